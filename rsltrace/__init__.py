@@ -22,10 +22,9 @@ if TYPE_CHECKING:
     from rsltrace.debug.client import DebugSession
     from rsltrace.diff import diff_files as diff
     from rsltrace.diff.bags.comparison import diff_bags
+    from rsltrace.diff.facts.causes import Verdict
     from rsltrace.diff.options import DiffOptions
-    from rsltrace.diff.result.bags import BagDiff
-    from rsltrace.diff.result.traces import Diff
-    from rsltrace.diff.result.verdicts import Verdict
+    from rsltrace.diff.result import BagDiff, Diff
     from rsltrace.errors import RsltraceError
     from rsltrace.job import (
         BagSpec,
@@ -49,13 +48,13 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _HOMES = {
-    "BagDiff": "rsltrace.diff.result.bags",
+    "BagDiff": "rsltrace.diff.result",
     "BagSpec": "rsltrace.job",
     "ChainLatency": "rsltrace.latency.measure",
     "CheckResult": "rsltrace.checks.evaluate",
     "CheckSpec": "rsltrace.job",
     "DebugSession": "rsltrace.debug.client",
-    "Diff": "rsltrace.diff.result.traces",
+    "Diff": "rsltrace.diff.result",
     "DiffOptions": "rsltrace.diff.options",
     "FaultSpec": "rsltrace.job",
     "HooksSpec": "rsltrace.job",
@@ -73,7 +72,7 @@ _HOMES = {
     "StopSpec": "rsltrace.job",
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
-    "Verdict": "rsltrace.diff.result.traces",
+    "Verdict": "rsltrace.diff.facts.causes",
     "diff_bags": "rsltrace.diff.bags.comparison",
     "evaluate_checks": "rsltrace.checks.evaluate",
     "evaluate_metrics": "rsltrace.checks.metrics",

@@ -12,7 +12,7 @@ from campaigns.truth.faults.planting import Truth
 from rsltrace import Diff, diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
-from rsltrace.diff.result.divergence import Divergence
+from rsltrace.diff.result import Divergence
 
 _MIRRORED = {
     "missing": "extra",

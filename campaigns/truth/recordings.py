@@ -13,7 +13,7 @@ from campaigns.truth.complaint import Complaint
 from campaigns.truth.graph import write_bag
 from rsltrace import DiffOptions, diff_bags
 from rsltrace.diff.report import render
-from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result import BagDiff
 
 Messages = list[tuple[int, str, float]]
 COUNTS = ("equal", "tolerated", "ignored", "differing", "moved", "only_a", "only_b")

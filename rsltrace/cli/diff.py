@@ -17,8 +17,7 @@ from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.diff.report.line import Line
-    from rsltrace.diff.result.bags import BagDiff
-    from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result import BagDiff, Diff
     from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
@@ -199,7 +198,7 @@ def _diff(
             trouble = True
     if done:
         print_diffs(done, form, options, output)
-    from rsltrace.diff.result.exit_codes import exit_code_of_several
+    from rsltrace.diff.exit_codes import exit_code_of_several
 
     return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
 

@@ -17,8 +17,9 @@ from rsltrace.callable_package import make_callable
 
 if TYPE_CHECKING:
     from pathlib import Path
+    from typing import Any
 
-    from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result import Diff
 
     Tolerances = Mapping[str, float] | Sequence[tuple[str, float]]
 
@@ -35,9 +36,12 @@ def diff_files(
     absolute: Tolerances = (),
     relative: Tolerances = (),
     window: int = 2000,
+    by: str = "order",
     as_far_as_they_go: bool = False,
-) -> Diff:
-    """Compare two traces: paths, or addresses such as ``https://…`` given as strings.
+    check: bool = False,
+) -> Diff | Any:
+    """Compare two traces: paths, or addresses such as ``https://…`` given as strings. Or two
+    recordings: folders with metadata.yaml, ``.mcap`` or ``.db3`` files; one may be a trace.
 
     ``context`` is the number of events told before a divergence. ``everything`` looks at both runs
     to their ends and tells every independent divergence; else ``window`` events after the first
@@ -47,17 +51,20 @@ def diff_files(
     ``absolute`` and ``relative`` give tolerances by such globs: ``{"pose.*": 1e-6}``, or pairs.
 
     A trace that is cut is never identical to another; with ``as_far_as_they_go`` it passes if it
-    agrees until there.
+    agrees until there. ``check`` reads both traces first and verifies their hashes. ``by`` says how
+    the messages of recordings are matched: ``order`` or ``stamp``.
 
-    Returns a ``rsltrace.Diff``; ``identical``, ``verdict`` and ``sentence`` say the most, and
-    ``rsltrace.diff.report.render`` makes a report of it. For recordings that are no traces there
-    is ``rsltrace.diff_bags``.
+    Returns a ``rsltrace.Diff``, or a ``rsltrace.BagDiff`` of recordings; ``identical``, ``verdict``
+    and ``sentence`` say the most, and ``rsltrace.diff.report.render`` makes a report of it.
 
-    Raises TraceError if a file is missing, damaged or no trace, or if an option makes no sense,
+    Raises TraceError or BagError if a file is missing or damaged, or if an option makes no sense,
     and SetupError for an address when fsspec is not installed.
     """
-    from rsltrace.diff.options import DiffOptions
+    from rsltrace.diff.file_kind import is_recording
+    from rsltrace.diff.options import BY_ORDER, DiffOptions
     from rsltrace.diff.traces.diff import diff_traces
+    from rsltrace.errors import TraceError
+    from rsltrace.trace.contents import check_contents
     from rsltrace.trace.reader import Trace
 
     chosen = DiffOptions(
@@ -69,9 +76,21 @@ def diff_files(
         absolute=_pairs(absolute),
         relative=_pairs(relative),
         window=window,
+        by=by,
         as_far_as_they_go=as_far_as_they_go,
     )
+    if is_recording(a) or is_recording(b):
+        from rsltrace.diff.bags.comparison import diff_bags
+
+        if nodes or check:
+            raise TraceError("nodes and check need two traces: a recording has neither of them")
+        return diff_bags(a, b, chosen)
+    if by != BY_ORDER:
+        raise TraceError(f"by={by!r} is for recordings; the events of two traces are aligned")
     with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
+        for trace in (trace_a, trace_b) if check else ():
+            trace.check()
+            check_contents(trace)
         return diff_traces(trace_a, trace_b, chosen)
 
 

@@ -96,6 +96,8 @@ class DomainEntity:
         detail = self.trace_detail()
         if source := source_of(self.user_callback()):
             detail["source"] = source
+        if group := self.trace_group():
+            detail["group"] = group
         return Entity(
             id=self.entity_id,
             node=self.node.entity_id if self.node is not None else 0,
@@ -117,6 +119,10 @@ class DomainEntity:
     def trace_detail(self) -> dict[str, object]:
         """Return what only this kind of entity has."""
         return {}
+
+    def trace_group(self) -> str:
+        """Return the callback group: ``exclusive 1``; "" for its node's default one, or none."""
+        return ""
 
     def user_callback(self) -> object:
         """Return the user's callable that its events run, None if there is none."""

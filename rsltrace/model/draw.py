@@ -59,6 +59,12 @@ def encode_clock(by_ns: int) -> int:
     return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
 
 
+def kind_of(number: int) -> Draw | None:
+    """Return what was decided, None where a later version knows it."""
+    kind = number >> _SHIFT
+    return Draw(kind) if kind in {int(one) for one in Draw} else None
+
+
 def is_switch(number: int) -> bool:
     """Whether a decision lets another thread go on in the middle of a callback."""
     return number >> _SHIFT == Draw.SWITCH
@@ -74,21 +80,20 @@ def duration_of(number: int, kind: Draw) -> int | None:
     return number & _VALUE_MAX if number >> _SHIFT == kind else None
 
 
-def draw_text(number: int) -> str:
-    """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
-    kind, value_ns = number >> _SHIFT, number & _VALUE_MAX
-    try:
-        draw = Draw(kind)
-    except ValueError:
-        return f"draw of kind {kind}: {value_ns}"
+def draw_text(number: int, digits: int = 6) -> str:
+    """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``; times with some digits."""
+    draw, value_ns = kind_of(number), number & _VALUE_MAX
+    duration = format_duration(value_ns, digits)
+    if draw is None:
+        return f"draw of kind {number >> _SHIFT}: {value_ns}"
     if draw in _WORDS:
         return _WORDS[draw]
     if draw is Draw.SWITCH:
         return f"another thread goes on before line {value_ns}"
     if draw in _CLOCKS:
-        return f"clock set {format_duration(value_ns)} {_CLOCKS[draw]}"
+        return f"clock set {duration} {_CLOCKS[draw]}"
     if draw in _FAULTS:
         word, more = _FAULTS[draw]
-        return word + (f"{more} {format_duration(value_ns)}" if value_ns else "")
+        return word + (f"{more} {duration}" if value_ns else "")
     names = {Draw.DELAY: "delay", Draw.DUPLICATE: "second copy after", Draw.EXECUTION: "takes"}
-    return f"{names[draw]} {format_duration(value_ns)}"
+    return f"{names[draw]} {duration}"

@@ -29,6 +29,18 @@ def shortened(text: str, width: int) -> str:
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
 
 
+def told_apart(a: str, b: str, width: int = 40, before: int = 20) -> tuple[str, str]:
+    """Return two different texts, printable, in at most ``width`` characters in which they differ:
+    of long ones from ``before`` characters before the place where they do."""
+    a, b = printable(a), printable(b)
+    at = next(
+        (i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b))
+    )
+    if max(len(a), len(b)) > width and at > width - before:
+        a, b = (f"…{text[at - before :]}" for text in (a, b))
+    return shortened(a, width), shortened(b, width)
+
+
 def _escaped(match: re.Match[str]) -> str:
     character = match.group()
     return _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")

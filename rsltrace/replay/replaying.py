@@ -9,8 +9,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError
 from rsltrace.replay.editing import Editing
@@ -139,7 +140,11 @@ def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
         b=replace(found.b, path=name),
         counts=(),
         resync_index=None,
-        notes=tuple(note for note in found.notes if not note.startswith("b ")),
+        remarks=tuple(
+            one
+            for one in found.remarks
+            if not (isinstance(one, EndedByException) and one.run == "b")
+        ),
         divergences=tuple(replace(one, next_step="", reaches=()) for one in found.divergences[:1]),
     )
 

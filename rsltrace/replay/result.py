@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result import Diff
     from rsltrace.errors import RunError
 
 

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from diff_simulator import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
 
-from rsltrace.diff.result.divergence import Divergence
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.causes import Root, Verdict
+from rsltrace.diff.result import Diff, Divergence
 from rsltrace.model.event import EventKind
 
 EVENTS_MAX = 1500

@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation
 
 from rsltrace.diff.alignment import blocks
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.traces import aligned_runs
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.reader import Trace

@@ -15,9 +15,12 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.bags.sequences import Gap, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.facts.bags import BagVerdict
+from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.bags import BagDiff, BagVerdict, Presence
+from rsltrace.diff.result import BagDiff
+from rsltrace.diff.sentences.values import notes_text
 from rsltrace.errors import BagError, TraceError
 from tests.tiers import cases
 
@@ -124,7 +127,7 @@ def test_a_changed_message_is_named_with_its_fields(compare: Any) -> None:
     ]
     assert [message.index for message in first.before] == [2, 3, 4, 5, 6]
     assert 'frame_id: "ab"' in first.before[-1].preview
-    assert "message 7 has another point.x" in diff.sentence
+    assert "message 7 has a different point.x" in diff.sentence
 
 
 @pytest.mark.parametrize("missing", [[0], [7], [7, 8, 12], [19]])
@@ -379,7 +382,7 @@ def test_types_that_differ_are_said(compare: Any, tmp_path: Path) -> None:
     diff = diff_bags(write(tmp_path / "a", points(3)), path)
     assert counts(diff) == (0, 0, 3, 0, 0)
     assert diff.first is not None
-    assert diff.first.fields[0].note == "different types"
+    assert notes_text(diff.first.fields[0]) == "different types"
     assert f"/p is {POINT} in a, {UINT64} in b" in diff.notes
 
 
@@ -392,8 +395,27 @@ def test_messages_of_unknown_type_are_compared_by_their_bytes(
     diff = diff_bags(a, b)
     assert counts(diff, "/x") == (1, 0, 1, 0, 0)
     assert diff.first is not None
-    assert "cannot be decoded" in diff.first.reason
+    assert "cannot be decoded" in diff.first.error
     assert any("byte by byte" in note for note in diff.notes)
+
+
+def test_python_takes_what_the_command_takes(tmp_path: Path) -> None:
+    """Recordings, too; what needs two traces is refused."""
+    import rsltrace
+
+    a = write(tmp_path / "a", points(9))
+    b = write(tmp_path / "b", points(9, x4=4.5), storage="sqlite3")
+    found = rsltrace.diff(str(a), b)
+    assert isinstance(found, BagDiff)
+    assert found == diff_bags(a, b)
+    assert rsltrace.diff(a, b, by="stamp", absolute={"point.x": 1.0}).exit_code == 3
+    for refused in ({"nodes": "/n"}, {"check": True}):
+        with pytest.raises(TraceError, match="need two traces"):
+            rsltrace.diff(a, b, **refused)
+    pair = Path(__file__).parent.parent.parent / "sample_traces" / "schedule"
+    with pytest.raises(TraceError, match="is for recordings"):
+        rsltrace.diff(pair / "a.mcap", pair / "b.mcap", by="stamp")
+    assert rsltrace.diff(pair / "a.mcap", pair / "b.mcap", check=True).diverged
 
 
 @pytest.fixture

@@ -54,7 +54,7 @@ def test_exit_status_0_for_identical_runs(diff: Callable[..., Done]) -> None:
 def test_exit_status_1_for_runs_that_part(diff: Callable[..., Done]) -> None:
     done = diff(A, B)
     assert (done.returncode, done.stderr) == (1, "")
-    assert "got the same input" in done.stdout
+    assert "received the same input" in done.stdout
     assert "\x1b" not in done.stdout
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import rsltrace
+from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.report import render
-from rsltrace.diff.result.verdicts import Verdict
 
 pytestmark = [pytest.mark.ros]
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
@@ -89,7 +89,7 @@ def test_a_parameter_and_what_it_did(recorded: Callable[..., Path]) -> None:
     assert diff.verdict is Verdict.ENVIRONMENT
     assert diff.agreeing == diff.divergences[0].a.index == 1  # type: ignore[union-attr]
     assert diff.sentence == (
-        "parameter speed 1.0 → 1.5 (job.yaml:6); first effect: /follower published another "
+        "parameter speed 1.0 → 1.5 (job.yaml:6); first effect: /follower published a different "
         "linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more field)"
     )
     other = rsltrace.diff(b, a).sentence
@@ -117,7 +117,8 @@ def test_an_effect_that_comes_late_is_found(recorded: Callable[..., Path]) -> No
     a, b = recorded(from_="20"), recorded(speed="1.5", from_="20")
     diff = rsltrace.diff(a, b, window=5, ignore=options["ignore"])
     assert (
-        "first effect: /follower published another linear.x on /cmd_vel at 2.0 s" in diff.sentence
+        "first effect: /follower published a different linear.x on /cmd_vel at 2.0 s"
+        in diff.sentence
     )
 
 
@@ -136,11 +137,11 @@ def test_what_is_ignored_or_tolerated_does_not_lead(recorded: Callable[..., Path
     plain = rsltrace.diff(a, b)
     assert "angular.z" in plain.sentence
     near = rsltrace.diff(a, b, absolute={"angular.z": 1e-6})
-    assert "another linear.x" in near.sentence
+    assert "a different linear.x" in near.sentence
     assert "at 2.0 s" in near.sentence
     ignored = ["/parameter_events:*", "/rosout:*", "angular.z"]
     diff = rsltrace.diff(a, b, ignore=ignored)
-    assert "/cmd_vel: linear.x 2.0 → 3.0" in diff.sentence
+    assert "/cmd_vel (linear.x 2.0 → 3.0)" in diff.sentence
     assert any("only in what is ignored or within tolerance" in note for note in diff.notes)
     assert diff.agreeing == 1
 

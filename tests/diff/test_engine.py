@@ -16,11 +16,12 @@ from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.run import Run
 
 import rsltrace
+from rsltrace.diff.facts.causes import Root, Verdict
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
-from rsltrace.diff.result.row_sign import Sign
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.result import Diff
+from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventKind, OutputKind
@@ -79,7 +80,7 @@ def test_a_changed_output(tmp_path: Path) -> None:
     assert diff.agreeing == step(20, 1)
     (first,) = diff.divergences
     assert (first.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
-    assert "subscription /a of /left at 0.2 s" in first.sentence
+    assert "/left: the callback for /a at 0.2 s" in first.sentence
     assert "/l" in first.sentence
     assert first.a is not None
     assert first.b is not None
@@ -92,7 +93,7 @@ def test_a_changed_output(tmp_path: Path) -> None:
     # The chain: what led to it agrees in both runs, then comes the event itself.
     (cause, itself) = first.chain
     assert cause.a is not None
-    assert (cause.a.entity.name, cause.relation) == ("tick", "published /a")
+    assert (cause.a.entity.name, link_text(cause.link)) == ("tick", "published /a")
     assert cause.a == cause.b
     assert (itself.a, itself.b) == (first.a, first.b)
     assert [view.index for view in first.before_a] == list(range(step(20, 1) - 5, step(20, 1)))
@@ -184,7 +185,7 @@ def test_a_consequence_that_was_asked_for_leads_back_to_its_root(tmp_path: Path)
     assert "/left" in first.root_sentence
     nodes = [step.a.entity.node for step in first.chain if step.a]
     assert nodes == ["/source", "/left", "/sum"]
-    assert first.chain[-2].relation == "published /l"
+    assert link_text(first.chain[-2].link) == "published /l"
     assert first.messages[0].position == -1
     assert [field.path for field in first.messages[0].fields] == ["data"]
     assert any("shown is where /sum differs" in note for note in diff.notes)
@@ -198,8 +199,8 @@ def test_state_is_a_way_to_the_root_too(tmp_path: Path) -> None:
     assert first.root is Root.CALLBACK
     assert first.a is not None
     assert first.a.entity.name == "/r"
-    assert first.chain[-2].relation == "may have changed the state of /sum"
-    assert "because its node had done something else before" in first.sentence
+    assert link_text(first.chain[-2].link) == "may have changed the state of /sum"
+    assert "because its node had already diverged" in first.sentence
 
 
 def test_asking_for_what_does_not_differ(tmp_path: Path) -> None:
@@ -220,7 +221,7 @@ def test_settings_are_always_listed(tmp_path: Path) -> None:
     assert places == {"job.yaml:1": ("seed: 0", "seed: 7"), "environment: sim": ("1", "2")}
     # They may be why; what is seen is a callback.
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
-    assert "job.yaml:1, environment: sim" in diff.divergences[0].root_sentence
+    assert "job.yaml:1, environment.sim" in diff.divergences[0].root_sentence
 
 
 def test_lines_of_a_job_of_several_files_are_not_those_of_one(tmp_path: Path) -> None:
@@ -406,7 +407,7 @@ def test_without_payloads_it_says_which_output_and_how_to_record_it(tmp_path: Pa
     assert message.topic == "/l"
     assert message.fields == ()
     assert message.hash_a != message.hash_b
-    assert "payloads: true" in message.reason
+    assert "payloads: true" in no_fields_text(message)
 
 
 def test_a_dropped_message_names_where_it_came_from(tmp_path: Path) -> None:
@@ -429,7 +430,7 @@ def test_ignored_fields_leave_the_verdict(tmp_path: Path) -> None:
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     (message,) = diff.divergences[0].messages
     assert message.fields == ()
-    assert "ignored" in message.reason
+    assert "ignored" in no_fields_text(message)
 
 
 @pytest.mark.parametrize("kind", ["drop", "extra", "swap", "late", "raise", "state"])
@@ -538,7 +539,7 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:
-    from rsltrace.diff.causes.event_views import phrase
+    from rsltrace.diff.sentences.divergence import phrase
     from rsltrace.words.phrases import at_time as at
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)))

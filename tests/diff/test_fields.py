@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.diff.bags.content import ContentKeys
+from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import SAME_WORDS, FieldDifference
+from rsltrace.diff.sentences.values import notes_text
 from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import ulp_distance
@@ -136,7 +137,7 @@ def test_floats_are_shown_in_full_and_measured_in_their_own_width(
 )
 def test_special_floats_are_called_out(field: str, a: float, b: float, note: str) -> None:
     found = only(message(**{field: a}), message(**{field: b}))
-    assert found.note == note
+    assert notes_text(found) == note
     if note == "sign of zero":
         assert (found.a, found.b, found.absolute, found.ulp) == ("0.0", "-0.0", 0.0, 0)
     else:
@@ -152,7 +153,7 @@ def nan_of(bits: int) -> float:
 def test_nan_equals_a_nan_of_the_same_bits_only() -> None:
     assert diff_messages(message(double=math.nan), message(double=math.nan), ONLY) == ((), 0)
     found = only(message(double=math.nan), message(double=nan_of(0x7FF8000000000001)))
-    assert found.note == "NaN with another payload"
+    assert notes_text(found) == "NaN with another payload"
     assert (found.a, found.b) == ("nan", "nan(0x7ff8000000000001)")
     array = np.full(4, np.nan, dtype=np.float32)
     assert diff_messages(message(ranges=array), message(ranges=array), ONLY) == ((), 0)
@@ -187,10 +188,10 @@ def test_times_are_one_field_in_seconds() -> None:
 
 def test_texts_say_where_they_part() -> None:
     found = only(message(text="left"), message(text="right\x1b[31m\n"))
-    assert (found.a, found.b, found.note) == ('"left"', '"right\\x1b[31m\\n"', "")
+    assert (found.a, found.b, found.notes) == ('"left"', '"right\\x1b[31m\\n"', ())
     long = "x" * 200
     found = only(message(text=long), message(text=long[:120] + "y" + long[121:150]))
-    assert found.note == "first at character 120; length 200 and 150"
+    assert notes_text(found) == "first at character 120; length 200 and 150"
     assert "xy" in found.b
     assert len(found.a) < 70
 
@@ -209,7 +210,7 @@ def test_texts_say_where_they_part() -> None:
 def test_texts_that_list_the_same_in_another_order_say_so(
     a: str, b: str, is_reordered: bool
 ) -> None:
-    assert (only(message(text=a), message(text=b)).note == SAME_WORDS) is is_reordered
+    assert only(message(text=a), message(text=b)).is_reordered is is_reordered
 
 
 def test_one_element_is_named_by_its_index() -> None:
@@ -239,14 +240,14 @@ def test_arrays_are_summarised() -> None:
     )
     assert (found.smallest, found.largest) == (0.0, 0.5)
     assert found.ulp == 2097152
-    assert found.note == "NaN in b only: 1; infinite in b only: 1; sign of zero: 1"
+    assert notes_text(found) == "NaN in b only: 1; infinite in b only: 1; sign of zero: 1"
     assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100]"
 
 
 def test_arrays_of_other_length_show_what_is_beyond() -> None:
     a = np.arange(5, dtype=np.float32)
     found = only(message(ranges=a), message(ranges=a[:3]))
-    assert found.note == "length 5 and 3"
+    assert notes_text(found) == "length 5 and 3"
     assert found.elements == (2, 5)
     assert found.first == ((3, "3.0", "absent"), (4, "4.0", "absent"))
     assert not found.within_tolerance
@@ -274,12 +275,12 @@ def test_long_binary_fields_are_shown_as_a_hex_dump() -> None:
     b[[18, 20, 150]] = 255
     found = only(message(data=a), message(data=b))
     assert (found.a, found.b, found.elements) == ("200 bytes", "200 bytes", (3, 200))
-    assert found.note == "first at byte 18"
+    assert notes_text(found) == "first at byte 18"
     assert [offset for offset, _, _ in found.first] == [16, 144]
     assert found.first[0][1].startswith("10 11 12 13 14")
     assert found.first[0][2].startswith("10 11 ff 13 ff")
     found = only(message(data=a), message(data=a[:100]))
-    assert found.note == "length 200 and 100"
+    assert notes_text(found) == "length 200 and 100"
     assert found.first[0][0] == 96
     # short ones are numbers
     assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8]"
@@ -292,7 +293,11 @@ def test_messages_in_arrays_are_compared_one_by_one() -> None:
     b.points.append(b.points[0])
     found, _ = diff_messages(a, b, ONLY)
     assert [one.path for one in found] == ["points", "points[1].y"]
-    assert (found[0].a, found[0].b, found[0].note) == ("2 items", "3 items", "length 2 and 3")
+    assert (found[0].a, found[0].b, notes_text(found[0])) == (
+        "2 items",
+        "3 items",
+        "length 2 and 3",
+    )
     assert found[0].first == ((2, "absent", "x: 1.0, y: 2.0, z: 3.0"),)
     names = only(message(names=["a", "b"]), message(names=["a", "c"]))
     assert (names.path, names.a, names.b) == ("names[1]", '"b"', '"c"')

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.diff.causes.job_settings import job_settings
+from rsltrace.diff.sentences.values import setting_name
 from rsltrace.job import Job, load_job
 
 JOB = """\
@@ -51,8 +52,8 @@ def of_job(job: Job) -> Recorded:
 def told(a: Recorded, b: Recorded) -> dict[str, tuple[str | None, str | None]]:
     found: dict[str, tuple[str | None, str | None]] = {}
     for setting in job_settings(a, b):  # type: ignore[arg-type]
-        assert str(setting) not in found
-        found[str(setting)] = (setting.a, setting.b)
+        assert setting_name(setting) not in found
+        found[setting_name(setting)] = (setting.a, setting.b)
     return found
 
 

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from rsltrace.diff.causes.likely_cause import call_sentence, calls_sentence
-from rsltrace.diff.result.divergence import CallDifference, MessageDifference
-from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.causes.calls import call_difference
+from rsltrace.diff.causes.likely_cause import telling_calls
+from rsltrace.diff.facts.causes import OutsideAnswers
+from rsltrace.diff.facts.evidence import (
+    CallDifference,
+    FieldDifference,
+    MessageDifference,
+    Presence,
+)
+from rsltrace.diff.sentences import sentence
+from rsltrace.words.entities import EntityKey
 
 PLACE = "picker.py:24 in Picker.pick"
 
@@ -14,11 +24,15 @@ PLACE = "picker.py:24 in Picker.pick"
 def call(
     source: str, text: str, a: str | None, b: str | None, where: str = PLACE
 ) -> CallDifference:
-    return CallDifference(source, text, where, 3, 3, a, b)
+    return call_difference(source, text, where, (3, 3), (a, b))
+
+
+def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str:
+    return sentence(OutsideAnswers("/picker", telling_calls(calls, messages)))
 
 
 @pytest.mark.parametrize(
-    ("found", "sentence"),
+    ("found", "text"),
     [
         (
             call("environment", "os.environ['MOTOR_SEED']", "'6'", "'4'"),
@@ -50,8 +64,8 @@ def call(
         ),
     ],
 )
-def test_a_call_as_a_sentence(found: CallDifference, sentence: str) -> None:
-    assert call_sentence(found, "/picker") == sentence
+def test_a_call_as_a_sentence(found: CallDifference, text: str) -> None:
+    assert told((found,)) == text
 
 
 def test_of_several_answers_those_that_show_are_told() -> None:
@@ -59,12 +73,16 @@ def test_of_several_answers_those_that_show_are_told() -> None:
     same = call("environment", "os.environ['SAME']", "'1'", "'1'")
     topic = call("environment", "os.environ['TOPIC']", "'/one'", "'/other'")
     calls = (unused, unused, same, topic)
-    made = MessageDifference(None, "new publisher /one", "", 0, "only a", None, None)
-    told = "/n read TOPIC, /one in a and /other in b, at picker.py:24"
-    assert calls_sentence(calls, "/n", (made,)) == told
+    name = EntityKey("/picker", "publisher", "/one", "")
+    made = message("new publisher /one", Presence.ONLY_A, entity=name)
+    one = "/picker read TOPIC, /one in a and /other in b, at picker.py:24"
+    assert told(calls, made) == one
     field = FieldDifference("data", '"x"', '"/other"')
-    text = MessageDifference(None, "/t", "", 0, "both", None, None, (field,))
-    assert calls_sentence(calls, "/n", (text,)) == told
-    assert calls_sentence(calls, "/n", ()) == (
-        "/n read UNUSED, 1 in a and 2 in b, at picker.py:8; " + told.removeprefix("/n ")
+    assert told(calls, message("/t", Presence.BOTH, fields=(field,))) == one
+    assert told(calls) == (
+        "/picker read UNUSED, 1 in a and 2 in b, at picker.py:8; " + one.removeprefix("/picker ")
     )
+
+
+def message(topic: str, presence: Presence, **more: Any) -> MessageDifference:
+    return MessageDifference(None, topic, "", 0, presence, None, None, **more)

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow
-from rsltrace.diff.causes.output_notes import durations
+from rsltrace.diff.sentences.values import durations
 from rsltrace.model.event import OutputKind
-from rsltrace.model.stamp import format_duration
+from rsltrace.model.printable import printable, told_apart
+from rsltrace.model.stamp import durations_apart, format_duration
 from rsltrace.words.entities import EntityKey
 
 MESSAGE = int(OutputKind.MESSAGE)
@@ -44,6 +45,36 @@ def test_a_duration_is_short_and_a_time_since_1970_is_in_full(duration_ns: int, 
 def test_two_durations_share_a_unit() -> None:
     assert durations(20_000_000, 26_000_000) == "20 → 26 ms"
     assert durations(900_000, 2_000_000) == "900 us → 2 ms"
+
+
+@pytest.mark.parametrize(
+    ("a_ns", "b_ns", "text"),
+    [
+        (100_000_000, 100_000_100, "100 → 100.0001 ms"),
+        (100_000_100, 100_000_000, "100.0001 → 100 ms"),
+        (1_000_000_000, 1_000_000_001, "1 → 1.000000001 s"),
+        (999_999_999, 1_000_000_000, "999.999999 ms → 1 s"),
+        (86_400_000_000_001, 86_400_000_000_000, "86400.000000001 → 86400 s"),
+    ],
+)
+def test_durations_that_differ_are_shown_so_that_one_sees_it(
+    a_ns: int, b_ns: int, text: str
+) -> None:
+    assert durations(a_ns, b_ns) == text
+
+
+@given(st.integers(0, 10**15), st.integers(-3, 3))
+def test_two_durations_never_look_the_same(a_ns: int, more_ns: int) -> None:
+    one, other = durations_apart(a_ns, a_ns + more_ns)
+    assert (one == other) == (more_ns == 0)
+
+
+@given(st.text(max_size=80), st.text(max_size=80))
+def test_two_texts_never_look_the_same(a: str, b: str) -> None:
+    prefix = "same " * 20
+    one, other = told_apart(prefix + a, prefix + b)
+    assert max(len(one), len(other)) <= 40
+    assert (one == other) == (printable(a) == printable(b))
 
 
 def test_outputs_in_another_order_are_told_once() -> None:

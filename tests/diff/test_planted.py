@@ -22,9 +22,9 @@ from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks
 from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.propagation import Propagation
+from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace

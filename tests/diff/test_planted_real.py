@@ -11,8 +11,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 import rsltrace
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.causes import Root, Verdict
+from rsltrace.diff.result import Diff
+from rsltrace.diff.sentences.values import setting_name
 from tests.tiers import cases
 
 pytestmark = pytest.mark.ros
@@ -228,11 +229,11 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert (diff.verdict, first.root) == (Verdict.ENVIRONMENT, Root.JOB)
     assert first.a is not None
     assert first.a.entity.name == "/sensor"
-    assert [str(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
+    assert [setting_name(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
     assert diff.sentence == (
-        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published another data on "
-        "/reading at 0.1 s (data 1.0 → 1.5)"
+        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published a different data "
+        "on /reading at 0.1 s (data 1.0 → 1.5)"
     )
     assert diff.shown is diff.effect
     assert diff.effect is not None
@@ -332,6 +333,6 @@ class Reader(Node):
     assert message.topic == "the clock of /reader"
     (field,) = message.fields
     assert {text[:10] for text in (field.a, field.b)} <= {"clock set ", "none"}
-    assert "read a clock, but chance decided otherwise: the clock of /reader" in first.sentence
+    assert "read a clock, but chance decided differently: the clock of /reader" in first.sentence
     assert "job.yaml:5" in first.root_sentence  # the line with the seed
     assert {divergence.verdict for divergence in diff.divergences} == {Verdict.DRAW}

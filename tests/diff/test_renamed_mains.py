@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rsltrace.diff import diff_files
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.facts.causes import Verdict
 from rsltrace.job import load_job
 from rsltrace.run import record
 

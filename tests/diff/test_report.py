@@ -9,6 +9,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Callable
+from enum import Enum
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -17,29 +18,48 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report import FORMATS, render
-from rsltrace.diff.result.bags import (
-    BagDiff,
+from rsltrace.diff.facts.bags import (
     BagMessage,
     BagVerdict,
     LoneTopic,
     MessageDivergence,
-    Presence,
     Recording,
     TopicDiff,
 )
-from rsltrace.diff.result.divergence import (
-    CauseStep,
-    Divergence,
-    MessageDifference,
-    Reach,
+from rsltrace.diff.facts.causes import (
+    NothingBefore,
+    OnlyInOne,
+    OtherOutput,
+    RaisedInOne,
+    Root,
+    Verdict,
 )
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.fields import FieldDifference
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.traces import Diff, EntityCount, Side
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.evidence import (
+    CauseStep,
+    EventView,
+    FieldDifference,
+    FieldNote,
+    FieldNoteKind,
+    Link,
+    LinkKind,
+    MessageDifference,
+    NoFields,
+    Presence,
+    Reach,
+    Setting,
+    SettingKind,
+)
+from rsltrace.diff.facts.remarks import (
+    AgreeUntilCut,
+    Diverged,
+    Identical,
+    Interrupted,
+    LogTimesIgnored,
+    Told,
+)
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import FORMATS, render
+from rsltrace.diff.result import BagDiff, Diff, Divergence, EntityCount, Side
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.words.entities import EntityKey
@@ -63,7 +83,7 @@ ALL_FIELDS = (
         "[0.0, 1.0, … 360]",
         "[0.0, 2.0, … 360]",
         ulp=99,
-        note="NaN in b only: 1",
+        notes=(FieldNote(FieldNoteKind.NAN_IN_B, count=1),),
         elements=(17, 360),
         first=((1, "1.0", "2.0"), (4, "1.0", "nan"), (9, "3.0", "4.0")),
         smallest=1e-7,
@@ -74,8 +94,9 @@ ALL_FIELDS = (
         "data",
         "500 bytes",
         "500 bytes",
-        note="first at byte 18",
+        notes=(FieldNote(FieldNoteKind.FIRST_BYTE, 18),),
         elements=(2, 500),
+        binary=True,
         first=((16, "00 01 02 03 04 05 06 07 08 09 0a", "00 01 ff 03 04 05 06 07 08 09 0a"),),
     ),
 )
@@ -113,7 +134,7 @@ def side(name: str, digest: str, **changes: Any) -> Side:
 
 def identical() -> Diff:
     sides = (side("run1", "0123456789abcdef"), side("run2", "0123456789abcdef"))
-    return Diff(*sides, Verdict.IDENTICAL, "The two runs are identical: 5210 events.", 5210)
+    return Diff(*sides, Verdict.IDENTICAL, Identical(5210), 5210)
 
 
 def nondeterministic() -> Diff:
@@ -126,53 +147,60 @@ def nondeterministic() -> Diff:
         for i in range(118, 123)
     )
     message = MessageDifference(
-        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, "both", 1, 2, ALL_FIELDS, more_fields=3
+        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, Presence.BOTH, 1, 2, ALL_FIELDS, more_fields=3
     )
     log = MessageDifference(
-        OutputKind.LOG, "/rosout", "", 1, "only b", None, 5, preview='msg: "nothing in reach"'
+        OutputKind.LOG,
+        "/rosout",
+        "",
+        1,
+        Presence.ONLY_B,
+        None,
+        5,
+        preview='msg: "nothing in reach"',
     )
     found = Divergence(
         Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
-        "Event 123 at 1.350000000 s: /scan_filter got the same /scan and published something else.",
+        Root.CALLBACK,
+        OtherOutput(),
+        NothingBefore("callback", state_unknown=False, guard_is_off=False),
         a,
         b,
-        Root.CALLBACK,
-        "the callback of /scan in /scan_filter itself",
-        (CauseStep(tick, tick, "published /scan"), CauseStep(a, b)),
-        (message, log),
-        before,
-        before,
-        (event(100, 1200),),
-        (event(100, 1200),),
-        (Reach("/points", 0, 3), Reach("/cmd_vel", 50 * MS, 2)),
-        "rsltrace cat runs/run1.mcap --node /scan_filter --from 1.35 --to 1.35",
+        messages=(message, log),
+        chain=(CauseStep(tick, tick, Link(LinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
+        before_a=before,
+        before_b=before,
+        same_node_a=(event(100, 1200),),
+        same_node_b=(event(100, 1200),),
+        reaches=(Reach("/points", 0, 3), Reach("/cmd_vel", 50 * MS, 2)),
+        next_step="rsltrace cat runs/run1.mcap --node /scan_filter --from 1.35 --to 1.35",
     )
     later = dataclasses.replace(
         found,
         verdict=Verdict.EXCEPTION,
-        sentence="Event 200: /planner raised in b only.",
+        what=RaisedInOne("ValueError: no plan"),
         a=event(200, 2000, PLAN),
         b=event(201, 2000, PLAN, flags=EventFlag.RAISED, summary="exception"),
         chain=(),
-        root_sentence="",
+        why=None,
         messages=(),
     )
     return Diff(
         side("run1", "0123456789abcdef"),
         side("run2", "fedcba9876543210", events=5208),
         found.verdict,
-        found.sentence,
+        Diverged(),
         123,
         (found, later),
         (
-            Setting("job.yaml:12", "  gain: 1.0", "  gain: 1.5"),
-            Setting("environment: numpy", "1.26.4", None),
+            Setting(SettingKind.JOB, "job.yaml", "  gain: 1.0", "  gain: 1.5", line=12),
+            Setting(SettingKind.ENVIRONMENT, "numpy", "1.26.4", None),
         ),
         (EntityCount(SCAN, 100, 3, 1, 0), EntityCount(PLAN, 90, 2, 0, 1)),
         (200, 199),
         (2123, 2122),
         4096,
-        ("run2.mcap was recorded on another machine",),
+        (Told("run2.mcap was recorded on another machine"),),
     )
 
 
@@ -182,21 +210,21 @@ def missing() -> Diff:
     instead = event(40, 950, PLAN)
     found = Divergence(
         Verdict.MISSING,
-        "Event 40 of a at 0.900000000 s is missing in b: /driver: timer tick.",
-        gone,
-        instead,
         Root.MISSING,
-        "",
+        OnlyInOne(instead),
+        None,
+        gone,
+        None,
         messages=(
             MessageDifference(
                 OutputKind.MESSAGE,
                 "/scan",
                 SCAN_TYPE,
                 0,
-                "only a",
+                Presence.ONLY_A,
                 77,
                 None,
-                reason="payloads were not recorded: set record.payloads to true and record again",
+                no_fields=NoFields.NOT_RECORDED_IN_A,
             ),
         ),
         before_a=(event(38, 880, TICK, EventKind.TIMER), event(39, 890)),
@@ -207,7 +235,7 @@ def missing() -> Diff:
         side("run1", "0123456789abcdef"),
         side("run2", "fedcba9876543210", complete=False, stop_reason=""),
         found.verdict,
-        found.sentence,
+        Diverged(),
         40,
         (found,),
     )
@@ -217,11 +245,11 @@ def tolerated() -> Diff:
     base = nondeterministic()
     close = (dataclasses.replace(ALL_FIELDS[1], within_tolerance=True),)
     message = MessageDifference(
-        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, "both", 1, 2, close, more_fields=4
+        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, Presence.BOTH, 1, 2, close, more_fields=4
     )
     found = dataclasses.replace(base.divergences[0], messages=(message,))
     return dataclasses.replace(
-        base, divergences=(found,), notes=(), settings=(), tolerance=equal_within_tolerance()
+        base, divergences=(found,), remarks=(), settings=(), tolerance=equal_within_tolerance()
     )
 
 
@@ -249,8 +277,6 @@ def recordings() -> BagDiff:
         Recording("bags/monday", "mcap", 4, 1207, 112 * 1000 * MS, 203 * 1000 * MS),
         Recording("bags/tuesday", "sqlite3", 3, 1199, 212 * 1000 * MS, 303 * 1000 * MS, False),
         BagVerdict.DIFFERENT,
-        "The recordings first diverge on /odom, 16.691000000 s after the start: message 500 has "
-        "another header.stamp (and 3 other fields).",
         "order",
         (
             TopicDiff(
@@ -263,7 +289,7 @@ def recordings() -> BagDiff:
         (),
         first,
         "rsltrace diff bags/monday bags/tuesday --topic /odom --context 20",
-        ("log times are not compared (--by stamp matches messages by them)",),
+        (LogTimesIgnored(),),
     )
 
 
@@ -271,7 +297,6 @@ def equal_within_tolerance() -> BagDiff:
     return dataclasses.replace(
         recordings(),
         verdict=BagVerdict.WITHIN_TOLERANCE,
-        sentence="The recordings are equal within tolerance, not identical.",
         topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 5, 0, 0, 0),),
         topics_only_a=(),
         first=None,
@@ -286,9 +311,9 @@ def cut() -> Diff:
         sides[0],
         dataclasses.replace(sides[1], complete=False, stop_reason="interrupted"),
         Verdict.AS_FAR_AS_THEY_GO,
-        "the two runs agree as far as they go, 4096 events: the recording of b is cut",
+        AgreeUntilCut(4096, ("b",)),
         4096,
-        notes=("the recording of b (runs/run2.mcap) was interrupted: compared is what is there",),
+        remarks=(Interrupted("b", "runs/run2.mcap", 4096, 10_000 * MS),),
     )
 
 
@@ -297,7 +322,6 @@ def cut_recording() -> BagDiff:
         equal_within_tolerance(),
         b=dataclasses.replace(recordings().b, complete=False),
         verdict=BagVerdict.AS_FAR_AS_THEY_GO,
-        sentence="As far as they go, the recordings agree: 690 messages on 1 topic say the same.",
         topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 0, 0, 0, 0),),
     )
 
@@ -394,7 +418,7 @@ def crowd(diff: Diff) -> Diff:
     others = tuple(event(i, i, PLAN) for i in range(61, 81))
     found = dataclasses.replace(
         found,
-        sentence=found.sentence * 3,
+        what=RaisedInOne("no " * 200),
         chain=(step,) * 15 + found.chain[1:],
         messages=found.messages * 6,
         before_a=events,
@@ -405,11 +429,10 @@ def crowd(diff: Diff) -> Diff:
     )
     return dataclasses.replace(
         diff,
-        sentence=found.sentence,
         divergences=(found, *diff.divergences),
         settings=diff.settings * 20,
         counts=diff.counts * 20,
-        notes=diff.notes * 10,
+        remarks=diff.remarks * 10,
     )
 
 
@@ -427,12 +450,14 @@ HOSTILE = "/x\x1b]0;pwned\x07\n::error::injected\r`|<script>&\u202e@everyone"
 
 def poisoned(value: Any) -> Any:
     """Put hostile text in every text of a diff that comes from a file."""
+    if isinstance(value, Enum):
+        return value
     if isinstance(value, str):
         return value + HOSTILE
     if isinstance(value, tuple):
         return tuple(map(poisoned, value))
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        kept = ("presence", "digest", "by")
+        kept = ("digest", "by", "source", "run", "doubt")
         # values of fields are printable when they are made
         made = isinstance(value, FieldDifference)
         return dataclasses.replace(
@@ -469,7 +494,9 @@ def test_what_a_file_says_cannot_steer_a_terminal_or_a_build(case: str, form: st
 @given(st.text(max_size=30))
 def test_junit_is_well_formed_whatever_the_sentence(sentence: str) -> None:
     plain, told = (
-        ElementTree.fromstring(render(dataclasses.replace(missing(), sentence=each), "junit"))
+        ElementTree.fromstring(
+            render(dataclasses.replace(missing(), outcome=Diverged(None, (each, "ab c"))), "junit")
+        )
         for each in ("x", sentence or "x")
     )
     assert [each.tag for each in told.iter()] == [each.tag for each in plain.iter()]
@@ -507,6 +534,8 @@ def documented_keys() -> set[str]:
 
 
 def all_keys(value: Any) -> set[str]:
+    if isinstance(value, dict) and "fact" in value:
+        return {"fact"}  # whose keys are those of its class
     if isinstance(value, dict):
         return set(value) | {key for item in value.values() for key in all_keys(item)}
     if isinstance(value, list):

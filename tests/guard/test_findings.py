@@ -197,6 +197,9 @@ def test_info_cat_and_diff_tell(
         "event_b": 1,
         "a": "not set",
         "b": "'9'",
+        "subject": "SHIFT",
+        "short": ["not set", "9"],
+        "only_touched": False,
     }
 
 

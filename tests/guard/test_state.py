@@ -364,7 +364,7 @@ def test_the_first_diverging_event_is_the_planted_one(tmp_path: Path) -> None:
         found = diff_files(str(plain), str(path))
         # Steps alternate between the timer's events and the subscription's; 0 is the constructor.
         assert found.agreeing == step, f"planting {number}"
-        assert "left its node in another state" in found.sentence
+        assert "left its node in a different state" in found.sentence
 
 
 @pytest.mark.few(1)

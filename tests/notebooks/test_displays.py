@@ -69,7 +69,7 @@ def test_a_diff_says_where_and_why() -> None:
     folder = SAMPLES / "nondeterministic_callback"
     diff = rsltrace.diff(folder / "a.mcap", folder / "b.mcap")
     page = shown(diff)
-    assert page.texts[0].startswith("Subscription /scan of /obstacle_filter at 2.1 s got the same")
+    assert page.texts[0].startswith("/obstacle_filter: the callback for /scan at 2.1 s received")
     assert "-0.19956212899502732" in page.texts
     assert any(text.startswith("cause: ") and "hash_seed" in text for text in page.texts)
     assert diff.a.digest in page.texts

@@ -24,8 +24,9 @@ from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
 from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
 from rsltrace_viewer.rerun_export.messages.tracks import Track
 
-from rsltrace.diff.result.traces import Diff, Side
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.facts.causes import Verdict
+from rsltrace.diff.facts.remarks import DifferentJobs
+from rsltrace.diff.result import Diff, Side
 
 S = 1_000_000_000
 
@@ -198,7 +199,13 @@ def test_lists_are_cut_by_their_counts() -> None:
 
 def test_texts_of_a_trace_are_no_markdown() -> None:
     side = Side("a```.mcap", "0" * 16, 1, 2, True)
-    diff = Diff(side, side, Verdict.SCHEDULE, "*bold* <b>\x1b[31m\n# title\n```", 1)
+    diff = Diff(
+        side,
+        side,
+        Verdict.SCHEDULE,
+        DifferentJobs(("*bold* <b>\x1b[31m\n# title\n```", ""), ("a",)),
+        1,
+    )
     title, _, fence, *lines, end = document(diff).splitlines()
     assert (title, fence, end) == ("# The runs diverge", "````text", "````")
     assert "a```.mcap" in "\n".join(lines)

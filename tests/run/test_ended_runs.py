@@ -20,8 +20,8 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 
 import rsltrace
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.causes import Root, Verdict
+from rsltrace.diff.result import Diff
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros

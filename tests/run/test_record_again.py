@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from rsltrace.diff.causes.record_command import record_again
+from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.trace.reader import Trace
 
 JOB = """\
@@ -77,7 +78,7 @@ def _again(name: str, *overrides: str) -> tuple[str, str]:
     lines = "".join(f"#   with --{override}\n" for override in overrides)
     text = f"# The effective job of {name}\n{lines}nodes: []\n#   with --set x=1\n"
     again = record_again(_Job(name, text))  # type: ignore[arg-type]
-    return again.command, " ".join(again.warnings)
+    return again.command, " ".join(map(remark_text, again.warnings))
 
 
 @pytest.fixture
@@ -169,7 +170,7 @@ def test_what_may_run_code_is_told_and_not_offered(here: Path, override: str) ->
     """A trace may come from anybody, and the line is there to be pasted."""
     command, warning = _again("job.yaml", override)
     assert command == ""
-    assert "there is no command to paste" in warning
+    assert "no command to reproduce this" in warning
     assert "\x1b" not in warning
     assert len(warning) < 1000
 
@@ -187,7 +188,7 @@ def test_another_job_of_that_name_is_told(here: Path) -> None:
     assert record_again(mine).warnings == ()  # type: ignore[arg-type]
     theirs = record_again(_Job("job.yaml", "nodes: [x]\n"))  # type: ignore[arg-type]
     assert theirs.command == "rsltrace record job.yaml"
-    assert "was made elsewhere, or the job has been changed" in theirs.warnings[0]
+    assert "was made elsewhere, or the job has been changed" in remark_text(theirs.warnings[0])
 
 
 @pytest.mark.parametrize("name", ["", "<python>"])

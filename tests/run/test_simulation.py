@@ -342,7 +342,7 @@ def test_the_same_driver_gives_the_same_trace(simulate: Any, tmp_path: Path) -> 
     [
         (
             lambda sim: sim.publish("numbers", _number(5)),
-            "the message from outside on /numbers at 1.0 s is another one",
+            "the message from outside on /numbers at 1.0 s is different",
         ),
         (
             lambda sim: sim.call(sim.node("echo").say, 5),  # of two at one time, by their names

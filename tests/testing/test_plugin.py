@@ -55,7 +55,7 @@ def test_the_report_is_the_message(tmp_path: Path) -> None:
     with pytest.raises(GoldenMismatch) as caught:
         assert_matches_golden(B, golden)
     text = str(caught.value)
-    assert text.startswith("Subscription /scan of /obstacle_filter at 2.1 s got the same input")
+    assert text.startswith("/obstacle_filter: the callback for /scan at 2.1 s received the same")
     assert "-0.19956212899502734" in text
     assert text.endswith("pytest --rsltrace-update accepts what it does now")
     assert isinstance(caught.value, AssertionError)

@@ -15,6 +15,7 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.sentences.values import notes_text
 from rsltrace.diff.values.fields import diff_messages
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoder, to_plain
@@ -103,7 +104,7 @@ def test_constants_are_not_part_of_a_message() -> None:
 def test_names_of_whole_numbers_are_kept_beside_the_message() -> None:
     made = decoder("uint8 LOW=3\nuint8 HIGH=4\nuint8 c\n")
     (found,), _ = diff_messages(made.decode(CDR + b"\3"), made.decode(CDR + b"\4"), DiffOptions())
-    assert (found.path, found.a, found.b, found.note) == ("c", "3", "4", "LOW → HIGH")
+    assert (found.path, found.a, found.b, notes_text(found)) == ("c", "3", "4", "LOW → HIGH")
 
 
 def test_names_that_may_mean_another_field_are_not_told() -> None:
@@ -111,7 +112,7 @@ def test_names_that_may_mean_another_field_are_not_told() -> None:
     (found,), _ = diff_messages(
         made.decode(CDR + b"\3\3"), made.decode(CDR + b"\4\3"), DiffOptions()
     )
-    assert found.note == ""
+    assert notes_text(found) == ""
 
 
 def test_fields_may_have_names_that_python_reserves() -> None:

@@ -31,7 +31,7 @@ from rsltrace_viewer.terminal.screenshot import settle, text_of
 from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace.trace.decode import to_plain
 from rsltrace.words.times import START, parse_time_in_run
 

@@ -14,7 +14,7 @@ from rsltrace_viewer.model.timeline.message_values import message_values
 from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 

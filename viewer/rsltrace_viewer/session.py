@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind

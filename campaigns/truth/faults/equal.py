@@ -40,7 +40,7 @@ def irrelevant(name: str) -> Callable[[Change], Change]:
                 node.full_name,
                 node.callbacks[0].entity,
                 says=(NOT_DETERMINISTIC,),
-                never=(*ALWAYS_FALSE, blamed, r"made differently"),
+                never=(*ALWAYS_FALSE, blamed, r"had different settings"),
                 values=node.callbacks[0].publishes,
             )
             return Planted(a, b, truth)

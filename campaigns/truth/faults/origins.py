@@ -205,7 +205,7 @@ def set_order(rng: random.Random) -> Planted:
     b = a.copy()
     b.hidden = "fault"
     first = (
-        r"/list: data has the same elements in another order",
+        r"/list\W+data has the same elements in another order",
         rf"{LIKELY}the order of the set self\.things, at {node.module}\.py:\d+",
     )
     return Planted(a, b, replace(_truth(node), first=first, values=""))

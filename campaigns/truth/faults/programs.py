@@ -50,10 +50,10 @@ def _file(
 
 
 for _what, _isolated in (("script", False), ("process of its own", True)):
-    _file(_what, "value", ["value += 4.0"], r"/program: data \d", isolated=_isolated)
+    _file(_what, "value", ["value += 4.0"], r"/program\W+data \d", isolated=_isolated)
     _file(_what, "sleep", ["time.sleep(0.003)"], "3 ms", isolated=_isolated)
     _file(_what, "left out", ["continue"], "/program", isolated=_isolated)
-_file("script", "value", ["value += 4.0"], r"/program: data", isolated=False, hidden=True)
+_file("script", "value", ["value += 4.0"], r"/program\W+data", isolated=False, hidden=True)
 _file("script", "sleep", ["time.sleep(0.003)"], "3 ms", isolated=False, hidden=True)
 _file("process of its own", "exit", ["import sys; sys.exit(4)"], "program", isolated=True)
 

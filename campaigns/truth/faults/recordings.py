@@ -37,7 +37,7 @@ def value(rng: random.Random) -> Planted:
     at = rng.randrange(len(places))
     stamp, _, data = b[places[at]]
     b[places[at]] = (stamp, topic, data + 100.5)
-    first = (rf"message {at} has another data",)
+    first = (rf"message {at} has a different data",)
     return _planted(Recordings(a, b, topic, {"differing": 1}, first=first, place=at))
 
 
@@ -48,7 +48,7 @@ def values(rng: random.Random) -> Planted:
     for at in chosen:
         stamp, _, data = b[places[at]]
         b[places[at]] = (stamp, topic, data + 100.5 + at)
-    first = (rf"message {chosen[0]} has another data",)
+    first = (rf"message {chosen[0]} has a different data",)
     return _planted(Recordings(a, b, topic, {"differing": 3}, first=first, place=chosen[0]))
 
 
@@ -164,5 +164,5 @@ def not_a_number(rng: random.Random) -> Planted:
     a, b, topic, places = _two(rng)
     at = rng.randrange(len(places))
     b[places[at]] = (b[places[at]][0], topic, float("nan"))
-    first = (rf"message {at} has another data",)
+    first = (rf"message {at} has a different data",)
     return _planted(Recordings(a, b, topic, {"differing": 1}, first=first, place=at))

@@ -153,7 +153,7 @@ _in(
     "latched: nobody waits",
     _kept(1, "tick"),
     ["qos = 10"],
-    r"/kept.* QoS .*durability transient_local in a, volatile in b",
+    r"/kept.* QoS\W.*durability transient_local → volatile",
     verdicts=("missing",),
     calls=None,
     entity="/kept",

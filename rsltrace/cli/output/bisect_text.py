@@ -14,7 +14,7 @@ from rsltrace.diff.report import render
 if TYPE_CHECKING:
     from rsltrace.campaign.bisect.repository import Commit, Repository
     from rsltrace.campaign.bisect.search import Found, Tried
-    from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result import Diff
 
 _FILES_MAX = 12
 Kept = tuple[Path, Path] | None

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EqualBlock, EventPair
 from rsltrace.diff.alignment.longest_increasing import longest_increasing
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 
 Ints = npt.NDArray[np.int64]
 _NONE = -1

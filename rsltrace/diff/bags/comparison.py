@@ -20,19 +20,12 @@ from rsltrace.diff.bags.content import ContentKeys
 from rsltrace.diff.bags.messages import Fetched, TopicPair, compare_topic
 from rsltrace.diff.bags.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
 from rsltrace.diff.bags.source import Source, SourceTopic, open_source, source_of
+from rsltrace.diff.facts.bags import BagVerdict, LoneTopic, MessageDivergence, Recording, TopicDiff
+from rsltrace.diff.facts.remarks import ComparedByBytes, LogTimesIgnored, OtherType, Remark, Told
 from rsltrace.diff.options import BY_STAMP, DiffOptions
-from rsltrace.diff.result.bags import (
-    BagDiff,
-    BagVerdict,
-    LoneTopic,
-    MessageDivergence,
-    Presence,
-    Recording,
-    TopicDiff,
-)
+from rsltrace.diff.result import BagDiff
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.errors import TraceError
-from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
 
 
@@ -78,7 +71,7 @@ class _Comparison:
         self._a, self._b = a, b
         self._options = options
         self._pairs, self._lone_a, self._lone_b = _paired(a, b, options)
-        self._notes = [*a.notes, *b.notes]
+        self._remarks: list[Remark] = [Told(note) for note in (*a.notes, *b.notes)]
 
     def run(self) -> BagDiff:
         scans_a, scans_b = self._scan(self._a, 0), self._scan(self._b, 1)
@@ -156,15 +149,15 @@ class _Comparison:
                         full[place] = everything.key(message)
                     keys[place] = maker.key(message)
                 except TraceError as error:
-                    self._note(f"{error}; compared byte by byte, padding included")
+                    self._note(ComparedByBytes(str(error)))
 
     def _compare(self, pairs: list[TopicPair], starts: tuple[int, int]) -> list[TopicDiff]:
         fetched = Fetched(self._a, self._b, pairs, self._options)
         return [compare_topic(pair, fetched, starts, self._options) for pair in pairs]
 
-    def _note(self, text: str) -> None:
-        if text not in self._notes and len(self._notes) < 10:
-            self._notes.append(text)
+    def _note(self, remark: Remark) -> None:
+        if remark not in self._remarks and len(self._remarks) < 10:
+            self._remarks.append(remark)
 
     def _result(
         self,
@@ -184,25 +177,21 @@ class _Comparison:
             if not (a.complete and b.complete):
                 verdict = BagVerdict.AS_FAR_AS_THEY_GO
         if self._options.by != BY_STAMP and topics:
-            self._note("log times are not compared (--by stamp matches messages by them)")
+            self._note(LogTimesIgnored())
         for topic in topics:
             if topic.type_a != topic.type_b:
-                self._note(
-                    f"{topic.topic} is {topic.type_a or 'of unknown type'} in a, "
-                    f"{topic.type_b or 'of unknown type'} in b"
-                )
+                self._note(OtherType(topic.topic, topic.type_a, topic.type_b))
         return BagDiff(
             a=a,
             b=b,
             verdict=verdict,
-            sentence=_sentence(verdict, first, topics, lone_a, lone_b),
             by=self._options.by,
             topics=topics,
             topics_only_a=lone_a,
             topics_only_b=lone_b,
             first=first,
             next_step=_next_step(a, b, first, self._options),
-            notes=tuple(self._notes),
+            remarks=tuple(self._remarks),
             as_far_as_they_go=self._options.as_far_as_they_go,
         )
 
@@ -257,67 +246,6 @@ def _recording(source: Source, scans: dict[int, _Scan]) -> Recording:
 
 def _lone(topic: SourceTopic, scan: _Scan) -> LoneTopic:
     return LoneTopic(topic.name, topic.type, len(scan.hashes))
-
-
-def _sentence(
-    verdict: BagVerdict,
-    first: MessageDivergence | None,
-    topics: tuple[TopicDiff, ...],
-    lone_a: tuple[LoneTopic, ...],
-    lone_b: tuple[LoneTopic, ...],
-) -> str:
-    messages = sum(topic.agreeing for topic in topics)
-    counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
-    if verdict is BagVerdict.EQUAL:
-        return f"The recordings are equal: {counted} say the same."
-    tolerated = sum(topic.tolerated for topic in topics)
-    ignored = sum(topic.ignored for topic in topics)
-    if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
-        how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
-        how += f" but for what is ignored ({ignored} differ in it)" if ignored else ""
-        return f"As far as they go, the recordings agree: {counted} {how}; not both are whole."
-    if verdict is BagVerdict.WITHIN_TOLERANCE and not tolerated:
-        return (
-            "The recordings are equal but for what is ignored, not identical: "
-            f"{ignored} of {counted} differ in it."
-        )
-    if verdict is BagVerdict.WITHIN_TOLERANCE:
-        also = f", {ignored} more in what is ignored" if ignored else ""
-        return (
-            f"The recordings are equal within tolerance, not identical: {tolerated} of {counted} "
-            f"differ, none by more than is tolerated{also}."
-        )
-    if first is None:
-        lone = [f"{topic.topic} is only in a" for topic in lone_a]
-        lone += [f"{topic.topic} is only in b" for topic in lone_b]
-        more = f" and {len(lone) - 3} more" if len(lone) > 3 else ""
-        same = f"{counted} in both agree, but " if messages else ""
-        text = f"{same}{', '.join(lone[:3])}{more}."
-        return text[0].upper() + text[1:]
-    when = f"{format_seconds(first.after_ns)} s after the start"
-    diverge = f"The recordings first diverge on {first.topic}, {when}"
-    if first.note:
-        return f"{diverge}: {first.note}."
-    if first.presence is Presence.ONLY_A:
-        assert first.a is not None
-        return f"{diverge}: message {first.a.index} of a is missing in b."
-    if first.presence is Presence.ONLY_B:
-        assert first.b is not None
-        return f"{diverge}: message {first.b.index} of b is extra, not in a."
-    assert first.a is not None
-    differing = len(first.fields) + first.more_fields
-    if not first.fields:
-        what = "differs"
-    elif differing == 1:
-        what = f"has another {first.fields[0].path}"
-    else:
-        others = _number(differing - 1, "other field")
-        what = f"has another {first.fields[0].path} (and {others})"
-    return f"{diverge}: message {first.a.index} {what}."
-
-
-def _number(count: int, noun: str) -> str:
-    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _next_step(

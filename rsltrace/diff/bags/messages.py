@@ -13,14 +13,9 @@ from dataclasses import dataclass, replace
 from rsltrace.diff.bags.pairing import LOOKAHEAD, MessagePair, Pairing
 from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
 from rsltrace.diff.bags.source import Source, SourceTopic
+from rsltrace.diff.facts.bags import BagMessage, MessageDivergence, TopicDiff
+from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
 from rsltrace.diff.options import BY_STAMP, DiffOptions
-from rsltrace.diff.result.bags import (
-    BagMessage,
-    MessageDivergence,
-    Presence,
-    TopicDiff,
-)
-from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import diff_messages, field_differences, preview
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.errors import TraceError
@@ -280,14 +275,14 @@ def _divergence(
     view_a = a.view(one.a, pair.stamps_a) if in_a else None
     view_b = b.view(one.b, pair.stamps_b) if in_b else None
     fields: tuple[FieldDifference, ...] = ()
-    more, reason = 0, ""
+    more, no_fields, problem = 0, None, ""
     if in_a and in_b:
         try:
             fields, more = diff_messages(a.get(one.a), b.get(one.b), options)
             if not fields:
-                reason = "the messages differ in bytes that their types do not describe"
+                no_fields = NoFields.UNDESCRIBED_BYTES
         except TraceError as error:
-            reason = str(error)
+            no_fields, problem = NoFields.UNREADABLE, str(error)
     side, stamps, index = (a, pair.stamps_a, one.a) if in_a else (b, pair.stamps_b, one.b)
     before = range(max(index - options.context, 0), index)
     return MessageDivergence(
@@ -303,7 +298,8 @@ def _divergence(
         ),
         fields=fields,
         more_fields=more,
-        reason=reason,
+        no_fields=no_fields,
+        error=problem,
         before=tuple(side.view(place, stamps) for place in before),
     )
 
@@ -328,10 +324,12 @@ def _moved(
     gap = next(g for g in pair.gaps if g.a_start <= one.a < g.a_end or g.b_start <= one.b < g.b_end)
     here, there = (gap.b_start, whole.b) if one.a >= 0 else (gap.a_start, whole.a)
     after_ns = min(view.stamp_ns - start for view, start in zip(views, starts, strict=True))
-    if there == here + 1 and abs(gap.surplus) == 1:
-        note = f"messages {gap.a_start} and {gap.a_start + 1} are swapped"
-    else:
-        note = f"message {whole.a} of a is message {whole.b} of b, in another order"
     return replace(
-        found, presence=Presence.BOTH, a=views[0], b=views[1], after_ns=after_ns, note=note
+        found,
+        presence=Presence.BOTH,
+        a=views[0],
+        b=views[1],
+        after_ns=after_ns,
+        moved=True,
+        swapped_at=gap.a_start if there == here + 1 and abs(gap.surplus) == 1 else None,
     )

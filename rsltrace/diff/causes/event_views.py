@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
-from rsltrace.diff.result.events import EventView
+from rsltrace.diff.facts.evidence import EventView
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.words.code import code_places, place_here, places_text
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.outputs import output_text
-from rsltrace.words.phrases import event_phrase
 
 COUNTED_MAX = 8192
 """Events up to here are told which of their entity's events they are. Counting takes reading."""
@@ -23,9 +22,6 @@ COUNTED_MAX = 8192
 _SUMMARY_OUTPUTS_MAX = 4
 _DRAW = int(OutputKind.DRAW)
 _SEGMENTS_BACK = 2
-
-CLOCK_OF = "the clock of "
-"""How the text of a draw begins that has set a clock."""
 
 
 class EventViews:
@@ -125,27 +121,11 @@ class EventViews:
 def drawn_for(key: EntityKey) -> str:
     """Return what chance decided about: a link, or a clock that was set."""
     if key.kind == EntityKind.NODE.label:
-        return f"{CLOCK_OF}{key.name}"
+        return f"the clock of {key.name}"
     return f"{key.kind} {key.name} of {key.node}"
-
-
-def node_of(view: EventView) -> str:
-    """Return the full name of the node an event is of; a constructor's is the one it makes."""
-    is_node = view.entity.kind == EntityKind.NODE.label
-    return view.entity.name if is_node else view.entity.node
 
 
 def subject_of(view: EventView) -> str:
     """Return the node an event is of, ``main package:main`` for a main without one, or ""."""
     is_main = view.entity.kind == EntityKind.MAIN.label
-    return node_of(view) or (f"main {view.entity.name}" if is_main else "")
-
-
-def phrase(view: EventView) -> str:
-    """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
-    return event_phrase(view.kind, view.entity)
-
-
-def raised(view: EventView) -> bool:
-    """Whether an event ended with an exception."""
-    return bool(view.flags & EventFlag.RAISED)
+    return view.node or (f"main {view.entity.name}" if is_main else "")

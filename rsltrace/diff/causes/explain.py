@@ -1,36 +1,48 @@
-"""One divergence with everything there is to say about it: verdict, way from the root, evidence."""
+"""One divergence with everything there is to know of it: verdict, way from the root, evidence."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 from rsltrace.diff.alignment.blocks import EventPair
 from rsltrace.diff.alignment.rows import Run, outputs_of
-from rsltrace.diff.causes.call_differences import call_differences
-from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
+from rsltrace.diff.causes.calls import call_differences
+from rsltrace.diff.causes.classify import ROOT_OF, Case, judge
+from rsltrace.diff.causes.delivery import (
+    are_swapped,
+    entity_changes,
+    lost_message,
+    periods,
+    slept,
+    still_waits,
+    topics_of,
+)
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
-from rsltrace.diff.causes.likely_cause import with_likely_cause
-from rsltrace.diff.causes.lost_messages import lost_message
+from rsltrace.diff.causes.likely_cause import likely_cause
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.causes.propagation import BUSY, DRAWN, MADE, NODE, STUCK, FoundDivergence, Origin
 from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
-from rsltrace.diff.causes.swapped import swapped_with
-from rsltrace.diff.causes.waits import slept_text, still_waits
-from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import (
+from rsltrace.diff.facts.causes import CauseOf, FollowsFrom, Judgement, Root, Verdict
+from rsltrace.diff.facts.evidence import (
     CauseStep,
-    Divergence,
+    EntitiesChanged,
+    EventView,
+    Link,
+    LinkKind,
     MessageDifference,
     Reach,
+    Setting,
+    SettingKind,
 )
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.remarks import Remark
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result import Divergence
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.words.phrases import seconds_text
@@ -57,7 +69,7 @@ class Explainer:
         self._viewer_a = EventViews(self.run_a)
         self._viewer_b = EventViews(self.run_b)
         self._relevance = Relevance(self.run_a, self.run_b)
-        self.warnings: dict[str, None] = {}
+        self.warnings: dict[Remark, None] = {}
         """What to know before one runs a ``next_step``."""
 
     def explain(self, found: FoundDivergence) -> Divergence:
@@ -66,7 +78,7 @@ class Explainer:
         judgement = self._judge(found, a, b, messages)
         if found.origin.previous is not None:
             judgement = self._following(judgement, found.origin)
-        return self._divergence(found, judgement, messages)
+        return self._divergence(found, judgement)
 
     def explain_effect(self, found: FoundDivergence, first: Divergence) -> Divergence:
         """Return everything about the first effect of a node that was set up otherwise."""
@@ -75,7 +87,7 @@ class Explainer:
         return replace(
             effect,
             root=ROOT_OF.get(root.verdict, root.root),
-            root_sentence=first.root_sentence,
+            why=CauseOf(first),
             settings=root.settings,
             reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
             next_step=first.next_step,
@@ -91,16 +103,10 @@ class Explainer:
 
     def ended(self, index: int, judgement: Judgement) -> Divergence:
         """Return a divergence at ``index`` where one run has nothing more to compare."""
-        bare = Divergence(
-            verdict=judgement.verdict,
-            sentence=judgement.sentence,
-            a=judgement.a,
-            b=judgement.b,
-            root=judgement.root,
-            root_sentence=judgement.root_sentence,
+        bare = _divergence_of(
+            judgement,
             chain=(CauseStep(judgement.a, judgement.b),),
             next_step=self._next_step(judgement),
-            settings=judgement.settings,
         )
         return self._with_context(bare, index, index)
 
@@ -157,29 +163,22 @@ class Explainer:
                 settings=self.settings,
                 relevance=self._relevance,
                 state=state_differences(self.run_a, self.run_b, a, b),
-                lost=still_waits(self.run_a, self.run_b, a, b)
+                loss=still_waits(self.run_a, self.run_b, a, b)
                 or lost_message(self.run_a, self.run_b, a, b),
-                periods=self._periods(a, b),
-                slept=slept_text(self.run_a, self.run_b, a, b),
-                swapped_with_ns=swapped_with(self.run_a, self.run_b, a, b),
+                periods_ns=periods(self.run_a, self.run_b, a, b),
+                slept=slept(self.run_a, self.run_b, a, b),
+                changed=self._changed(a or b, messages),
+                swapped=are_swapped(self.run_a, self.run_b, a, b),
             )
         )
 
-    def _periods(self, a: EventView | None, b: EventView | None) -> tuple[int, int] | None:
-        view = a or b
-        if view is None or view.kind is not EventKind.TIMER:
+    def _changed(
+        self, view: EventView | None, messages: Sequence[MessageDifference]
+    ) -> EntitiesChanged | None:
+        """Return the entities whose QoS shows in an event."""
+        if view is None or not (topics := topics_of(view, messages)):
             return None
-        number = self.run_a.matching.by_key[view.entity]
-        found = []
-        for run in (self.run_a, self.run_b):
-            table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
-            ids = (table == number).nonzero()[0]
-            detail = run.trace.entities[int(ids[0])].detail if len(ids) else {}
-            found.append(detail.get("period_ns"))
-        one, other = found
-        if isinstance(one, int) and isinstance(other, int) and one != other:
-            return one, other
-        return None
+        return entity_changes(self.run_a, self.run_b, topics)
 
     def _root_judgement(self, number: int) -> Judgement:
         if number not in self._judged:
@@ -190,15 +189,12 @@ class Explainer:
     def _following(self, judgement: Judgement, origin: Origin) -> Judgement:
         """Return the verdict on a consequence: its own, with the root of its divergence."""
         root = self._root_judgement(origin.root)
-        verdict, sentence = judgement.verdict, judgement.sentence
-        if origin.why == NODE and verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT:
-            sentence += ", because its node had done something else before"
         return replace(
             judgement,
-            verdict=verdict,
-            sentence=sentence,
             root=ROOT_OF.get(root.verdict, root.root),
-            root_sentence=f"it follows from an earlier difference: {root.sentence}",
+            why=FollowsFrom(root),
+            node_diverged=origin.why == NODE
+            and judgement.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
         )
 
     # -- the way from the root -------------------------------------------------------------------
@@ -210,22 +206,22 @@ class Explainer:
         origins.reverse()
         steps = []
         for origin, following in zip(origins, [*origins[1:], None], strict=True):
-            relation = ""
+            link = Link()
             if following is not None and following.why == NODE:
                 item = following.item
                 view = self.view(item.a, of_b=False) or self.view(item.b, of_b=True)
-                relation = f"may have changed the state of {view.entity.node}" if view else ""
+                link = Link(LinkKind.CHANGED_STATE, view.entity.node) if view else link
             elif following is not None and following.why in _SHARED:
-                relation = _SHARED[following.why]
+                link = Link(_SHARED[following.why])
             elif following is not None:
-                relation = self._sent(following)
+                link = self._sent(following)
             a = self.view(origin.item.a, of_b=False)
             b = self.view(origin.item.b, of_b=True)
-            steps.append(CauseStep(a, b, relation))
+            steps.append(CauseStep(a, b, link))
         if len(steps) > STEPS_MAX:
             left_out = len(steps) - STEPS_MAX
             steps[1 : 1 + left_out] = []
-            steps[0] = replace(steps[0], relation=f"led, in {left_out} more steps, to")
+            steps[0] = replace(steps[0], link=Link(LinkKind.MORE_STEPS, steps=left_out))
         return (*self._ancestors(origins[0]), *steps)
 
     def _ancestors(self, root: Origin) -> list[CauseStep]:
@@ -239,56 +235,47 @@ class Explainer:
             cause = _cause(view)
             if not 0 <= cause < min(view.index, start if start >= 0 else view.index):
                 break
-            relation = self._relation(self.run_b if of_b else self.run_a, cause, view.cause_output)
+            link = self._link(self.run_b if of_b else self.run_a, cause, view.cause_output)
             a, b = self.view(cause, of_b=False), self.view(cause, of_b=True)
-            steps.append(CauseStep(a, b, relation))
+            steps.append(CauseStep(a, b, link))
             view = a
         return steps[::-1]
 
-    def _sent(self, origin: Origin) -> str:
+    def _sent(self, origin: Origin) -> Link:
         """Say how the cause of an event led to it."""
         item = origin.item
         for run, index in ((self.run_a, item.a), (self.run_b, item.b)):
             if index >= 0:
                 event = run.trace.event(index)
                 if event.cause_event != NO_EVENT:
-                    return self._relation(run, event.cause_event, event.cause_output)
-        return ""
+                    return self._link(run, event.cause_event, event.cause_output)
+        return Link()
 
-    def _relation(self, run: Run, cause: int, nth: int) -> str:
+    def _link(self, run: Run, cause: int, nth: int) -> Link:
         outputs = outputs_of(run, cause)
         if nth >= len(outputs):
-            return "caused"
+            return Link(LinkKind.CAUSED)
         kind, number, _, _ = outputs[nth]
-        verb = _VERBS.get(kind, "caused")
-        return f"{verb} {run.matching.keys[number].name}".rstrip()
+        return Link(_LINKS.get(kind, LinkKind.CAUSED), run.matching.keys[number].name)
 
     # -- the rest --------------------------------------------------------------------------------
 
-    def _divergence(
-        self, found: FoundDivergence, judgement: Judgement, messages: tuple[MessageDifference, ...]
-    ) -> Divergence:
+    def _divergence(self, found: FoundDivergence, judgement: Judgement) -> Divergence:
         place_a = judgement.a.index if judgement.a is not None else found.place_a
         place_b = judgement.b.index if judgement.b is not None else found.place_b
-        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b)
+        changed = judgement.changed
+        node = "" if changed is None else changed.node
+        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b, node)
         if found.origin.previous is None:
-            run = self.run_b if judgement.a is None else self.run_a
-            judgement = with_likely_cause(judgement, run, messages, calls, self._relevance)
-        bare = Divergence(
-            verdict=judgement.verdict,
-            sentence=judgement.sentence,
-            a=judgement.a,
-            b=judgement.b,
-            root=judgement.root,
-            root_sentence=judgement.root_sentence,
-            likely_cause=judgement.likely_cause,
+            runs = self.run_a, self.run_b
+            likely = likely_cause(judgement, runs, calls, self._relevance)
+            judgement = replace(judgement, likely=likely)
+        bare = _divergence_of(
+            judgement,
             chain=self._chain(found),
-            messages=messages,
             calls=calls,
-            state=state_differences(self.run_a, self.run_b, judgement.a, judgement.b),
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
-            settings=judgement.settings,
         )
         return self._with_context(bare, place_a, place_b)
 
@@ -362,7 +349,7 @@ def _word(path: str) -> str:
 
 def _told_to_differ(settings: Sequence[Setting]) -> bool:
     """Whether job or code are others in the two runs: that needs no third run to be believed."""
-    return any(not setting.place.startswith("environment:") for setting in settings)
+    return any(setting.kind is not SettingKind.ENVIRONMENT for setting in settings)
 
 
 def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
@@ -375,23 +362,28 @@ def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
 
 
 _SHARED = {
-    DRAWN: "is drawn otherwise again in",
-    MADE: "made a receiver of",
-    BUSY: "keeps waiting",
-    STUCK: "ended before",
+    DRAWN: LinkKind.DRAWN_AGAIN,
+    MADE: LinkKind.MADE_RECEIVER,
+    BUSY: LinkKind.KEEPS_WAITING,
+    STUCK: LinkKind.ENDED_BEFORE,
 }
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
 """What recording the job once more tells more about: which of the two runs is the usual one."""
 
-_VERBS: dict[int, str] = {
-    OutputKind.MESSAGE: "published",
-    OutputKind.REQUEST: "called",
-    OutputKind.RESPONSE: "answered",
-    OutputKind.LOG: "logged to",
-    OutputKind.GUARD: "triggered",
-    OutputKind.TASK: "made or resumed a task of",
+_LINKS: dict[int, LinkKind] = {
+    OutputKind.MESSAGE: LinkKind.PUBLISHED,
+    OutputKind.REQUEST: LinkKind.CALLED,
+    OutputKind.RESPONSE: LinkKind.ANSWERED,
+    OutputKind.LOG: LinkKind.LOGGED,
+    OutputKind.GUARD: LinkKind.TRIGGERED,
+    OutputKind.TASK: LinkKind.MADE_TASK,
 }
+
+
+def _divergence_of(judgement: Judgement, **more: Any) -> Divergence:
+    own = {field.name: getattr(judgement, field.name) for field in fields(judgement)}
+    return Divergence(**own, **more)
 
 
 def _cause(view: EventView | None) -> int:

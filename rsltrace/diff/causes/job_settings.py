@@ -17,7 +17,7 @@ from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
-from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.model.nesting import nested_too_deep
 from rsltrace.model.stamp import format_duration
 from rsltrace.trace.reader import Trace
@@ -47,10 +47,14 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
             continue
         places = text_a.place(change.path_a, change.a), text_b.place(change.path_b, change.b)
         depth, line = max(places, key=lambda place: place[0])
-        name = f"{_name(a, b)}:{line}" if depth else "job"
         key = _shared_key(change, resolved_a, resolved_b)
         order = (change.may_be_one_file, line or _LINES_MAX)
-        found.append((order, Setting(name, *change.shown(), key)))
+        found.append(
+            (
+                order,
+                Setting(SettingKind.JOB, _name(a, b), *change.shown(), key, line if depth else 0),
+            )
+        )
     return tuple(setting for _, setting in sorted(found, key=lambda item: item[0]))
 
 
@@ -294,7 +298,7 @@ def _differing_lines(a: Trace, b: Trace) -> Iterator[Setting]:
         name = f"effective {name}"  # put together from several files: no line of one of them
     (numbers_a, lines_a), (numbers_b, lines_b) = _lines(a), _lines(b)
     if max(len(lines_a), len(lines_b)) > _LINES_MAX:
-        yield Setting(name, f"{len(lines_a)} lines", f"{len(lines_b)} lines")
+        yield Setting(SettingKind.JOB, name, f"{len(lines_a)} lines", f"{len(lines_b)} lines")
         return
     matcher = difflib.SequenceMatcher(None, lines_a, lines_b, autojunk=False)
     for tag, begin_a, end_a, begin_b, end_b in matcher.get_opcodes():
@@ -304,7 +308,7 @@ def _differing_lines(a: Trace, b: Trace) -> Iterator[Setting]:
             line_a = lines_a[begin_a + nth] if begin_a + nth < end_a else None
             line_b = lines_b[begin_b + nth] if begin_b + nth < end_b else None
             number = numbers_b[begin_b + nth] if line_a is None else numbers_a[begin_a + nth]
-            yield Setting(f"{name}:{number}", line_a, line_b)
+            yield Setting(SettingKind.JOB, name, line_a, line_b, line=number)
 
 
 def _lines(trace: Trace) -> tuple[list[int], list[str]]:

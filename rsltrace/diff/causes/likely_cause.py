@@ -1,44 +1,39 @@
-"""What came from outside and is likely behind a divergence: who read what, and what it was."""
+"""What is likely behind a divergence: who got which answer from outside, or the order of a set."""
 
 from __future__ import annotations
 
-import re
+import ast
+import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from rsltrace.diff.alignment.rows import Run
-from rsltrace.diff.causes.answers import STARTED_BY, answers_apart
-from rsltrace.diff.causes.call_differences import unrecorded_call
-from rsltrace.diff.causes.classify import Judgement
+from rsltrace.diff.causes.calls import (
+    STARTED_BY,
+    subject_of_call,
+    unquoted,
+    unrecorded_answer,
+)
+from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
-from rsltrace.diff.causes.set_order import set_behind
-from rsltrace.diff.causes.wording import MADE_DIFFERENTLY, NAMED_MAX
-from rsltrace.diff.result.divergence import CallDifference, MessageDifference
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.verdicts import Root
+from rsltrace.diff.facts.causes import (
+    Judgement,
+    LikelyCause,
+    OutsideAnswers,
+    Root,
+    SetOrder,
+    Verdict,
+)
+from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, Moved
+from rsltrace.errors import JobError
 from rsltrace.model.finding import Source
-from rsltrace.model.printable import printable
+from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.words.code import code_file, code_place
 
-NOT_DETERMINISTIC = "not deterministic"
-_ANSWER_MAX = 60
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
 """What ``subprocess`` asks of the system about the program that it has started."""
-
-_CHANGED = re.compile(r"(\d+ bytes), changed \d+")
-_VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
-_FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
-_CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
-_VERBS = {
-    Source.ENVIRONMENT: "read",
-    Source.PID: "read",
-    Source.FILE: "read",
-    Source.DIRECTORY: "listed",
-    Source.CLOCK: "read",
-    Source.RANDOM: "drew",
-    Source.SOCKET: "called",
-}
-
 
 _OPEN_TO_IT = frozenset(
     (Root.CALLBACK, Root.TIMING, Root.MISSING, Root.EXTRA, Root.EXCEPTION, Root.SCHEDULE, Root.JOB)
@@ -46,118 +41,119 @@ _OPEN_TO_IT = frozenset(
 """Roots that what a node read from outside can be behind."""
 
 
-def with_likely_cause(
+_OF_ORDER = (Verdict.SCHEDULE, Verdict.TIMING, Verdict.MISSING, Verdict.EXTRA)
+"""Verdicts that QoS and callback groups can be behind."""
+
+
+def likely_cause(
     judgement: Judgement,
-    run: Run,
-    messages: Sequence[MessageDifference],
+    runs: tuple[Run, Run],
     calls: Sequence[CallDifference],
     relevance: Relevance,
-) -> Judgement:
-    """Return a verdict on a root that names what explains it: the first of ``calls`` if its answers
-    differ, or a set whose order shows. ``run`` is one that has the event."""
-    view = judgement.a or judgement.b
-    if judgement.root not in _OPEN_TO_IT or not judgement.root_sentence or view is None:
-        return judgement
-    if calls and calls[0].a != calls[0].b:
-        text = calls_sentence(calls, subject_of(view), messages)
-    else:
-        text = set_behind(run, view, messages, calls, relevance)
-    if not text:
-        return _with_unrecorded(judgement, run, view)
-    _, made_differently, others = judgement.root_sentence.partition(MADE_DIFFERENTLY)
-    why = f"{text}; and {made_differently}{others}" if made_differently else text
-    sentence = f"{judgement.sentence}; likely cause: {text}"
-    return replace(judgement, sentence=sentence, root_sentence=why, likely_cause=text)
+) -> LikelyCause | None:
+    """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
+    shows, entities with other properties. If nothing does, the answer that nobody kept.
+    """
+    run_a, run_b = runs
+    run = run_b if judgement.a is None else run_a
+    view = judgement.one
+    if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
+        return None
+    if calls and calls[0].differs:
+        changed = judgement.changed
+        subject = subject_of(view) if changed is None else changed.node
+        return OutsideAnswers(subject, telling_calls(calls, judgement.messages))
+    if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
+        return found
+    if judgement.verdict in _OF_ORDER and judgement.changed is None:
+        nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
+        changed = entity_changes(run_a, run_b, topics_of(view, judgement.messages), nodes - {""})
+        if changed is not None:
+            return changed
+    return unrecorded_answer(run, view) if judgement.is_unexplained else None
 
 
-def _with_unrecorded(judgement: Judgement, run: Run, view: EventView) -> Judgement:
-    """Name the answer that nobody kept, where nothing that is known explains a divergence."""
-    if NOT_DETERMINISTIC not in judgement.root_sentence:
-        return judgement
-    found = unrecorded_call(run, view)
-    if found is None:
-        return judgement
-    call, advice = found
-    return replace(
-        judgement,
-        sentence=f"{judgement.sentence}; possible cause: {call}, which is not recorded",
-        root_sentence=f"{judgement.root_sentence}; {call} is not recorded ({advice})",
-    )
-
-
-def calls_sentence(
-    calls: Sequence[CallDifference], node: str, messages: Sequence[MessageDifference]
-) -> str:
-    """Return the calls with different answers as a sentence. Of several those whose answers show in
-    what differs, if there are such; else all may be the cause."""
-    differing = list({(c.call, c.where): c for c in reversed(calls) if c.a != c.b}.values())[::-1]
-    differing = [c for c in differing if not _is_touched(c)] or differing
+def telling_calls(
+    calls: Sequence[CallDifference], messages: Sequence[MessageDifference]
+) -> tuple[CallDifference, ...]:
+    """Return the calls with different answers. Of several those whose answers show in what differs,
+    if there are such; else all may be the cause."""
+    differing = list({(c.call, c.where): c for c in reversed(calls) if c.differs}.values())[::-1]
+    differing = [c for c in differing if not c.only_touched] or differing
     if len(differing) > 1:
         shown = _shown(messages)
-        telling = [c for c in differing if {_unquoted(v) for v in (c.a, c.b) if v} & shown]
+        telling = [c for c in differing if {unquoted(v) for v in (c.a, c.b) if v} & shown]
         differing = telling or differing
     programs = {c.where: c.call for c in calls if c.call.startswith(STARTED_BY)}
-    of_programs = [
-        replace(c, call=programs[c.where]) if c.call in _OF_PROGRAMS and c.where in programs else c
+    return tuple(
+        replace(c, call=programs[c.where], subject=subject_of_call(c.source, programs[c.where]))
+        if c.call in _OF_PROGRAMS and c.where in programs
+        else c
         for c in differing
-    ]
-    told = list(dict.fromkeys(call_sentence(call, node) for call in of_programs))
-    first, *others = told[:NAMED_MAX]
-    more = len(told) - NAMED_MAX
-    text = "; ".join([first, *(other.removeprefix(f"{node} ") for other in others)])
-    return f"{text}; and {more} more" if more > 0 else text
-
-
-def _is_touched(call: CallDifference) -> bool:
-    """Whether nothing of a file differs but when it was written."""
-    files = [_CHANGED.fullmatch(value or "") for value in (call.a, call.b)]
-    return bool(files[0] and files[1] and files[0][1] == files[1][1])
+    )
 
 
 def _shown(messages: Sequence[MessageDifference]) -> set[str]:
-    texts = {word for message in messages for word in message.topic.split()}
-    return texts | {
-        _unquoted(value, '"')
-        for m in messages
-        for field in m.fields
-        for value in (field.a, field.b)
-    }
+    names = {message.entity.name for message in messages}
+    values = (value for m in messages for field in m.fields for value in (field.a, field.b))
+    return names | {unquoted(value, '"') for value in values}
 
 
-def call_sentence(call: CallDifference, node: str) -> str:
-    """Return ``/picker read MOTOR_SEED, 6 in a and 4 in b, at picker.py:24``."""
-    source = Source(call.source)
-    place = call.where.partition(" in ")[0]
-    done = (
-        f"{node or 'the run'} {_VERBS.get(source, 'called')} {printable(_what(source, call.call))}"
+# -- the set whose order shows in a message ------------------------------------------------------
+
+
+def _set_behind(
+    run: Run,
+    view: EventView,
+    messages: Sequence[MessageDifference],
+    calls: Sequence[CallDifference],
+    relevance: Relevance,
+) -> SetOrder | None:
+    """Return the set through which an event goes that sent the same in another order; None if it
+    did not, or if its code goes through no set that a run leaves as it is."""
+    if not any(map(_is_reordered, messages)):
+        return None
+    for call in calls:
+        if call.source == Source.ORDER.value:
+            return SetOrder(call.call, call.where.partition(" in ")[0])
+    if relevance.sets_are_in_order:
+        return None
+    place = code_place(run.trace, run.trace.event(view.index))
+    found = code_file(run.trace, place)
+    if found is None or not _is_as_recorded(run, found[0]):
+        return None
+    lines = _lines_with_sets(*found)
+    if not lines:
+        return None
+    file = place.rpartition(":")[0]
+    return SetOrder(lines[0][1], f"{file}:{lines[0][0]}", len(lines) - 1)
+
+
+def _is_reordered(message: MessageDifference) -> bool:
+    return isinstance(message.fate, Moved) or any(one.is_reordered for one in message.fields)
+
+
+def _is_as_recorded(run: Run, file: Path) -> bool:
+    try:
+        present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    except OSError:
+        return False
+    return present in run.trace.metadata(METADATA_SOURCES).values()
+
+
+def _lines_with_sets(file: Path, line: int) -> list[tuple[int, str]]:
+    """Return where a file goes through sets: in the function at a line, or else anywhere."""
+    from rsltrace.audit.audit import audit_path  # most diffs do not need it
+
+    try:
+        found = [(o.line, o.call) for o in audit_path(file).found if o.kind == Source.ORDER.value]
+        tree = ast.parse(file.read_bytes())
+    except (JobError, OSError, SyntaxError, ValueError):
+        return []
+    ends = (
+        node.end_lineno or line
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.lineno == line
     )
-    if call.a is None or call.b is None:
-        return f"{done} only in {'b' if call.a is None else 'a'}, at {place}"
-    a, b = _answers(source, call.a, call.b)
-    return f"{done}, {a} in a and {b} in b, at {place}"
-
-
-def _what(source: Source, call: str) -> str:
-    if source is Source.ENVIRONMENT and (found := _VARIABLE.match(call)):
-        return found[2]
-    if source in (Source.FILE, Source.DIRECTORY) and (found := _FILE.match(call)):
-        return found[2]
-    return call
-
-
-def _answers(source: Source, a: str, b: str) -> tuple[str, str]:
-    contents = _CONTENT.fullmatch(a), _CONTENT.fullmatch(b)
-    if contents[0] and contents[1] and contents[0][1] == contents[1][1]:
-        a, b = contents[0][2], contents[1][2]
-    sizes = _CHANGED.fullmatch(a), _CHANGED.fullmatch(b)
-    if sizes[0] and sizes[1] and sizes[0][1] != sizes[1][1]:
-        a, b = sizes[0][1], sizes[1][1]
-    if source is Source.ENVIRONMENT:
-        a, b = _unquoted(a), _unquoted(b)
-    return answers_apart(a, b, _ANSWER_MAX)
-
-
-def _unquoted(text: str, quote: str = "'") -> str:
-    inner = text[1:-1]
-    quoted = len(text) > 2 and text[0] == text[-1] == quote
-    return inner if quoted and re.fullmatch(r"[\w./:+-]+", inner) else text
+    end = next(ends, line)
+    return [one for one in found if line <= one[0] <= end] or found

@@ -1,30 +1,50 @@
-"""The messages in which two events differ, decoded where their payloads were recorded."""
+"""The messages in which two events differ, decoded where their payloads were recorded, and what
+became of an output that only one of two events has: sent twice, sent later, done to a timer. The
+trace has hashes of these; what they stand for is found by trying."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cached_property
+from itertools import islice, pairwise
 
 from rsltrace.diff.alignment.outputs import matched_outputs
-from rsltrace.diff.alignment.rows import OutputRow, Run, counts, outputs_of
+from rsltrace.diff.alignment.rows import (
+    TIMER,
+    OutputRow,
+    Rows,
+    Run,
+    counts,
+    load_rows,
+    outputs_of,
+)
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
-from rsltrace.diff.causes.output_notes import (
-    IN_ANOTHER_ORDER,
-    OutputNotes,
-    parameter_changes,
-    parameters_text,
+from rsltrace.diff.facts.evidence import (
+    EventView,
+    Fate,
+    FieldDifference,
+    MessageDifference,
+    Moved,
+    NoFields,
+    ParametersChanged,
+    ParametersSet,
+    Presence,
+    SentLater,
+    SentTimes,
+    TimerCancelled,
+    TimerPeriodSet,
 )
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import ALL_IGNORED, MessageDifference
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.errors import TraceError
 from rsltrace.model.draw import draw_text
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
 from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
 from rsltrace.words.code import output_places, place_here
 from rsltrace.words.entities import EntityKey
@@ -37,7 +57,6 @@ MESSAGES_MAX = 50
 _EXCEPTION_MAX = 200
 _LOG_MAX = 100
 _INPUT = -1
-_IN_BOTH, _ONLY_A, _ONLY_B = "both", "only a", "only b"
 _WITH_PAYLOAD = frozenset(
     (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
 )
@@ -61,6 +80,17 @@ def message_differences(
     return tuple(found)
 
 
+_LOOKED_AT_MAX = 1000
+"""Events in which an output is looked for that came later."""
+
+_PARAMETERS_MAX = 3
+_VALUES = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}
+"""The field of a ``ParameterValue`` by its type."""
+
+_SENT = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
+_CANCEL_HASH = hash64(pack_operation(TIMER_CANCEL, 0))
+
+
 class _Evidence:
     def __init__(self, run_a: Run, run_b: Run, options: DiffOptions) -> None:
         self._run_a = run_a
@@ -76,7 +106,7 @@ class _Evidence:
             yield self._difference(_INPUT, input_a, input_b, hash_a, hash_b)
         outputs_a = outputs_of(self._run_a, a.index) if a is not None else []
         outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
-        notes = OutputNotes(self._run_a, self._run_b, a, b)
+        fates = _Fates(self._run_a, self._run_b, a, b)
         bag = any(view is not None and _is_published_input(view) for view in (a, b))
         keys = self._run_a.matching.keys
         for position, x, y, moved in matched_outputs(outputs_a, outputs_b, keys):
@@ -89,8 +119,8 @@ class _Evidence:
             found = replace(found, code=tuple(dict.fromkeys(places)))
             one = x or y
             if one is not None and not (x and y):
-                note = notes.note(one, (outputs_a, outputs_b), only_b=x is None)
-                found = replace(found, note=note or found.note)
+                fate = fates.fate(one, (outputs_a, outputs_b), only_b=x is None)
+                found = replace(found, fate=fate or found.fate)
             yield found
 
     def _places(self, run: Run, row: OutputRow | None, view: EventView | None) -> list[str]:
@@ -132,7 +162,7 @@ class _Evidence:
         kind, number, _, _ = one
         keys = self._run_a.matching.keys
         key = keys[number]
-        presence = _IN_BOTH if a and b else _ONLY_A if a else _ONLY_B
+        presence = Presence.BOTH if a and b else Presence.ONLY_A if a else Presence.ONLY_B
         topic = _topic(kind, key)
         base = MessageDifference(
             kind=None if position == _INPUT else OutputKind(kind),
@@ -142,8 +172,8 @@ class _Evidence:
             presence=presence,
             hash_a=hash_a,
             hash_b=hash_b,
-            reason="sent in another order" if moved else "",
-            note=IN_ANOTHER_ORDER if moved else "",
+            fate=Moved() if moved else None,
+            entity=key,
         )
         if moved or kind == OutputKind.ENTITY:
             return base
@@ -157,11 +187,11 @@ class _Evidence:
             try:
                 value = self._decoded(run, output)
             except TraceError as error:
-                return replace(base, reason=str(error))
+                return replace(base, no_fields=NoFields.UNREADABLE, error=str(error))
             if value is None and kind not in _WITH_PAYLOAD:
                 return base
             if value is None:
-                return replace(base, reason=self._not_recorded(run, topic))
+                return replace(base, no_fields=_NOT_RECORDED[run.of_b])
             values.append(value)
         if kind == OutputKind.EXCEPTION:
             raised = [_last_line(value) for value in values]
@@ -169,17 +199,17 @@ class _Evidence:
                 return replace(base, preview=raised[0])
             return replace(base, fields=(FieldDifference("raised", raised[0], raised[1]),))
         if len(values) == 1:
-            note = parameters_text(values[0]) if topic == PARAMETER_EVENTS else ""
+            was_set = _parameters_set(values[0]) if topic == PARAMETER_EVENTS else ()
+            became = ParametersSet(was_set) if was_set else None
             text = _log_text(values[0]) if kind == OutputKind.LOG else ""
-            return replace(base, preview=text or preview(values[0]), note=note)
+            return replace(base, preview=text or preview(values[0]), fate=became)
         fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
-        reason = ""
-        if not fields and self._options.ignore:
-            reason = ALL_IGNORED
-        elif not fields:
-            reason = "its fields are equal, but what the recorder hashed of it is not"
-        note = parameter_changes(*values) if topic == PARAMETER_EVENTS else ""
-        return replace(base, fields=fields, more_fields=more, reason=reason, note=note)
+        no_fields = None
+        if not fields:
+            no_fields = NoFields.ALL_IGNORED if self._options.ignore else NoFields.EQUAL_FIELDS
+        changed = _parameters_changed(*values) if topic == PARAMETER_EVENTS else ()
+        fate = ParametersChanged(changed) if changed else None
+        return replace(base, fields=fields, more_fields=more, no_fields=no_fields, fate=fate)
 
     def _decoded(self, run: Run, row: OutputRow) -> object | None:
         """Return the decoded payload of an output (a text for a detail), None if not recorded."""
@@ -197,12 +227,8 @@ class _Evidence:
             return None
         return trace.decode(channel, found[2])
 
-    def _not_recorded(self, run: Run, topic: str) -> str:
-        where = "b" if run.of_b else "a"
-        return (
-            f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
-            f"and a topic glob that matches {topic} (record: in the job)"
-        )
+
+_NOT_RECORDED = (NoFields.NOT_RECORDED_IN_A, NoFields.NOT_RECORDED_IN_B)
 
 
 def _last_line(traceback: object) -> str:
@@ -238,3 +264,105 @@ def _is_published_input(view: EventView) -> bool:
 def _entity_id(run: Run, number: int) -> int:
     table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
     return int((table == number).nonzero()[0][0])
+
+
+# -- what became of an output --------------------------------------------------------------------
+
+
+class _Fates:
+    """What became of the outputs of one pair of events."""
+
+    def __init__(self, run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> None:
+        self._runs = (run_a, run_b)
+        self._views = (a, b)
+
+    def fate(
+        self, row: OutputRow, outputs: tuple[list[OutputRow], list[OutputRow]], *, only_b: bool
+    ) -> Fate | None:
+        """Return what became of an output that only one run has, None if that is all."""
+        if None in self._views:
+            return None
+        in_a, in_b = (sum(other[:3] == row[:3] for other in side) for side in outputs)
+        name = "b" if only_b else "a"
+        if row[0] in _SENT and in_a and in_b:
+            return SentTimes(in_a, in_b)
+        if row[0] == OutputKind.TIMER:
+            return self._done_to_timer(row, name, only_b=only_b)
+        return self._later(row, only_b=only_b) if row[0] in _SENT else None
+
+    @cached_property
+    def _rows(self) -> tuple[Rows, Rows]:
+        rows = []
+        for run, view in zip(self._runs, self._views, strict=True):
+            assert view is not None
+            rows.append(load_rows(run, view.index, view.index + _LOOKED_AT_MAX))
+        return rows[0], rows[1]
+
+    def _later(self, row: OutputRow, *, only_b: bool) -> SentLater | None:
+        """Say whether the other run sends the same later, and from there on as this one."""
+        has, has_not = self._rows[::-1] if only_b else self._rows
+        mine, theirs = (list(islice(_sent(rows, row), 2)) for rows in (has, has_not))
+        if not mine or not theirs:
+            return None
+        late_ns = theirs[0][0] - mine[0][0]
+        moved = [(stamp + late_ns, content) for stamp, content in mine]
+        repeats = len({content for _, content in mine}) < len(mine)
+        if late_ns <= 0 or (mine[1:] != theirs[1:] and (repeats or moved != theirs)):
+            return None  # another one, of a sender that often sends the same
+        return SentLater(late_ns, "a" if only_b else "b")
+
+    def _done_to_timer(self, row: OutputRow, name: str, *, only_b: bool) -> Fate | None:
+        _, number, content, _ = row
+        if content == _CANCEL_HASH:
+            return TimerCancelled(name)
+        mine, theirs = self._rows[::-1] if only_b else self._rows
+        for period_ns in _periods(mine, number):
+            if hash64(pack_operation(TIMER_PERIOD, period_ns)) == content:
+                before_ns = next(iter(_periods(theirs, number)), None)
+                return TimerPeriodSet(before_ns, period_ns, name)
+        return None
+
+
+def _parameters_set(event: object) -> tuple[tuple[str, str], ...]:
+    """Return the parameters that a ``ParameterEvent`` sets."""
+    return tuple(_parameters(event).items())[:_PARAMETERS_MAX]
+
+
+def _parameters_changed(a: object, b: object) -> tuple[tuple[str, str, str], ...]:
+    """Return which of the parameters differ that two ``ParameterEvent`` set."""
+    of_a, of_b = _parameters(a), _parameters(b)
+    both = [name for name in of_a if name in of_b and of_a[name] != of_b[name]]
+    return tuple((name, of_a[name], of_b[name]) for name in both[:_PARAMETERS_MAX])
+
+
+def _parameters(event: object) -> dict[str, str]:
+    found = {}
+    for name in ("new_parameters", "changed_parameters"):
+        for parameter in getattr(event, name, ()):
+            value = getattr(parameter, "value", None)
+            field = _VALUES.get(getattr(value, "type", 0))
+            if field is not None:
+                text = printable(str(getattr(value, field, "")))
+                found[printable(str(parameter.name))] = text
+    return found
+
+
+def _sent(rows: Rows, row: OutputRow) -> Iterator[tuple[int, int]]:
+    """Yield (stamp, content) of an output and of what its sender sends from there on."""
+    found = False
+    for place, stamp in enumerate(rows.stamp):
+        if rows.output_counts[place]:
+            for output in rows.outputs(rows.first + place):
+                found = found or output[:3] == row[:3]
+                if found and output[:2] == row[:2]:
+                    yield stamp, output[2]
+
+
+def _periods(rows: Rows, number: int) -> list[int]:
+    """Return the times between the events of a timer, each once."""
+    stamps = [
+        rows.stamp[place]
+        for place, (other, kind) in enumerate(zip(rows.number, rows.kind, strict=True))
+        if other == number and kind == TIMER
+    ]
+    return list(dict.fromkeys(late - early for early, late in pairwise(stamps)))

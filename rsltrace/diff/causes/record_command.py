@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rsltrace.model.printable import printable, shortened
+from rsltrace.diff.facts.remarks import CannotRepeat, JobChanged, Remark
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
@@ -76,7 +76,7 @@ class RecordAgain:
     """
 
     command: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Remark, ...] = ()
 
 
 @dataclass(slots=True)
@@ -134,24 +134,11 @@ def record_again(trace: Trace) -> RecordAgain:
     for option, change in options_of(trace):
         _take(words, option, change, name)
     if words.foreign:
-        more = f" and {len(words.foreign) - 3} more" if len(words.foreign) > 3 else ""
-        told = ", ".join(_told(text) for text in words.foreign[:3])
-        return RecordAgain(
-            "",
-            (
-                f"{trace.name} says that it was recorded with {told}{more}: that may run code, so "
-                "there is no command to paste; use it only if you know where the trace is from",
-            ),
-        )
+        return RecordAgain("", (CannotRepeat(trace.name, options=tuple(words.foreign)),))
     if words.job and not path:
-        return RecordAgain(
-            "", (f"{trace.name} was made elsewhere: its job {_told(name)} is not here",)
-        )
-    warning = (
-        f"{path} is not what {trace.name} was recorded with: it was made elsewhere, or the job has "
-        "been changed since"
-    )
-    return RecordAgain(words.command(), () if is_same or not words.job else (warning,))
+        return RecordAgain("", (CannotRepeat(trace.name, job=name),))
+    changed = words.job and not is_same
+    return RecordAgain(words.command(), (JobChanged(trace.name, path),) if changed else ())
 
 
 def job_file(trace: Trace, name: str) -> tuple[str, bool]:
@@ -246,7 +233,3 @@ def _take_ros_argument(words: _Words, text: str) -> None:
         words.ros.append(word)
     else:
         words.foreign.append(f"--ros-args {text}")
-
-
-def _told(text: str) -> str:
-    return shortened(printable(text), _TEXT_MAX)

@@ -14,8 +14,8 @@ from functools import cached_property
 from typing import Any
 
 from rsltrace.diff.alignment.rows import Run
-from rsltrace.diff.causes.module_code import used_by
-from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.causes.environment import used_by
+from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.finding import Mode, Source
 from rsltrace.model.printable import printable
@@ -30,7 +30,6 @@ _WHEN = frozenset(
 _CONSTRUCTING = frozenset(("parameters", "parameter_files", "name", "namespace", "remappings"))
 """Keys of a node that its constructor shows, if they change anything."""
 
-_CODE = "code of module "
 _DRAWING_POLICY = "permutation"
 
 
@@ -61,8 +60,8 @@ class Relevance:
         return tuple(setting for setting in settings if self._can_matter(setting, place))
 
     def _can_matter(self, setting: Setting, place: Place) -> bool:
-        if setting.place.startswith(_CODE):
-            return self._is_code_of(setting.place.removeprefix(_CODE), place)
+        if setting.kind is SettingKind.CODE:
+            return self._is_code_of(setting.name, place)
         key, *rest = setting.key.split(".") if setting.key else [""]
         if key in _NEVER or (key in _WHEN and place.inside):
             return False

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from rsltrace.diff.alignment.rows import Run
-from rsltrace.diff.result.divergence import StateDifference
-from rsltrace.diff.result.events import EventView
+from rsltrace.diff.facts.evidence import EventView, StateDifference
 from rsltrace.trace.states import Leaf, state_after
 
 DIFFERENCES_MAX = 20

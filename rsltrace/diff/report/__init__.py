@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import report_lines
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
 from rsltrace.errors import TraceError
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result import BagDiff
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
 

@@ -1,21 +1,33 @@
 """A diff as JSON, for programs. ``docs/diff.md`` describes it; keys are only ever added.
 
-Times are integers of nanoseconds; hashes are 16 hex digits, since JSON readers lose digits of
-64-bit numbers; what is not there is null.
+Facts are objects with their class as ``fact``, or a word where there is nothing more to say; beside
+them stand the sentences for people. Times are integers of nanoseconds; hashes are 16 hex digits,
+since JSON readers lose digits of 64-bit numbers; what is not there is null.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.exit_codes import exit_code_of_several
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.exit_codes import exit_code_of_several
+from rsltrace.diff.facts.bags import MessageDivergence
+from rsltrace.diff.facts.causes import CauseOf, Judgement
+from rsltrace.diff.facts.evidence import (
+    CauseStep,
+    EventView,
+    Fact,
+    FieldDifference,
+    MessageDifference,
+    Setting,
+)
+from rsltrace.diff.result import BagDiff, Diff, Divergence
+from rsltrace.diff.sentences.runs import moved_text
+from rsltrace.diff.sentences.values import fate_text, link_text, no_fields_text, notes_text
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.entities import EntityKey
@@ -30,6 +42,7 @@ def as_json(diff: Diff | BagDiff) -> dict[str, Any]:
     """Return one diff as what ``json`` writes (without NaN: those are texts)."""
     kind = "traces" if isinstance(diff, Diff) else "bags"
     result = {"format": FORMAT, "version": VERSION, "kind": kind, **_fields(diff)}
+    result["sentence"], result["notes"] = diff.sentence, list(diff.notes)
     result["identical"] = diff.identical
     result["exit_code"] = diff.exit_code
     result["failed"] = diff.failed
@@ -63,14 +76,17 @@ def _fields(value: Any) -> dict[str, Any]:
 
 
 def _plain(name: str, value: Any) -> Any:
-    if isinstance(value, EventView):
-        return _event(value)
+    for kind, form in _FORMS.items():
+        if type(value) is kind:
+            return form(value)
     if isinstance(value, (EventKind, OutputKind)):
         return value.label
     if isinstance(value, EventFlag):
         return flag_names(value)
     if isinstance(value, Enum):
         return value.value
+    if isinstance(value, Fact):
+        return {"fact": _snake(type(value).__name__), **_fields(value)}
     if dataclasses.is_dataclass(value):
         return _fields(value)
     if isinstance(value, tuple):
@@ -80,6 +96,41 @@ def _plain(name: str, value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return value
+
+
+def _snake(name: str) -> str:
+    return re.sub("(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+def _divergence(found: Divergence) -> dict[str, Any]:
+    told = {"sentence": found.sentence, "root_sentence": found.root_sentence}
+    return {**_fields(found), **told, "likely_cause": found.likely_cause}
+
+
+def _judgement(found: Judgement) -> dict[str, Any]:
+    """Return a divergence that another one refers to: what and why, without the evidence."""
+    kept = ("verdict", "root", "what", "why", "a", "b", "settings", "likely")
+    return {name: _plain(name, getattr(found, name)) for name in kept}
+
+
+def _message(message: MessageDifference) -> dict[str, Any]:
+    return {**_fields(message), "note": fate_text(message), "reason": no_fields_text(message)}
+
+
+def _bag_message(found: MessageDivergence) -> dict[str, Any]:
+    return {**_fields(found), "note": moved_text(found), "reason": no_fields_text(found)}
+
+
+def _setting(setting: Setting) -> dict[str, Any]:
+    return {"place": setting.place, **_fields(setting)}
+
+
+def _field(found: FieldDifference) -> dict[str, Any]:
+    return {**_fields(found), "note": notes_text(found)}
+
+
+def _step(step: CauseStep) -> dict[str, Any]:
+    return {**_fields(step), "relation": link_text(step.link)}
 
 
 def _event(event: EventView) -> dict[str, Any]:
@@ -97,3 +148,16 @@ def _entity(key: EntityKey) -> dict[str, Any]:
 
 def _sides(pair: tuple[int, int] | None) -> dict[str, int] | None:
     return None if pair is None else {"a": pair[0], "b": pair[1]}
+
+
+_FORMS: dict[type, Callable[[Any], Any]] = {
+    EventView: _event,
+    Divergence: _divergence,
+    Judgement: _judgement,
+    CauseOf: lambda why: {"fact": "cause_of", "first": _judgement(why.first)},
+    MessageDifference: _message,
+    MessageDivergence: _bag_message,
+    Setting: _setting,
+    FieldDifference: _field,
+    CauseStep: _step,
+}

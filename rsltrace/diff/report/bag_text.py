@@ -1,12 +1,21 @@
-"""The report of two recordings as a person reads it."""
+"""The report of two recordings, or native runs, as a person reads it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rsltrace.diff.facts.bags import (
+    BagComparison,
+    BagMessage,
+    LoneTopic,
+    MessageDivergence,
+    NativeComparison,
+    Recording,
+    TopicDiff,
+)
+from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import payload_lines
-from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
     HEIGHT,
     NOTHING,
@@ -16,18 +25,16 @@ from rsltrace.diff.report.line import (
     Style,
     cut,
     fitted,
+    head_lines,
     in_columns,
     line,
+    next_section,
+    notes_section,
+    wrapped,
 )
-from rsltrace.diff.result.bags import (
-    BagDiff,
-    BagMessage,
-    LoneTopic,
-    MessageDivergence,
-    Presence,
-    Recording,
-    TopicDiff,
-)
+from rsltrace.diff.result import BagDiff
+from rsltrace.diff.sentences.runs import moved_text, tail_text
+from rsltrace.diff.sentences.values import no_fields_text
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 
@@ -88,11 +95,11 @@ def divergence_section(found: MessageDivergence, width: int) -> Section:
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])
     rows += in_columns(cells)
     only = None if found.presence is Presence.BOTH else found.a or found.b
-    if found.note:
+    if moved := moved_text(found):
         only = found.a
-        rows.append(line(f"    {printable(found.note)}"))
+        rows.append(line(f"    {printable(moved)}"))
     preview = only.preview if only is not None else ""
-    rows += payload_lines(found.fields, found.more_fields, preview, found.reason, width)
+    rows += payload_lines(found.fields, found.more_fields, preview, no_fields_text(found), width)
     return Section(line((title, Style.TITLE)), rows, 14, "lines", least=6)
 
 
@@ -112,7 +119,7 @@ def _brief(message: BagMessage) -> Line:
     return line((head, Style.FAINT), printable(message.preview))
 
 
-def topics_section(diff: BagDiff, width: int) -> Section:
+def topics_section(diff: BagComparison, width: int) -> Section:
     """Return a table of the topics: how many messages of each are equal, and so on."""
     columns = [
         (name, attribute)
@@ -152,3 +159,63 @@ def _lone_cells(topic: LoneTopic, attributes: Sequence[str], side: str) -> list[
         *((str(count), "" if count else Style.FAINT) for count in counts),
         (f"only in {side}", ""),
     ]
+
+
+# -- native runs ---------------------------------------------------------------------------------
+
+
+def native_sections(found: NativeComparison, options: DiffOptions, width: int) -> list[Section]:
+    """Return the sections of a report, what matters most first."""
+    content = found.content
+    sections = []
+    if found.first is not None:
+        sections.append(divergence_section(found.first, width))
+    sections.append(topics_section(content, width))
+    sections.append(_order(found, width))
+    sections.append(_times(found, width))
+    if options.everything:
+        sections += [
+            divergence_section(topic.first, width)
+            for topic in content.topics
+            if topic.first is not None and topic.first is not found.first
+        ]
+    if found.differs:
+        sections.append(next_section(content.next_step, width=width))
+    return sections
+
+
+def _order(found: NativeComparison, width: int) -> Section:
+    rows: list[Line] = []
+    if (first := found.first_moved) is not None:
+        which = f"{first.entity}, event {first.event_a} of a and {first.event_b} of b"
+        text = f"order: the first of {found.moved} callbacks that moved is {which}"
+        rows += wrapped(printable(text), width, indent="  ")
+    for tail in found.tails:
+        rows += wrapped(f"end: {printable(tail_text(tail))}", width, indent="  ")
+    return Section((), rows, 4, "lines")
+
+
+def _times(found: NativeComparison, width: int) -> Section:
+    names = ("callback", "", "runs a", "runs b", "median a", "median b", "95 % a", "95 % b")
+    cells: list[list[Piece]] = [[(name, Style.FAINT) for name in names]]
+    for one in found.callbacks:
+        cells.append(
+            [
+                (printable(str(one.entity)), ""),
+                (one.measure, Style.FAINT),
+                (str(one.events_a), Style.SIDE_A),
+                (str(one.events_b), Style.SIDE_B),
+                *(
+                    (_ms(None if times is None else getattr(times, name)), style)
+                    for name in ("median_ns", "p95_ns")
+                    for times, style in ((one.a, Style.SIDE_A), (one.b, Style.SIDE_B))
+                ),
+            ]
+        )
+    rows = [cut(row, width) for row in in_columns(cells)]
+    title = line(("timing", Style.TITLE), " in ms: periods of timers, latencies after the cause")
+    return Section(title, rows, 6, "callbacks", fixed=1)
+
+
+def _ms(duration_ns: int | None) -> str:
+    return "-" if duration_ns is None else f"{duration_ns / 1e6:.4g}"

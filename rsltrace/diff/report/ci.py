@@ -10,8 +10,7 @@ from xml.sax.saxutils import escape, quoteattr
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import report_lines
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.model.printable import printable
 from rsltrace.words.phrases import as_sentence
 
@@ -52,10 +51,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         lines.append(f"::{level} {place}::{command_data(text)}")
         if isinstance(diff, Diff):
             for setting in diff.settings:
-                name, colon, number = setting.place.rpartition(":")
-                if colon and number.isdigit():
+                if setting.line:
                     change = f"{_side(setting.a)} became {_side(setting.b)}"
-                    place = f"file={command_property(printable(name))},line={number}"
+                    place = f"file={command_property(printable(setting.name))},line={setting.line}"
                     lines.append(
                         f"::notice {place},title=rsltrace%3A job differs::{command_data(change)}"
                     )

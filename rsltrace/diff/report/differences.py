@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rsltrace.diff.facts.evidence import (
+    ULP_TOLD_MAX,
+    FieldDifference,
+    MessageDifference,
+    Presence,
+)
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
-from rsltrace.diff.result.divergence import MessageDifference
-from rsltrace.diff.result.fields import ULP_TOLD_MAX, FieldDifference
+from rsltrace.diff.sentences.values import fate_text, notes_text
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.words.code import places_text
@@ -20,6 +25,7 @@ _VERBS = {
     OutputKind.RESPONSE: "response of",
     OutputKind.LOG: "log record on",
 }
+_NOT_SAID = (OutputKind.ENTITY, OutputKind.DRAW, *_VERBS)
 _TYPED = (None, OutputKind.ENTITY, *_VERBS)
 
 
@@ -30,15 +36,15 @@ def message_title(message: MessageDifference) -> str:
     else:
         verb = _VERBS.get(message.kind, message.kind.label)
         what = f"output {message.position}:" if message.position >= 0 else "input:"
-        if not message.topic.startswith(verb):  # "timer Arm.control" says what it is
+        if message.kind in _NOT_SAID:  # others say what they are
             what = f"{what} {verb}"
     text = f"{what} {printable(message.topic)}".rstrip()
     if message.type and message.kind in _TYPED:
         text += f" ({printable(message.type)})"
-    if message.kind is OutputKind.TIMER and message.note:
-        text += f", {message.note}"
-    elif message.presence != "both":
-        text += f", {message.presence}"
+    if message.kind is OutputKind.TIMER and message.fate is not None:
+        text += f", {fate_text(message)}"
+    elif message.presence is not Presence.BOTH:
+        text += f", {message.presence.value}"
     if message.code:
         text += f", at {printable(places_text(list(message.code)))}"
     return text
@@ -65,8 +71,8 @@ def distance_text(difference: FieldDifference) -> str:
     if difference.ulp is not None and difference.ulp <= ULP_TOLD_MAX:
         several = difference.elements is not None and difference.elements[0] > 1
         parts.append(f"{'up to ' if several else ''}{difference.ulp} ulp")
-    if difference.note:
-        parts.append(difference.note)
+    if difference.notes:
+        parts.append(notes_text(difference))
     if difference.within_tolerance:
         parts.append("within tolerance")
     return ", ".join(parts)
@@ -120,9 +126,8 @@ def _element_rows(found: FieldDifference) -> list[list[Piece]]:
     """Return the first elements that differ; bytes below each other, as in a hex dump."""
     if any(max(len(a), len(b)) > _INLINE_MAX for _, a, b in found.first):
         rows: list[list[Piece]] = []
-        binary = found.a.endswith(" bytes")
         for place, a, b in found.first:
-            label = f"{place:#06x}" if binary else f"[{place}]"
+            label = f"{place:#06x}" if found.binary else f"[{place}]"
             rows.append([(f"  {label} a {a}", Style.SIDE_A)])
             rows.append([(f"  {' ' * len(label)} b {b}", Style.SIDE_B)])
         return rows

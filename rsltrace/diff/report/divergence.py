@@ -5,9 +5,9 @@ from __future__ import annotations
 from difflib import SequenceMatcher
 from itertools import zip_longest
 
+from rsltrace.diff.facts.evidence import CauseStep, EventView, MessageDifference, Presence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
-from rsltrace.diff.report.events import event_cells, event_key, event_text
 from rsltrace.diff.report.line import (
     NOTHING,
     Line,
@@ -19,15 +19,12 @@ from rsltrace.diff.report.line import (
     line,
     wrapped,
 )
-from rsltrace.diff.result.divergence import (
-    CauseStep,
-    Divergence,
-    MessageDifference,
-)
-from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result import Divergence
+from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.phrases import seconds_text
+from rsltrace.words.kinds import flag_names
+from rsltrace.words.phrases import event_title, seconds_text
 
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
@@ -57,13 +54,14 @@ def _event(found: Divergence, width: int) -> Section:
     assert some is not None or not found.messages
     if a is not None and b is not None and a.entity == b.entity and a.kind is b.kind:
         title = event_text(a)
-        if (a.index, a.stamp_ns) == (b.index, b.stamp_ns):
+        at_once = (a.index, a.stamp_ns) == (b.index, b.stamp_ns)
+        if at_once:
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         if min(a.position, b.position) >= 0:
             counted = f", its event {a.position + 1}"
             counted += f" (b: {b.position + 1})" if a.position != b.position else ""
             title += counted if len(title) + len(counted) <= width else ""
-        if not title.startswith("event ") or a.flags != b.flags or not found.messages:
+        if not at_once or a.flags != b.flags or not found.messages:
             rows += _did([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
         if code := printable(a.code or b.code):
             if len(title) + len(code) + 3 <= width:
@@ -102,10 +100,11 @@ def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> li
 def _message(message: MessageDifference, width: int) -> list[Line]:
     rows = wrapped(f"  {message_title(message)}", width, indent="    ")
     rows += payload_lines(
-        message.fields, message.more_fields, message.preview, message.reason, width
+        message.fields, message.more_fields, message.preview, no_fields_text(message), width
     )
     told = message.fields or message.preview
-    if not told and (message.presence == "both" or message.reason):
+    unknown = message.no_fields is not None or message.presence is Presence.BOTH
+    if not told and unknown:
         rows.append(line((f"    hashes {hashes_text(message)}", Style.FAINT)))
     return rows
 
@@ -187,7 +186,7 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
     index = str(event.index)
     if step.a and step.b and step.a.index != step.b.index:
         index = f"{step.a.index}/{step.b.index}"
-    relation = printable(step.relation)
+    relation = printable(link_text(step.link))
     end: Piece = ("  <- here" if last and depth else "", Style.BAD)
     return line(
         f"  {branch}",
@@ -303,3 +302,35 @@ def _reaches(found: Divergence, width: int) -> Section:
         if len(rows) <= _REACHES_LINES:
             break
     return Section((), rows, len(rows), "", len(rows), rank=5)
+
+
+# -- events as rows ------------------------------------------------------------------------------
+
+
+def event_text(event: EventView) -> str:
+    """Return ``/filter: subscription /scan``, or what else ran."""
+    return event_title(event.kind, event.entity)
+
+
+def event_cells(event: EventView) -> list[Piece]:
+    """Return an event as cells of a table: index, time, what ran, what it did."""
+    flags = (f"[{name}]" for name in flag_names(event.flags))
+    done = ", ".join(filter(None, [printable(event.summary), *flags]))
+    return [
+        (str(event.index), Style.FAINT),
+        (format_seconds(event.stamp_ns), Style.FAINT),
+        (event_text(event), ""),
+        (f"-> {done}" if done else "", ""),
+    ]
+
+
+def event_key(event: EventView) -> tuple[object, ...]:
+    """Return what is equal for events that are the same but for their place in the run."""
+    return (
+        event.entity,
+        event.stamp_ns,
+        event.kind,
+        event.input_hash,
+        event.output_hash,
+        event.flags,
+    )

@@ -9,7 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 
-from rsltrace.model.printable import shortened
+from rsltrace.model.printable import printable, shortened
+from rsltrace.words.phrases import as_sentence
 
 
 class Style:
@@ -196,6 +197,8 @@ class Section:
 NOTHING = Section((), [], 0, "")
 """A section without lines."""
 
+_SENTENCE_LINES = 6
+_NOTES_LEAST = 2
 _LEFT_OUT = line(("… a taller terminal shows more, and so does | less", Style.FAINT))
 
 
@@ -237,3 +240,48 @@ def fitted(head: list[Line], sections: Sequence[Section], height: int | None) ->
     if any(part.left_out for part in others):
         ending.insert(1, _LEFT_OUT)
     return [*lines, *ending]
+
+
+# -- what all reports begin and end with -----------------------------------------------------------
+
+
+def head_lines(
+    sentence: str, sides: Sequence[Sequence[Piece]], verdict: str, width: int, *, good: bool
+) -> list[Line]:
+    """Return the sentence, a line of facts for each file and the verdict (if any).
+
+    Facts are path, kind or size, and so on; the first four stay whatever the width.
+    """
+    style = Style.GOOD if good else Style.BAD
+    lines = wrapped(as_sentence(sentence), width, style=style)
+    if len(lines) > _SENTENCE_LINES:
+        lines = lines[:_SENTENCE_LINES]
+        lines[-1] = line((lines[-1][0][0][: width - 1] + "…", style))
+    names: tuple[Piece, Piece] = (("a", Style.SIDE_A), ("b", Style.SIDE_B))
+    named = [[name, *facts] for name, facts in zip(names, sides, strict=True)]
+    lines += side_lines(named, width, kept=5)
+    if verdict:
+        lines += wrapped(f"  verdict: {verdict}", width, indent="  ")
+    return lines
+
+
+def notes_section(notes: Sequence[str], width: int) -> Section:
+    """Return what else to know of the comparison."""
+    rows = [
+        row
+        for note in notes
+        for row in wrapped(f"note: {printable(note)}", width, style=Style.TITLE, indent="  ")
+    ]
+    return Section((), rows, min(len(rows), _NOTES_LEAST), "notes")
+
+
+def next_section(command: str, *before: str, width: int) -> Section:
+    """Return the command to run next, if there is one, below lines of text.
+
+    It is one line, however long: that is what can be copied.
+    """
+    rows = [line(text) for text in before]
+    if command:
+        rows.append(line(("next: ", Style.TITLE), (printable(command), Style.COMMAND)))
+    wraps = sum(max(len("".join(text for text, _ in row)) - 1, 0) // width for row in rows)
+    return Section((), rows, len(rows), "", len(rows), wraps=wraps)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import distance_text, message_title
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
 from rsltrace.diff.report.text import report_lines
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.fields import FieldDifference
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.model.printable import printable, shortened
 from rsltrace.words.phrases import as_sentence
 
@@ -22,10 +21,15 @@ _FIELDS = 10
 _CELL = 60
 
 
-def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
+def markdown(diff: Diff | BagDiff, options: DiffOptions, level: int = 3) -> str:
     """Return a heading with the verdict, a table of the fields that differ, and the full report
     folded away."""
-    lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(as_sentence(diff.sentence)), ""]
+    lines = [
+        f"{'#' * level} rsltrace: {_heading(diff)}",
+        "",
+        _escaped(as_sentence(diff.sentence)),
+        "",
+    ]
     lines += _sides(diff)
     lines += _fields(diff)
     if not diff.identical:
@@ -42,9 +46,7 @@ def several_markdown(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> s
     lines = [f"### rsltrace: {verdict}", "", f"Golden: {_code_span(diffs[0].a.path)}", ""]
     lines += _table(COLUMNS, [several_cells(diff) for diff in diffs])
     text = "\n".join(lines) + "\n"
-    return text + "".join(
-        "\n" + markdown(diff, options).replace("###", "####", 1) for diff in failed
-    )
+    return text + "".join("\n" + markdown(diff, options, level=4) for diff in failed)
 
 
 def _heading(diff: Diff | BagDiff) -> str:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 
-from rsltrace.diff.report.events import event_text
+from rsltrace.diff.facts.remarks import EndedByException
+from rsltrace.diff.report.divergence import event_text
 from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
+from rsltrace.diff.result import BagDiff, Diff
+from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
+from rsltrace.words.phrases import as_sentence
 
 COLUMNS = ("run", "verdict", "event", "time", "where")
 
@@ -49,10 +51,11 @@ def how_many_fail(diffs: Sequence[Diff | BagDiff], golden: str = "") -> str:
     return also if not diverged else f"{said}, {also}" if cut else said
 
 
-def how_all_agree(diffs: Sequence[Diff | BagDiff]) -> str:
+def how_all_agree(diffs: Sequence[Diff | BagDiff], golden: str = "") -> str:
     """Return ``all runs agree``, and how many are cut."""
     cut = sum(diff.agrees_until_cut for diff in diffs)
-    return "all runs agree" + (f", {cut} of them as far as the recordings go" if cut else "")
+    agree = f"all {len(diffs)} runs agree with {golden}" if golden else "all runs agree"
+    return agree + (f", {cut} of them as far as the recordings go" if cut else "")
 
 
 def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
@@ -67,8 +70,7 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     else:
         near = sum(diff.within_tolerance for diff in diffs)
         within = f", {near} of them within tolerance" if near else ""
-        agree = how_all_agree(diffs).replace("all runs agree", f"with {golden}", 1)
-        sentence = f"All {len(diffs)} runs agree {agree}{within}."
+        sentence = as_sentence(f"{how_all_agree(diffs, golden)}{within}")
     rows: list[list[Piece]] = [[(name, Style.FAINT) for name in COLUMNS]]
     for diff in diffs:
         path, *rest = several_cells(diff)
@@ -87,5 +89,6 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
 
 def _failure(diff: Diff | BagDiff) -> str:
     """Return which exception ended a run that the golden one did not end with."""
-    note = next((note for note in diff.notes if note.startswith(f"b {ENDED_BY_EXCEPTION}")), "")
-    return f"{printable(diff.b.path)}{printable(note[1:])}" if note else ""
+    ended = (r for r in diff.remarks if isinstance(r, EndedByException) and r.run == "b")
+    found = next((replace(one, run=diff.b.path) for one in ended), None)
+    return "" if found is None else printable(remark_text(found))

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import HEIGHT, Line
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result import BagDiff
 
 
 def report_lines(

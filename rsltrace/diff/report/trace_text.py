@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import takewhile
 from typing import TYPE_CHECKING
 
+from rsltrace.diff.facts.evidence import Setting
+from rsltrace.diff.facts.remarks import MoreDivergences, Remark
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
     BLANK,
     HEIGHT,
@@ -17,22 +17,25 @@ from rsltrace.diff.report.line import (
     Style,
     cut,
     fitted,
+    head_lines,
     in_columns,
     line,
+    next_section,
+    notes_section,
     wrapped,
 )
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.traces import Diff, Side
-from rsltrace.model.printable import printable, shortened
+from rsltrace.diff.result import Diff, Side
+from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
+from rsltrace.diff.sentences.values import setting_name
+from rsltrace.model.printable import printable, told_apart
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import as_sentence, seconds_text
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.divergence import Divergence
+    from rsltrace.diff.result import Divergence
 
 _ALIKE_SHOWN = 12
 _NARROW = 70
-_ALL_HINT = "--all shows them"
 
 
 def trace_report(
@@ -40,11 +43,11 @@ def trace_report(
 ) -> list[Line]:
     """Return the report of two traces, at most ``height`` lines unless ``options.everything``."""
     head = _head(diff, width)
-    hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
+    hidden = any(map(_is_hint, diff.remarks))
     # First what else to know of the comparison: that the jobs are different ones, or a file cut.
-    before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
+    before = notes_section([remark_text(one) for one in diff.remarks if not _is_hint(one)], width)
     if diff.native is not None:
-        from rsltrace.diff.report.native_text import native_sections
+        from rsltrace.diff.report.bag_text import native_sections
 
         found = native_sections(diff.native, options, width)
         return fitted(head, [before, *found], None if options.everything else height)
@@ -78,6 +81,10 @@ def trace_report(
     return lines
 
 
+def _is_hint(remark: Remark) -> bool:
+    return isinstance(remark, MoreDivergences) and not remark.all_shown
+
+
 def _head(diff: Diff, width: int) -> list[Line]:
     agree = f"the first {diff.agreeing} events agree"
     if diff.agreeing < 2:
@@ -101,7 +108,7 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
         how = "within tolerance" if tolerated else "but for what is ignored"
         text = f"equal {how}, not identical: the digests differ"
     else:
-        said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)
+        said = printable(recordings_sentence(diff.tolerance, "the messages"))
         text = f"not within tolerance: {said}"
     return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
@@ -151,7 +158,7 @@ def _settings(diff: Diff, width: int) -> Section:
     room = max((width - 40) // 2, 16)
     table = [
         [
-            (printable(str(setting)), ""),
+            (printable(setting_name(setting)), ""),
             (a, Style.SIDE_A),
             ("|", Style.FAINT),
             (b, Style.SIDE_B),
@@ -177,15 +184,12 @@ def _settings(diff: Diff, width: int) -> Section:
 
 def _values(setting: Setting, room: int) -> tuple[str, str]:
     """Return both values in ``room`` characters each: of long ones, what differs."""
-    a, b = ("-" if v is None else printable(v.strip()) for v in (setting.a, setting.b))
-    alike = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
-    if max(len(a), len(b)) > room and alike > _ALIKE_SHOWN:
-        a, b = (f"…{text[alike - _ALIKE_SHOWN :]}" for text in (a, b))
-    return shortened(a, room), shortened(b, room)
+    a, b = ("-" if v is None else v.strip() for v in (setting.a, setting.b))
+    return told_apart(a, b, room, before=_ALIKE_SHOWN)
 
 
 def _next(found: Divergence, others: int, width: int, *, hidden: bool = False) -> Section:
     count = f"more than {others}" if hidden else str(others)
     word = "divergence" if count == "1" else "divergences"
-    more = [f"{count} further independent {word}: {_ALL_HINT}"] if others else []
+    more = [f"{count} further independent {word}: {ALL_HINT}"] if others else []
     return next_section(found.next_step, *more, width=width)

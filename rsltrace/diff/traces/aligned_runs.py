@@ -12,9 +12,8 @@ from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.effects import first_effect, is_setup
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.message_differences import message_differences
+from rsltrace.diff.facts.evidence import EventView, MessageDifference
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import MessageDifference
-from rsltrace.diff.result.events import EventView
 from rsltrace.diff.traces.comparison import first_item
 from rsltrace.trace.reader import Trace
 

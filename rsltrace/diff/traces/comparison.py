@@ -12,33 +12,39 @@ from rsltrace.diff.alignment.blocks import (
     AlignedBlocks,
     EqualBlock,
     EventPair,
+    equal_block,
 )
 from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entities
 from rsltrace.diff.alignment.outputs import different_outputs
-from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.alignment.rows import SHUTDOWN, Run, load_rows
 from rsltrace.diff.causes.effects import EffectSearch
+from rsltrace.diff.causes.environment import entity_settings, environment_settings
 from rsltrace.diff.causes.explain import Explainer
-from rsltrace.diff.causes.headline import headline
 from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.causes.propagation import (
     FoundDivergence,
     Propagation,
 )
-from rsltrace.diff.causes.settings import entity_settings, environment_settings
+from rsltrace.diff.facts.causes import Verdict
+from rsltrace.diff.facts.evidence import Setting
+from rsltrace.diff.facts.remarks import (
+    ComparedAs,
+    Diverged,
+    Identical,
+    MoreDivergences,
+    NothingAskedFor,
+    ShownLater,
+    ShownPastTolerated,
+)
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import Divergence
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Verdict
-from rsltrace.diff.traces.counts import EventCounts
+from rsltrace.diff.result import Diff, Divergence, EntityCount
 from rsltrace.diff.traces.ended_runs import (
-    failure_text,
+    failure,
     failures,
     had_nothing_left,
     judge_end,
     who_ended,
 )
-from rsltrace.diff.traces.renamed import first_real_difference
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.errors import TraceError, did_you_mean
@@ -56,6 +62,13 @@ EFFECT_WITHIN = 100_000
 """Events after the first divergence among which its first effect is looked for."""
 
 _EVENTS_PER_BLOCK = 4096
+AGREEING_MIN = 32
+"""So many events in a row have to agree before it is called agreement …"""
+
+AGREEING_AT_END_MIN = 8
+"""… or so many if they are the last ones of both runs. Shutting down is no agreement."""
+
+_ROWS_AT_ONCE = 256
 _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 
 
@@ -93,26 +106,23 @@ class _Comparison:
         self._options = options
         self._matching: EntityMatching = match_entities(a, b)
         self._job = job_settings(a, b)
-        delays = any(setting.key.partition(".")[0] == "delay" for setting in self._job)
+        delays = any(setting.part == "delay" for setting in self._job)
         self._run_a = Run(a, self._matching, of_b=False, without_zero_delays=delays)
         self._run_b = Run(b, self._matching, of_b=True, without_zero_delays=delays)
         self._environment = environment_settings(a, b)
-        self._notes = list(interruptions(a, b))
+        self._remarks = list(interruptions(a, b))
         self._only_names = False
         """Whether the runs are the same but for names of programs."""
         if self._matching.renamed:
             real = first_real_difference(self._run_a, self._run_b, start)
             self._only_names = real is None
             self._start = start if real is None else real
-            self._notes += [
-                f"{printable(name_a)} in a is compared with {printable(name_b)} in b"
-                for name_a, name_b in self._matching.renamed
-            ]
-        self._counts = EventCounts()
+            self._remarks += [ComparedAs(*names) for names in self._matching.renamed]
+        self._counts = _EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
-        self._in_vain: str | None = None
-        """Up to where no effect was found, if there was one to look for."""
+        self._searched_to: int | None = None
+        """See ``Diverged``."""
 
     def run(self) -> Diff:
         """Return the answer."""
@@ -122,12 +132,12 @@ class _Comparison:
         divergences = [self._ended(over)] if over is not None else self._aligned()
         divergences[0] = first = self._with_failure(divergences[0])
         if first.verdict not in _TELL_THE_END:
-            self._notes += failures(self._a, self._b)
+            self._remarks += failures(self._a, self._b)
         return Diff(
             a=side(self._a),
             b=side(self._b),
             verdict=first.verdict,
-            sentence=self._sentence(first),
+            outcome=self._outcome(),
             effect=self._effect,
             agreeing=self._start,
             divergences=tuple(divergences),
@@ -136,7 +146,7 @@ class _Comparison:
             resync_index=self._counts.resync,
             aligned_to=self._aligned_to,
             bytes_read=self._a.bytes_read + self._b.bytes_read,
-            notes=tuple(self._notes),
+            remarks=tuple(self._remarks),
             tolerance=messages_within(self._a, self._b, self._start, self._options),
         )
 
@@ -146,27 +156,27 @@ class _Comparison:
             a=side(self._a),
             b=side(self._b),
             verdict=Verdict.IDENTICAL,
-            sentence=f"the two runs are identical but for names of programs: {events} events",
+            outcome=Identical(events, names_differ=True),
             agreeing=events,
             settings=(*self._job, *self._environment),
             aligned_to=(events, events),
             bytes_read=self._a.bytes_read + self._b.bytes_read,
-            notes=tuple(self._notes),
+            remarks=tuple(self._remarks),
         )
 
     def _with_failure(self, first: Divergence) -> Divergence:
-        """Add to the cause how one of the runs failed, where that is not said already."""
-        text = failure_text(self._a, self._b)
-        if not text or first.verdict in _TELL_THE_END or not first.root_sentence:
+        """Add how one of the runs failed, where that is not known already."""
+        failed = failure(self._a, self._b)
+        if failed is None or first.verdict in _TELL_THE_END or first.why is None:
             return first
-        return replace(first, root_sentence=f"{first.root_sentence}; {text}")
+        return replace(first, failed=failed)
 
-    def _sentence(self, first: Divergence) -> str:
-        if not self._matching.different_jobs:
-            return headline(first, self._effect, in_vain=self._in_vain)
-        jobs = [f'"{trace.job["name"]}"' for trace in (self._a, self._b) if trace.job.get("name")]
-        which = f" ({jobs[0]}, {jobs[1]})" if len(set(jobs)) == 2 else ""
-        return f"these are runs of different jobs{which} without a common node: {first.sentence}"
+    def _outcome(self) -> Diverged:
+        foreign = None
+        if self._matching.different_jobs:
+            jobs = (trace.job.get("name") for trace in (self._a, self._b))
+            foreign = tuple(name for name in jobs if name)
+        return Diverged(self._searched_to, foreign)
 
     def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
@@ -240,18 +250,13 @@ class _Comparison:
             chosen.sort(key=lambda found: (found.place_a, found.place_b))
         if not chosen:
             chosen = propagation.found[:1]
-            self._notes.append(
-                f"nothing that was asked for ({self._asked()}) differs among the events that were "
-                "aligned; shown is where the runs diverge"
-            )
+            self._remarks.append(NothingAskedFor(self._asked))
         elif propagation.found[0] is not chosen[0]:
-            self._notes.append(
-                f"the runs diverge at event {self._start}; shown is where {self._asked()} differs"
-            )
+            self._remarks.append(ShownLater(self._start, self._asked))
         most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
         if len(chosen) > most:
-            hint = "" if self._options.everything else "; --all shows them"
-            self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
+            more = MoreDivergences(len(chosen) - most, all_shown=self._options.everything)
+            self._remarks.append(more)
         explainer = self._explainer(propagation.found)
         divergences = [explainer.explain(found) for found in chosen[:most]]
         if search is not None and not search.past_covered and search.found is not None:
@@ -259,26 +264,23 @@ class _Comparison:
         if search is not None and search.in_vain:
             ends = (self._a.event_count, self._b.event_count)
             whole = self._aligned_to == ends
-            self._in_vain = "" if whole else f" up to event {self._aligned_to[0]}"
-        self._notes += explainer.warnings
+            self._searched_to = -1 if whole else self._aligned_to[0]
+        self._remarks += explainer.warnings
         return divergences
 
     def _past_covered(
         self, chosen: list[FoundDivergence], search: EffectSearch
     ) -> list[FoundDivergence]:
         """Return what to show if the first divergence is ignored or within tolerance."""
-        covered = "only in what is ignored or within tolerance"
         if search.found is None:
             return chosen  # what all messages say of that is told beside it
-        self._notes.append(
-            f"the runs diverge at event {self._start}, but there {covered}; shown is the first "
-            "difference that is not"
-        )
+        self._remarks.append(ShownPastTolerated(self._start))
         place = search.found.place_a
         return [search.found, *(found for found in chosen if found.place_a > place)]
 
-    def _asked(self) -> str:
-        return ", ".join((*self._options.nodes, *self._options.topics))
+    @property
+    def _asked(self) -> tuple[str, ...]:
+        return (*self._options.nodes, *self._options.topics)
 
     def _wanted(self, item: EventPair, block: AlignedBlock) -> bool:
         """Whether an item is of a node and touches a topic that was asked for."""
@@ -319,3 +321,85 @@ def first_item(block: AlignedBlock, start: int) -> EventPair:
 def _moved(block: AlignedBlock, item: EventPair) -> bool:
     a, b = block.rows_a, block.rows_b
     return a.stamp[item.a - a.first] != b.stamp[item.b - b.first]
+
+
+# -- what is counted -----------------------------------------------------------------------------
+
+
+class _EventCounts:
+    """Takes blocks in order."""
+
+    def __init__(self) -> None:
+        self._counts: dict[int, list[int]] = {}
+        self._resync: tuple[int, int] | None = None
+        self._agreeing = 0
+        self._ended = False
+
+    def take(self, block: AlignedBlock) -> None:
+        """Count the items of a block."""
+        for item in block.items:
+            rows, index = (block.rows_a, item.a) if item.a >= 0 else (block.rows_b, item.b)
+            counts = self._counts.setdefault(rows.number[index - rows.first], [0, 0, 0, 0])
+            counts[_column(item)] += 1
+            if not item.plain:
+                self._agreeing, self._resync = 0, None
+            elif rows.kind[index - rows.first] != SHUTDOWN:
+                self._agreeing += 1
+                self._resync = self._resync or (item.a, item.b)
+        self._ended = block.at_end
+
+    def take_equal(self, run: EqualBlock) -> None:
+        """Count a run of equal events."""
+        for number in run.counts.nonzero()[0].tolist():
+            self._counts.setdefault(number, [0, 0, 0, 0])[0] += int(run.counts[number])
+        self._agreeing += int(run.counts.sum())
+        self._resync = self._resync or (run.first_a, run.first_b)
+
+    def counts(self, matching: EntityMatching) -> tuple[EntityCount, ...]:
+        """Return the counts of each entity that had events, those that differ most first."""
+        counts = [EntityCount(matching.keys[n], *row) for n, row in self._counts.items()]
+        return tuple(
+            sorted(counts, key=lambda c: (-(c.differing + c.only_a + c.only_b), str(c.entity)))
+        )
+
+    @property
+    def resync(self) -> tuple[int, int] | None:
+        """The indexes from which on the runs agree to the end of what was aligned, if they do."""
+        enough = AGREEING_AT_END_MIN if self._ended else AGREEING_MIN
+        return self._resync if self._agreeing >= enough else None
+
+
+def _column(item: EventPair) -> int:
+    if item.b < 0:
+        return 2
+    if item.a < 0:
+        return 3
+    return 0 if item.same else 1
+
+
+# -- runs whose programs have other names, two builds of one ---------------------------------------
+
+
+def first_real_difference(run_a: Run, run_b: Run, start: int) -> int | None:
+    """Return the index of the first event from ``start`` on that differs in more than names: they
+    are in the trace's own hashes of what a main's construction has made, and so in all chain hashes
+    after it.
+
+    Where one run is the beginning of the other it is the number of events of the shorter one;
+    None if they do the same.
+    """
+    counts = run_a.trace.event_count, run_b.trace.event_count
+    index, end = start, min(counts)
+    while index < end:
+        equal = equal_block(run_a, run_b, index, index)
+        if equal is not None:
+            index = equal.end_a
+            continue
+        last = min(index + _ROWS_AT_ONCE, end)
+        a, b = (load_rows(run, index, last) for run in (run_a, run_b))
+        columns = ("number", "kind", "stamp", "input", "content", "flags", "state", "cause")
+        for place in range(last - index):
+            if any(getattr(a, name)[place] != getattr(b, name)[place] for name in columns):
+                return index + place
+        index = last
+    return None if counts[0] == counts[1] else end

@@ -9,9 +9,10 @@ around the divergence, unless everything is asked for.
 from __future__ import annotations
 
 from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.diff.facts.causes import Verdict
+from rsltrace.diff.facts.remarks import Identical, OtherEnd
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.sides import side
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
@@ -45,20 +46,18 @@ def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
 
 
 def _identical(a: Trace, b: Trace) -> Diff:
-    notes = []
-    for what in ("stop_reason", "exit_code"):
-        ended_a, ended_b = a.result.get(what), b.result.get(what)
-        if ended_a != ended_b:
-            notes.append(f"{what.replace('_', ' ')}: {ended_a} in a, {ended_b} in b")
     events = a.event_count
-    digest = "" if is_native(a) else f", digest {a.digest}"
     return Diff(
         a=side(a),
         b=side(b),
         verdict=Verdict.IDENTICAL,
-        sentence=f"the two runs are identical: {events} events{digest}",
+        outcome=Identical(events, "" if is_native(a) else a.digest),
         agreeing=events,
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
-        notes=tuple(notes),
+        remarks=tuple(
+            OtherEnd(what.replace("_", " "), a.result.get(what), b.result.get(what))
+            for what in ("stop_reason", "exit_code")
+            if a.result.get(what) != b.result.get(what)
+        ),
     )

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.causes.classify import Judgement
-from rsltrace.diff.causes.wording import because_of
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION, Root, Verdict
+from rsltrace.diff.facts.causes import (
+    EndedBefore,
+    Judgement,
+    NothingLeft,
+    Reason,
+    Root,
+    RunEnd,
+    Verdict,
+    Why,
+)
+from rsltrace.diff.facts.evidence import EventView, Setting
+from rsltrace.diff.facts.remarks import EndedByException, Remark
 from rsltrace.diff.traces.sides import stop_reason
 from rsltrace.model.event import Event, EventFlag, EventKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import REPLAY_DIVERGED
 from rsltrace.trace.reader import Trace
-from rsltrace.words.phrases import at_time, seconds_text
 
 _LOOKED_AT_MAX = 100
 _ERROR_MAX = 300
-_WAITS_MAX = 160
 NOTHING_LEFT = "nothing left to do"
 
 
@@ -49,22 +54,7 @@ def _stops(a: Trace, b: Trace, over: Trace, job: Sequence[Setting]) -> list[Sett
     """Return the stop conditions that differ, if it was they that ended a run."""
     if exit_code(over) or stop_reason(a) == stop_reason(b) == NOTHING_LEFT:
         return []
-    return [setting for setting in job if setting.key.partition(".")[0] == "stop"]
-
-
-def _why_ended(over: Trace, name: str, job: Sequence[Setting]) -> str:
-    how = error_text(over)
-    if how:
-        how = f"{name} failed (exit code {exit_code(over)}): {how}"
-    elif exit_code(over):
-        how = f"{name} ended with exit code {exit_code(over)} ({stop_reason(over)})"
-    elif had_nothing_left(over):
-        how = f"{name} had nothing left to do"
-    else:
-        how = f"{name} ended because of this: {stop_reason(over)}"
-    others = [s for s in job if s.key.partition(".")[0] not in ("stop", "record", "livelock_limit")]
-    because = because_of(others)
-    return f"both do the same until then; {how}{f'; {because}' if because else ''}"
+    return [setting for setting in job if setting.part == "stop"]
 
 
 def had_nothing_left(trace: Trace) -> bool:
@@ -91,28 +81,37 @@ def error_text(trace: Trace) -> str:
     return shortened(printable(" ".join(text.split())), _ERROR_MAX)
 
 
-def failures(a: Trace, b: Trace) -> list[str]:
-    """Return a note for each run that an exception ended, if that did not happen in both."""
+def failures(a: Trace, b: Trace) -> list[Remark]:
+    """Return a remark for each run that an exception ended, if that did not happen in both."""
     if stop_reason(a) == stop_reason(b):
         return []
     return [
-        f"{name} {ENDED_BY_EXCEPTION}: {stop_reason(trace)}, event {event.index}, "
-        f"{seconds_text(event.stamp_ns)} s"
+        EndedByException(name, stop_reason(trace), event.index, event.stamp_ns)
         for name, trace in (("a", a), ("b", b))
         if (event := _failed(trace)) is not None
     ]
 
 
-def failure_text(a: Trace, b: Trace) -> str:
-    """Say how the one run failed that did, "" if both did or none."""
+def failure(a: Trace, b: Trace) -> RunEnd | None:
+    """Return how the one run failed that did, None if both did or none."""
     if bool(exit_code(a)) == bool(exit_code(b)):
-        return ""
+        return None
     name, trace = ("a", a) if exit_code(a) else ("b", b)
-    if stop_reason(trace) == REPLAY_DIVERGED:
-        return ""
-    why = error_text(trace) or stop_reason(trace)
-    verb = "failed" if error_text(trace) or _failed(trace) is not None else "ended"
-    return f"{name} then {verb} (exit code {exit_code(trace)}): {why}"
+    return None if stop_reason(trace) == REPLAY_DIVERGED else _end_of(name, trace)
+
+
+def _end_of(name: str, trace: Trace) -> RunEnd:
+    return RunEnd(
+        name,
+        trace.end_ns,
+        stop_reason(trace),
+        has_events=bool(trace.event_count),
+        exit_code=exit_code(trace),
+        error=error_text(trace),
+        stuck=_waits(trace),
+        nothing_left=had_nothing_left(trace),
+        raised=_failed(trace) is not None,
+    )
 
 
 def _failed(trace: Trace) -> Event | None:
@@ -150,34 +149,25 @@ def judge_end(
     job: Sequence[Setting],
     alone: Judgement | None = None,
 ) -> Judgement:
-    """Put it in words. ``view_a`` is the event that only the other run has, or None; ``job`` is
+    """Return the verdict. ``view_a`` is the event that only the other run has, or None; ``job`` is
     what differs in the jobs; ``alone`` says why that event is missing in a run that had nothing
     left to do."""
     verdict = Verdict.ENDED_EARLY if over is b else Verdict.RAN_LONGER
-    name, other_name, other = ("b", "a", a) if over is b else ("a", "b", b)
-    where = f" {at_time(over.end_ns)}" if over.event_count else ""
-    how = f"ended{where} ({stop_reason(over)})"
-    if waits := _waits(over):
-        how = f"got stuck{where} ({shortened(waits, _WAITS_MAX)})"
-    sentence = (
-        f"run {name} {how}, {other_name} did the same until then and "
-        f"went on {'to' if other.end_ns != over.end_ns else 'until'} "
-        f"{seconds_text(other.end_ns)} s ({stop_reason(other)})"
-    )
-    root, told = Root.UNKNOWN, []
+    name = "b" if over is b else "a"
+    ends = _end_of("a", a), _end_of("b", b)
+    what = EndedBefore(*(ends[::-1] if over is b else ends))
+    root = Root.UNKNOWN
+    settings: tuple[Setting, ...] = ()
+    why: Why
     if not over.complete:
-        why = (
-            f"the recording of {name} was cut off: its run was killed, is still going on, or the "
-            "file is not whole"
-        )
-    elif told := _stops(a, b, over, job):
-        root = Root.JOB
-        differs = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in told)
-        why = f"both do the same as long as they last, and their jobs differ in {differs}"
+        why = Reason.CUT_OFF
+    elif stops := _stops(a, b, over, job):
+        root, why, settings = Root.JOB, Reason.STOPS_DIFFER, tuple(stops)
     elif alone is not None:
-        told = list(alone.settings)
-        why = f"{name} had nothing left to do: {alone.sentence}; {alone.root_sentence}"
+        why, settings = NothingLeft(name, alone), alone.settings
     else:
-        why = _why_ended(over, name, job)
-    a_view, b_view = (view_a, None) if over is b else (None, view_a)
-    return Judgement(verdict, root, sentence, why, a_view, b_view, tuple(told))
+        why = Reason.ENDED
+        others = (one for one in job if one.part not in ("stop", "record", "livelock_limit"))
+        settings = tuple(others)
+    in_a, in_b = (view_a, None) if over is b else (None, view_a)
+    return Judgement(verdict, root, what, why, in_a, in_b, settings=settings)

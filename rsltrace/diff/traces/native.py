@@ -16,11 +16,18 @@ import numpy.typing as npt
 
 from rsltrace.diff.alignment.longest_increasing import longest_increasing
 from rsltrace.diff.bags.comparison import compare_content
+from rsltrace.diff.facts.bags import (
+    CallbackTimes,
+    MovedCallback,
+    NativeComparison,
+    Tail,
+    TopicDiff,
+)
+from rsltrace.diff.facts.causes import Verdict
+from rsltrace.diff.facts.evidence import Presence
+from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeCompared
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.bags import BagDiff, Presence, TopicDiff
-from rsltrace.diff.result.native import CallbackTimes, NativeComparison
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
@@ -59,7 +66,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
     content = compare_content(a, b, replace(options, ignore=(*options.ignore, *TIMES)))
     sides = (_Callbacks(a), _Callbacks(b))
     compared, moved, first = _order(*sides)
-    tails = tuple(text for topic in content.topics if (text := _tail(topic)))
+    tails = tuple(tail for topic in content.topics if (tail := _tail(topic)) is not None)
     others = [
         topic
         for topic in content.topics
@@ -83,18 +90,17 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
         a=side(a),
         b=side(b),
         verdict=_verdict(a, b, found),
-        sentence=_sentence(found),
+        outcome=NativeCompared(),
         agreeing=0,
         aligned_to=(a.event_count, b.event_count),
         bytes_read=a.bytes_read + b.bytes_read,
-        notes=(*interruptions(a, b), *_notes(content)),
+        remarks=(
+            *interruptions(a, b),
+            *(one for one in content.remarks if not isinstance(one, LogTimesIgnored)),
+        ),
         as_far_as_they_go=options.as_far_as_they_go,
         native=found,
     )
-
-
-def _notes(content: BagDiff) -> list[str]:
-    return [note for note in content.notes if not note.startswith("log times")]
 
 
 def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
@@ -126,52 +132,16 @@ def _says_something_else(topic: TopicDiff) -> bool:
     return bool(topic.differing or missing)
 
 
-def _tail(topic: TopicDiff) -> str:
-    """Say how many messages more one run has at the end of a topic, if that is all that differs."""
+def _tail(topic: TopicDiff) -> Tail | None:
+    """Return how many messages more one run has at the end of a topic, if that is all that
+    differs."""
     first, more = topic.first, topic.only_a + topic.only_b
     if first is None or topic.differing or topic.moved or (topic.only_a and topic.only_b):
-        return ""
+        return None
     shown = first.a if first.presence is Presence.ONLY_A else first.b
     if shown is None or shown.index != topic.agreeing:
-        return ""
-    name = "a" if topic.only_a else "b"
-    return f"{topic.topic}: {more} more message{'' if more == 1 else 's'} in {name}, at its end"
-
-
-def _sentence(found: NativeComparison) -> str:
-    which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
-    said = sum(topic.agreeing for topic in found.content.topics)
-    order = (
-        f"{found.moved} of the {found.compared} callbacks of both began in another order"
-        if found.moved
-        else f"the {found.compared} callbacks of both began in the same order"
-    )
-    if found.differs:
-        return f"{which}, and the contents differ{_where(found)}; {order}"
-    return (
-        f"{which}, and the contents are the same but for times: {said} messages on "
-        f"{len(found.content.topics)} topics; {order}"
-    )
-
-
-def _where(found: NativeComparison) -> str:
-    first = found.first
-    if first is None:
-        lone = (*found.content.topics_only_a, *found.content.topics_only_b)
-        return f": only one run has messages on {lone[0].topic}"
-    shown = first.a or first.b
-    text = f", first on {first.topic}"
-    if shown is not None:
-        text += f": message {shown.index} "
-        if first.note:
-            text += "came in another order, and others are missing or differ"
-        elif first.presence is not Presence.BOTH:
-            text += f"is {first.presence.value}"
-        elif first.fields:
-            text += f"has another {first.fields[0].path}"
-        else:
-            text += "differs"
-    return text
+        return None
+    return Tail(topic.topic, more, "a" if topic.only_a else "b")
 
 
 class _Callbacks:
@@ -213,19 +183,19 @@ def _keys(trace: Trace) -> dict[int, EntityKey]:
     return keys
 
 
-def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, str]:
+def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, MovedCallback | None]:
     """Return how many callbacks both runs have, how many of them ran in another order, and the
-    first of these in words. The n-th of an entity is compared with the n-th."""
+    first of these. The n-th of an entity is compared with the n-th."""
     pairs: list[tuple[int, int, EntityKey]] = []
     for key, places in a.places.items():
         pairs += ((i, j, key) for i, j in zip(places, b.places.get(key, ()), strict=False))
     pairs.sort(key=lambda pair: pair[0])
     kept = longest_increasing([j for _, j, _ in pairs])
     moved = [place for place in range(len(pairs)) if place not in kept]
-    first = ""
+    first = None
     if moved:
         i, j, key = pairs[moved[0]]
-        first = f"{key}, event {i} of a and {j} of b"
+        first = MovedCallback(key, i, j)
     return len(pairs), len(moved), first
 
 

@@ -1,9 +1,9 @@
-"""What is said of each of the two runs as a whole."""
+"""What there is to know of each of the two runs as a whole."""
 
 from __future__ import annotations
 
-from rsltrace.diff.result.traces import Side
-from rsltrace.model.stamp import format_seconds
+from rsltrace.diff.facts.remarks import Interrupted, Remark
+from rsltrace.diff.result import Side
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 
@@ -16,7 +16,7 @@ def stop_reason(trace: Trace) -> str:
 
 
 def side(trace: Trace) -> Side:
-    """Return what is said of a run as a whole."""
+    """Return what there is to know of a run as a whole."""
     return Side(
         path=trace.name,
         digest="" if is_native(trace) else trace.digest,
@@ -27,11 +27,10 @@ def side(trace: Trace) -> Side:
     )
 
 
-def interruptions(a: Trace, b: Trace) -> list[str]:
-    """Return a note for each run whose recording was cut off."""
+def interruptions(a: Trace, b: Trace) -> list[Remark]:
+    """Return a remark for each run whose recording was cut off."""
     return [
-        f"the recording of {name} ({trace.name}) was interrupted: compared is what is there, "
-        f"{trace.event_count} events up to {format_seconds(trace.end_ns)} s"
+        Interrupted(name, trace.name, trace.event_count, trace.end_ns)
         for name, trace in (("a", a), ("b", b))
         if not trace.complete
     ]

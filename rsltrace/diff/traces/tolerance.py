@@ -17,7 +17,7 @@ from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result import BagDiff
 
 _SAME_EVENTS = "stamp entity kind flags outputs cause_event cause_output".split()
 _SAME_OUTPUTS = "event entity kind".split()

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Hashable, Iterator
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any, cast
 
 import numpy as np
 
+from rsltrace.diff.facts.evidence import FieldDifference, FieldNote, FieldNoteKind
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import SAME_ELEMENTS, SAME_WORDS, FieldDifference
-from rsltrace.diff.values.constants import with_names
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import (
     array_text,
@@ -33,8 +33,9 @@ from rsltrace.model.stamp import NS_PER_S, format_seconds
 WHOLE = "(whole)"
 """The path of a difference that belongs to no field: of the types, or of two plain values."""
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+Definition = tuple[Sequence[tuple[str, str, object]], Sequence[tuple[str, tuple[object, object]]]]
+
 _ABSENT = "absent"
-_NO_FIELD = "only one of the types has this field"
 _SECONDS_MAX = 2.0**33
 """More than any two times are apart."""
 _TEXT_MAX = 60
@@ -149,7 +150,10 @@ def _message_differences(path: str, a: Any, b: Any, rules: FieldRules) -> Iterat
     type_a, type_b = _type_of(a), _type_of(b)
     if type_a != type_b:
         yield FieldDifference(
-            path or WHOLE, printable(type_a), printable(type_b), note="different types"
+            path or WHOLE,
+            printable(type_a),
+            printable(type_b),
+            notes=(FieldNote(FieldNoteKind.OTHER_TYPES),),
         )
     elif type_a in _TIMES:
         time_a, time_b = _nanoseconds(a), _nanoseconds(b)
@@ -165,13 +169,20 @@ def _message_differences(path: str, a: Any, b: Any, rules: FieldRules) -> Iterat
             of_other = getattr(b, other)
             for found in _differences(prefix + name, value, of_other, base, rules):
                 definition = _definition(type(a)) if isinstance(value, int) else None
-                yield with_names(found, name, value, of_other, definition) if definition else found
+                yield _with_names(found, name, value, of_other, definition) if definition else found
         elif not rules.ignored(prefix + name):
-            yield FieldDifference(prefix + name, preview(value, 40), _ABSENT, note=_NO_FIELD)
+            yield FieldDifference(
+                prefix + name,
+                preview(value, 40),
+                _ABSENT,
+                notes=(FieldNote(FieldNoteKind.NO_SUCH_FIELD),),
+            )
     for name, attribute in of_b.items():
         if not rules.ignored(prefix + name):
             text = preview(getattr(b, attribute), 40)
-            yield FieldDifference(prefix + name, _ABSENT, text, note=_NO_FIELD)
+            yield FieldDifference(
+                prefix + name, _ABSENT, text, notes=(FieldNote(FieldNoteKind.NO_SUCH_FIELD),)
+            )
 
 
 def _list_differences(
@@ -185,12 +196,12 @@ def _list_differences(
             path,
             f"{len(a)} items",
             f"{len(b)} items",
-            note=f"length {len(a)} and {len(b)}",
+            notes=(FieldNote(FieldNoteKind.LENGTHS, len(a), len(b)),),
             first=extra,
         )
     elif 1 < len(a) <= _SORTED_MAX and rules.empty and _changed_places(a, b, base, rules):
         text_a, text_b = (preview(side, _LIST_MAX) for side in (a, b))
-        yield FieldDifference(path, text_a, text_b, note=SAME_ELEMENTS)
+        yield FieldDifference(path, text_a, text_b, notes=(FieldNote(FieldNoteKind.SAME_ELEMENTS),))
         return
     for place, (one, other) in enumerate(zip(a, b, strict=False)):
         yield from _differences(f"{path}[{place}]", one, other, base, rules)
@@ -216,18 +227,27 @@ def _item(items: list[Any], place: int) -> str:
 def _of_other_type(path: str, a: Any, b: Any, rules: FieldRules) -> Iterator[FieldDifference]:
     """Two types that define one field differently; equal bits mean nothing there."""
     if not rules.ignored(path):
-        yield FieldDifference(path or WHOLE, preview(a, 40), preview(b, 40), note="different types")
+        yield FieldDifference(
+            path or WHOLE,
+            preview(a, 40),
+            preview(b, 40),
+            notes=(FieldNote(FieldNoteKind.OTHER_TYPES),),
+        )
 
 
 def _text_difference(path: str, a: str, b: str) -> FieldDifference:
     at = next(
         (i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b))
     )
-    note = SAME_WORDS if _is_reordered(a, b) else ""
+    notes: tuple[FieldNote, ...]
+    notes = (FieldNote(FieldNoteKind.SAME_WORDS),) if _is_reordered(a, b) else ()
     if max(len(a), len(b)) > _TEXT_MAX:
-        note = note or f"first at character {at}; length {len(a)} and {len(b)}"
+        notes = notes or (
+            FieldNote(FieldNoteKind.FIRST_CHARACTER, at),
+            FieldNote(FieldNoteKind.LENGTHS, len(a), len(b)),
+        )
         a, b = _excerpt(a, at), _excerpt(b, at)
-    return FieldDifference(path or WHOLE, _quoted(a), _quoted(b), note=note)
+    return FieldDifference(path or WHOLE, _quoted(a), _quoted(b), notes=notes)
 
 
 def _is_reordered(a: str, b: str) -> bool:
@@ -303,3 +323,37 @@ def _preview_parts(value: Any, *, top: bool = False, base: str = "float64") -> I
         yield number_text(value, base)
     else:
         yield printable(str(value))
+
+
+# -- what a message type calls the values of a field: ``STATUS_SUCCEEDED → STATUS_ABORTED`` -------
+
+
+def _with_names(
+    found: FieldDifference, name: str, a: object, b: object, definition: Definition
+) -> FieldDifference:
+    """Return a difference of a whole number with the names of both values, if both have one.
+
+    ``definition`` is what rosbags knows of the message type: its constants, its fields.
+    """
+    if isinstance(a, bool) or not isinstance(a, int) or not isinstance(b, int) or found.notes:
+        return found
+    constants = _constants_of(name, definition)
+    names = [[n for n, value in constants if value == wanted] for wanted in (a, b)]
+    if any(len(of_one) != 1 for of_one in names):
+        return found
+    note = FieldNote(FieldNoteKind.CONSTANTS, names[0][0], names[1][0])
+    return replace(found, notes=(note,))
+
+
+def _constants_of(field: str, definition: Definition) -> list[tuple[str, object]]:
+    """Return the constants that are meant for a field: those that begin with its name, else all of
+    its type where no other field is of that type."""
+    constants, fields = definition
+    types = {name: detail[0] for name, (_, detail) in fields if isinstance(detail, tuple)}
+    kind = types.get(field)
+    of_type = [(name, value) for name, type_name, value in constants if type_name == kind]
+    prefix = f"{field.upper()}_"
+    own = [(name, value) for name, value in of_type if name.startswith(prefix)]
+    if own:
+        return own
+    return of_type if list(types.values()).count(kind) == 1 else []

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
+from rsltrace.diff.facts.evidence import FieldDifference, FieldNote, FieldNoteKind
 from rsltrace.diff.values.globs import FieldRules
 
 BINARY_ITEMS_MIN = 65
@@ -83,11 +83,12 @@ def diff_numbers(path: str, a: Any, b: Any, type_name: str, rules: FieldRules) -
         distance = float(abs(a - b))
         covered = rules.covers(path, distance, float(max(abs(a), abs(b))))
         return FieldDifference(path, text_a, text_b, distance, within_tolerance=covered)
-    note = _float_note(a, b)
+    kind = _float_note(a, b)
+    notes = (FieldNote(kind),) if kind is not None else ()
     if not (math.isfinite(a) and math.isfinite(b)):
         both_nan = math.isnan(a) and math.isnan(b)
         covered = both_nan and rules.tolerance(path) is not None
-        return FieldDifference(path, text_a, text_b, note=note, within_tolerance=covered)
+        return FieldDifference(path, text_a, text_b, notes=notes, within_tolerance=covered)
     distance = abs(a - b)
     return FieldDifference(
         path,
@@ -95,7 +96,7 @@ def diff_numbers(path: str, a: Any, b: Any, type_name: str, rules: FieldRules) -
         text_b,
         distance,
         ulp_distance(a, b, _width(type_name)),
-        note,
+        notes,
         within_tolerance=rules.covers(path, distance, max(abs(a), abs(b))),
     )
 
@@ -132,12 +133,13 @@ def diff_arrays(
         _short_array(a, binary),
         _short_array(b, binary),
         ulp=_largest_ulp(left, right),
-        note=_array_note(a, b, places, binary),
+        notes=_array_notes(a, b, places, binary),
         elements=(count, longest),
         first=_hex_rows(a, b, places) if binary else _first_elements(a, b, places),
         smallest=float(np.min(finite)) if len(finite) else None,
         largest=float(np.max(finite)) if len(finite) else None,
         within_tolerance=all_covered,
+        binary=binary,
     )
 
 
@@ -220,7 +222,7 @@ def _with_elements(one: FieldDifference, of: int, covered: bool) -> FieldDiffere
         one.b,
         one.absolute,
         one.ulp,
-        one.note,
+        one.notes,
         elements=(1, of),
         within_tolerance=covered,
     )
@@ -244,44 +246,44 @@ def _largest_ulp(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> int | None:
     return int(np.max(high.astype(np.uint64) - low.astype(np.uint64)))
 
 
-def _float_note(a: float, b: float) -> str:
+def _float_note(a: float, b: float) -> FieldNoteKind | None:
     if math.isnan(a) and math.isnan(b):
-        return "NaN with another payload"
+        return FieldNoteKind.NAN_PAYLOAD
     if math.isnan(a) or math.isnan(b):
-        return f"NaN in {'a' if math.isnan(a) else 'b'} only"
+        return FieldNoteKind.NAN_IN_A if math.isnan(a) else FieldNoteKind.NAN_IN_B
     if math.isinf(a) and math.isinf(b):
-        return "infinities of opposite sign"
+        return FieldNoteKind.OPPOSITE_INFINITIES
     if math.isinf(a) or math.isinf(b):
-        return f"infinite in {'a' if math.isinf(a) else 'b'} only"
-    return "sign of zero" if a == b else ""
+        return FieldNoteKind.INFINITE_IN_A if math.isinf(a) else FieldNoteKind.INFINITE_IN_B
+    return FieldNoteKind.SIGN_OF_ZERO if a == b else None
 
 
-def _array_note(
+def _array_notes(
     a: npt.NDArray[Any], b: npt.NDArray[Any], places: npt.NDArray[np.intp], binary: bool
-) -> str:
+) -> tuple[FieldNote, ...]:
     notes = []
     if len(a) != len(b):
-        notes.append(f"length {len(a)} and {len(b)}")
+        notes.append(FieldNote(FieldNoteKind.LENGTHS, len(a), len(b)))
     if len(a) == len(b) and len(places) > 1 and _same_elements(a[places], b[places]):
-        notes.append(SAME_ELEMENTS)
+        notes.append(FieldNote(FieldNoteKind.SAME_ELEMENTS))
     if binary and len(places):
-        notes.append(f"first at byte {places[0]}")
+        notes.append(FieldNote(FieldNoteKind.FIRST_BYTE, int(places[0])))
     if a.dtype.kind == "f":
         left, right = a[places], b[places]
         nan_a, nan_b = np.isnan(left), np.isnan(right)
         inf_a, inf_b = np.isinf(left), np.isinf(right)
-        for text, mask in (
-            ("NaN in a only", nan_a & ~nan_b),
-            ("NaN in b only", nan_b & ~nan_a),
-            ("NaN with another payload", nan_a & nan_b),
-            ("infinite in a only", inf_a & ~inf_b & ~nan_b),
-            ("infinite in b only", inf_b & ~inf_a & ~nan_a),
-            ("infinities of opposite sign", inf_a & inf_b),
-            ("sign of zero", left == right),
+        for kind, mask in (
+            (FieldNoteKind.NAN_IN_A, nan_a & ~nan_b),
+            (FieldNoteKind.NAN_IN_B, nan_b & ~nan_a),
+            (FieldNoteKind.NAN_PAYLOAD, nan_a & nan_b),
+            (FieldNoteKind.INFINITE_IN_A, inf_a & ~inf_b & ~nan_b),
+            (FieldNoteKind.INFINITE_IN_B, inf_b & ~inf_a & ~nan_a),
+            (FieldNoteKind.OPPOSITE_INFINITIES, inf_a & inf_b),
+            (FieldNoteKind.SIGN_OF_ZERO, left == right),
         ):
             if mask.any():
-                notes.append(f"{text}: {int(mask.sum())}")
-    return "; ".join(notes)
+                notes.append(FieldNote(kind, count=int(mask.sum())))
+    return tuple(notes)
 
 
 def _short_array(values: npt.NDArray[Any], binary: bool) -> str:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import WHOLE, diff_messages, preview
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.fields import FieldDifference
+    from rsltrace.diff.facts.evidence import FieldDifference
     from rsltrace.errors import RunError
 
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.row_sign import Sign
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
+from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.run import Run

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from rsltrace.diff.alignment.aligned_rows import AlignedRows
-    from rsltrace.diff.result.row_sign import Sign
+    from rsltrace.diff.row_sign import Sign
 
 Ints = npt.NDArray[np.int64]
 

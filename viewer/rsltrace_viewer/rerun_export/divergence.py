@@ -17,16 +17,13 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
+from rsltrace.diff.facts.evidence import CauseStep, EventView, LinkKind
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.markdown import code_block
-from rsltrace.diff.result.divergence import (
-    CauseStep,
-    Divergence,
-)
-from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff, Divergence
+from rsltrace.diff.sentences.values import link_text
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import event_title
@@ -149,7 +146,7 @@ def document(diff: Diff) -> str:
 def _step(step: CauseStep) -> str:
     view = _either(step.a, step.b)
     side = "" if step.a and step.b else (" (only in a)" if step.a else " (only in b)")
-    relation = f", {step.relation}" if step.relation else ""
+    relation = f", {link_text(step.link)}" if step.link.kind is not LinkKind.NOTHING else ""
     return f"{_event(view) if view else 'an event'}{relation}{side}"
 
 

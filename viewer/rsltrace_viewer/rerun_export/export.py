@@ -10,7 +10,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.model.regular_file import in_the_way

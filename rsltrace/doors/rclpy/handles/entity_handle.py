@@ -129,12 +129,19 @@ class EntityHandle(Destroyable, DomainEntity):
     def trace_name(self) -> str:
         return callback_name(self.user_callback())
 
+    def trace_group(self) -> str:
+        group = getattr(self._wrapper_now(), "callback_group", None)
+        return self.node.group_name(group) if isinstance(self.node, NodeHandle) else ""
+
     def user_callback(self) -> object:
+        return getattr(self._wrapper_now(), "callback", None)
+
+    def _wrapper_now(self) -> Any:
         wrapper = self.wrapper
         if wrapper is None and isinstance(self.node, NodeHandle) and self.node.made is not None:
             listed = self._listed_by(self.node.made)  # its constructor waits
             wrapper = next((one for handle, one in listed if handle is self), None)
-        return getattr(wrapper, "callback", None)
+        return wrapper
 
     def runnable(self) -> Runnable:
         node = self.node

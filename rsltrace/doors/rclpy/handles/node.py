@@ -26,6 +26,10 @@ from rsltrace.middleware.events.census import Asker
 from rsltrace.middleware.graph import Graph, action_names_and_types, names_and_types
 from rsltrace.middleware.participant import Participant, full_name
 
+_GROUP_KINDS = {
+    "MutuallyExclusiveCallbackGroup": "exclusive",
+    "ReentrantCallbackGroup": "reentrant",
+}
 _FRAMES_MAX = 10
 """Between the boundary and the constructor of ``rclpy.Node`` are two or three."""
 
@@ -101,6 +105,7 @@ class NodeHandle(Destroyable, Participant):
         self.mailbox: Mailbox | None = None
         self.rosout: DomainEntity | None = None
         self._made = _node_being_made()
+        self._groups: list[weakref.ref[Any]] = []
         self.user_waitables: dict[Any, Any] = {}
         self.waitable_count = 0
         domain.graph.add_node(self)
@@ -275,6 +280,18 @@ class NodeHandle(Destroyable, Participant):
 
     def user_callback(self) -> object:
         return None if self.made is None else type(self.made)  # its constructor
+
+    def group_name(self, group: Any) -> str:
+        """Return what the trace calls a callback group, by its kind and its number in the node:
+        ``reentrant 2``; "" for the default one."""
+        if group is None or group is getattr(self.made, "default_callback_group", group):
+            return ""
+        number = next((n for n, one in enumerate(self._groups, 1) if one() is group), 0)
+        if not number:
+            self._groups.append(weakref.ref(group))
+            number = len(self._groups)
+        kind = type(group).__name__
+        return f"{_GROUP_KINDS.get(kind, kind)} {number}"
 
     @property
     def made(self) -> Any:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
+from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference, Presence
+from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.report.differences import distance_text
-from rsltrace.diff.result.divergence import Divergence, MessageDifference
-from rsltrace.diff.result.fields import FieldDifference
-from rsltrace.diff.result.row_sign import Sign
-from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
+from rsltrace.diff.result import Divergence
+from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.sentences.runs import remark_text
+from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
@@ -126,9 +128,10 @@ def _why(comparison: Comparison) -> Iterator[Line]:
     elif (divergence := comparison.diff.shown) is not None:
         sentence = divergence.root_sentence or divergence.sentence
         yield Line(1, "why", printable(sentence), Role.NOTE, "why")
-        failed = [note for note in comparison.diff.notes if ENDED_BY_EXCEPTION in note]
-        for place, note in enumerate(failed):
-            yield Line(1, "!", printable(note), Role.ERROR, f"why.{place}")
+        remarks = comparison.diff.remarks
+        failed = [remark for remark in remarks if isinstance(remark, EndedByException)]
+        for place, remark in enumerate(failed):
+            yield Line(1, "!", printable(remark_text(remark)), Role.ERROR, f"why.{place}")
 
 
 def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line]:
@@ -146,8 +149,8 @@ def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line
             f"{view.index} {sign.value} {view.entity.node or RUN_NAME} {SHORT_KINDS[view.kind]} "
         )
         text = f"{words}{view.entity.name}"
-        if step.relation:
-            text += f", {step.relation}"
+        if relation := link_text(step.link):
+            text += f", {relation}"
         yield Line(
             1 + depth,
             "└" if depth else "●",
@@ -184,14 +187,16 @@ def message_difference_lines(
 ) -> Iterator[Line]:
     """Yield a message in which two events differ, with its fields."""
     what = "input" if message.position < 0 else f"output {message.position}"
-    presence = "" if message.presence == "both" else f", {message.presence}"
+    presence = ""
+    if message.presence is not Presence.BOTH:
+        presence = f", {message.presence.value}"
     is_open = openness.is_open(path, True)
     title = printable(f"{message.topic}  {message.type}{presence}").rstrip()
     yield Line(0, f"≠ {what}", title, Role.SECTION, path, is_open)
     if not is_open:
         return
-    if message.reason:
-        yield Line(1, "", printable(message.reason), Role.NOTE, f"{path}.reason")
+    if reason := no_fields_text(message):
+        yield Line(1, "", printable(reason), Role.NOTE, f"{path}.reason")
     if message.preview:
         yield Line(1, "", printable(message.preview), Role.FIELD, f"{path}.preview")
     for number, difference in enumerate(message.fields):

@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 
 from rsltrace.diff.alignment.rows import Run as DiffRun
 from rsltrace.diff.causes.state_differences import state_differences
-from rsltrace.diff.result.divergence import CallDifference, Divergence, StateDifference
-from rsltrace.diff.result.events import EventView
+from rsltrace.diff.facts.evidence import CallDifference, EventView, StateDifference
+from rsltrace.diff.result import Divergence
 from rsltrace.model.printable import printable, shortened
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 

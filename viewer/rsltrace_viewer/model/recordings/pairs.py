@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.bags.sequences import gaps_by_order
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace_viewer.model.recordings.recording import Topic
 
 _NONE = -1

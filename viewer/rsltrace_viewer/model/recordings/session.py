@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from rsltrace.diff.bags.comparison import diff_bags
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.result import BagDiff
+from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds

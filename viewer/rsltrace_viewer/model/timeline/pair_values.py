@@ -13,8 +13,7 @@ from rsltrace.model.printable import printable, shortened
 from rsltrace_viewer.model.timeline.message_values import field_name, number
 
 if TYPE_CHECKING:
-    from rsltrace.diff.result.divergence import MessageDifference
-    from rsltrace.diff.result.fields import FieldDifference
+    from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference
     from rsltrace.diff.traces.aligned_runs import AlignedRuns
 
 Pair = tuple[int, int]

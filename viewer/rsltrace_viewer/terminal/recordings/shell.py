@@ -10,7 +10,7 @@ from textual.containers import Container
 from textual.content import Content
 from textual.widgets import Static
 
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace.model.printable import printable
 from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.inspector.lines import Line

@@ -14,8 +14,7 @@ from textual.widgets import Static
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import Style
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import BagDiff, Diff
 
 _STYLES = {
     Style.TITLE: "bold $text-primary",

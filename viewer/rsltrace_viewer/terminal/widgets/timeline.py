@@ -14,7 +14,7 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace.diff.result.row_sign import Sign
+from rsltrace.diff.row_sign import Sign
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.timeline.columns import Columns
 from rsltrace_viewer.model.timeline.events import EventText

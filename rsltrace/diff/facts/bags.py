@@ -1,15 +1,21 @@
-"""What a diff of two recordings says: frozen values that the comparison fills and reports print.
+"""What the comparison of two recordings finds, and that of two runs of which one is native.
 
-``a`` is always the first recording given, ``b`` the second. Log times are integer nanoseconds.
+``a`` is always the first one given, ``b`` the second. Log times are integer nanoseconds.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
-from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
-from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
+from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
+from rsltrace.diff.facts.remarks import Remark
+
+if TYPE_CHECKING:
+    from rsltrace.trace.native import Spread
+    from rsltrace.words.entities import EntityKey
 
 
 class BagVerdict(Enum):
@@ -20,14 +26,6 @@ class BagVerdict(Enum):
     AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
     """One of them is cut, and until there they agree (or are equal within tolerance)."""
     DIFFERENT = "different"
-
-
-class Presence(Enum):
-    """Which of the recordings a message is in."""
-
-    BOTH = "both"
-    ONLY_A = "only a"
-    ONLY_B = "only b"
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +60,8 @@ class MessageDivergence:
     ``a`` or ``b`` is None where that side has no counterpart. ``after_ns`` is how long after the
     start of its recording the message was logged. ``before`` are the last messages of the topic
     before it (in a, or in b where a has none). ``fields`` and ``more_fields`` say what differs;
-    ``reason`` why nothing can be said. ``note``: both have the message, but in another place of the
-    topic: ``messages 4 and 5 are swapped``.
+    ``no_fields`` why nothing can be. ``moved``: both have the message, but in another place of the
+    topic; ``swapped_at``: it changed places with the next one, where a has the first of them.
     """
 
     topic: str
@@ -74,9 +72,11 @@ class MessageDivergence:
     after_ns: int
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
-    reason: str = ""
+    no_fields: NoFields | None = None
+    error: str = ""
     before: tuple[BagMessage, ...] = ()
-    note: str = ""
+    moved: bool = False
+    swapped_at: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,7 +122,7 @@ class LoneTopic:
 
 
 @dataclass(frozen=True, slots=True)
-class BagDiff:
+class BagComparison:
     """The answer for two recordings. ``exit_code``: 0 equal, 1 not, 3 within tolerance.
 
     ``topics`` are those that both sides have, in the order of a; ``first`` is the earliest
@@ -133,14 +133,13 @@ class BagDiff:
     a: Recording
     b: Recording
     verdict: BagVerdict
-    sentence: str
     by: str
     topics: tuple[TopicDiff, ...] = ()
     topics_only_a: tuple[LoneTopic, ...] = ()
     topics_only_b: tuple[LoneTopic, ...] = ()
     first: MessageDivergence | None = None
     next_step: str = ""
-    notes: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
     as_far_as_they_go: bool = False
     """Whether it is enough that they agree as far as they go."""
 
@@ -181,3 +180,63 @@ class BagDiff:
     def _is_enough(self) -> bool:
         """Whether agreeing as far as they go was asked for, and something agrees."""
         return self.as_far_as_they_go and any(t.agreeing for t in self.topics)
+
+
+# -- native runs ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackTimes:
+    """When the callbacks of one entity ran, in both runs.
+
+    ``measure`` says of what ``a`` and ``b`` are the spread: ``period``, from one call of a timer to
+    the next, or ``latency``, from the start of the callback that caused it.
+    """
+
+    entity: EntityKey
+    events_a: int
+    events_b: int
+    measure: str
+    a: Spread | None
+    b: Spread | None
+
+
+@dataclass(frozen=True, slots=True)
+class Tail:
+    """A topic of which ``run`` has ``more`` messages, at its end."""
+
+    topic: str
+    more: int
+    run: str
+
+
+@dataclass(frozen=True, slots=True)
+class MovedCallback:
+    """A callback that ran in another order: its events."""
+
+    entity: EntityKey
+    event_a: int
+    event_b: int
+
+
+@dataclass(frozen=True, slots=True)
+class NativeComparison:
+    """``native`` are the sides that are: ``("a",)``. ``content`` compares the messages, topic by
+    topic; ``tails`` are topics of which one run has more messages, at its end.
+
+    Of ``compared`` callbacks that both have, ``moved`` ran in another order; ``first_moved`` is the
+    first of them.
+    """
+
+    native: tuple[str, ...]
+    content: BagComparison
+    differs: bool
+    """Whether a message says something else, or is missing before the end; not whether messages
+    changed places."""
+    first: MessageDivergence | None
+    """The first that does, on a topic that both have."""
+    tails: tuple[Tail, ...]
+    compared: int
+    moved: int
+    first_moved: MovedCallback | None
+    callbacks: tuple[CallbackTimes, ...]

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 
 EXIT_DIVERGED = 1
 
-
 EXIT_WITHIN_TOLERANCE = 3
 """Neither identical (0) nor diverged (1), and not what others use for trouble (2)."""
 

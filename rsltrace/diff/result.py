@@ -1,23 +1,86 @@
-"""What a diff of two traces says. A report prints it without opening the files again.
+"""The answers: what a diff found, with its sentences. A report needs no file for them any more.
 
 ``a`` is always the first file given, ``b`` the second. Stamps are simulated nanoseconds, hashes
-unsigned 64-bit.
+unsigned 64-bit. Sentences are made when they are asked for; nothing is decided by them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
-from rsltrace.diff.result.settings import Setting
-from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
+from rsltrace.diff.facts.bags import BagComparison, NativeComparison
+from rsltrace.diff.facts.causes import Judgement, UnrecordedAnswer, Verdict
+from rsltrace.diff.facts.evidence import CallDifference, CauseStep, EventView, Reach, Setting
+from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
 
-if TYPE_CHECKING:  # most runs are identical: their diff loads no more than it needs
-    from rsltrace.diff.result.bags import BagDiff
-    from rsltrace.diff.result.divergence import Divergence
-    from rsltrace.diff.result.native import NativeComparison
+if TYPE_CHECKING:
     from rsltrace.words.entities import EntityKey
+
+
+@dataclass(frozen=True, slots=True)
+class Divergence(Judgement):
+    """One place where the runs diverge. ``independent`` ones follow from no earlier one.
+
+    ``chain`` is the way from the root to it. ``before_a``/``before_b`` are the last events before
+    it in each run, ``same_node_*`` the last ones in the same node.
+    """
+
+    chain: tuple[CauseStep, ...] = ()
+    before_a: tuple[EventView, ...] = ()
+    before_b: tuple[EventView, ...] = ()
+    same_node_a: tuple[EventView, ...] = ()
+    same_node_b: tuple[EventView, ...] = ()
+    reaches: tuple[Reach, ...] = ()
+    next_step: str = ""
+    calls: tuple[CallDifference, ...] = ()
+
+    @property
+    def sentence(self) -> str:
+        """What happened."""
+        from rsltrace.diff.sentences.divergence import sentence_of
+
+        return sentence_of(self)
+
+    @property
+    def root_sentence(self) -> str:
+        """Where it comes from; for most verdicts that is the diverging event itself."""
+        from rsltrace.diff.sentences.divergence import cause_of
+
+        return cause_of(self)
+
+    @property
+    def likely_cause(self) -> str:
+        """What came from outside and explains it, "" if nothing is known."""
+        from rsltrace.diff.sentences import sentence
+
+        if self.likely is None or isinstance(self.likely, UnrecordedAnswer):
+            return ""
+        return sentence(self.likely)
+
+
+@dataclass(frozen=True, slots=True)
+class BagDiff(BagComparison):
+    """The answer for two recordings, with its sentences."""
+
+    @property
+    def sentence(self) -> str:
+        """What a person wants to know."""
+        from rsltrace.diff.sentences.runs import recordings_sentence
+
+        return recordings_sentence(self)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else to know of the comparison."""
+        return _notes(self.remarks)
+
+
+def _notes(remarks: tuple[Remark, ...]) -> tuple[str, ...]:
+    from rsltrace.diff.sentences.runs import remark_text
+
+    return tuple(remark_text(remark) for remark in remarks)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +110,9 @@ class Side:
 class Diff:
     """The answer. ``exit_code``: 0 identical, 1 not, 3 equal within tolerance.
 
-    ``verdict`` is that of the first divergence, ``sentence`` what a person wants to know of it: the
-    settings that are to blame, and what they did. ``effect`` is the first difference that is more
-    than a node set up otherwise (other parameters), if the first divergence is no more than that.
+    ``verdict`` is that of the first divergence, ``outcome`` what is said of both runs as a whole.
+    ``effect`` is the first difference that is more than a node that was set up differently (other
+    parameters), if the first divergence is no more than that.
     ``agreeing`` is how many events are the same before the first divergence. ``settings`` lists
     what differs in job and environment. ``counts`` and ``resync_index`` (indexes in a and b from
     which on the runs agree again, if they do) cover the events from the divergence to
@@ -61,7 +124,7 @@ class Diff:
     a: Side
     b: Side
     verdict: Verdict
-    sentence: str
+    outcome: Outcome
     agreeing: int
     divergences: tuple[Divergence, ...] = ()
     settings: tuple[Setting, ...] = ()
@@ -69,7 +132,7 @@ class Diff:
     resync_index: tuple[int, int] | None = None
     aligned_to: tuple[int, int] = (0, 0)
     bytes_read: int = 0
-    notes: tuple[str, ...] = field(default=())
+    remarks: tuple[Remark, ...] = ()
     tolerance: BagDiff | None = None
     as_far_as_they_go: bool = False
     """Whether it is enough that they agree as far as they go."""
@@ -79,6 +142,18 @@ class Diff:
     native: NativeComparison | None = None
     """What of the difference is content, order and timing, if a run is native. Events are not
     aligned then."""
+
+    @property
+    def sentence(self) -> str:
+        """What a person wants to know: the settings that are to blame, and what they did."""
+        from rsltrace.diff.sentences.runs import answer
+
+        return answer(self)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What else to know of the comparison."""
+        return _notes(self.remarks)
 
     @property
     def shown(self) -> Divergence | None:
@@ -156,3 +231,20 @@ class Diff:
         if shown.next_step:
             sheet.line(f"next: {shown.next_step}")
         return sheet.html()
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduction(RepeatedRun):
+    """Which of two runs that diverge a third one repeats, with its sentence."""
+
+    @property
+    def sentence(self) -> str:
+        """The answer in words."""
+        from rsltrace.diff.sentences.runs import reproduction_text
+
+        return reproduction_text(self)
+
+    @property
+    def exit_code(self) -> int:
+        """0 if one of the runs was repeated, 1 if not."""
+        return 0 if self.repeats in (Repeats.A, Repeats.B) else 1

@@ -1,0 +1,253 @@
+"""The calls the guard found that can explain a divergence: in the event itself, or before it.
+
+What a trace keeps of a call is text that the guard wrote (``os.environ['X']``, ``4 bytes, SHA-256
+ab``). It is read here, once.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import re
+from itertools import zip_longest
+from operator import itemgetter
+from typing import Any
+
+from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.environment import used_by
+from rsltrace.diff.causes.event_views import subject_of
+from rsltrace.diff.facts.causes import UnrecordedAnswer
+from rsltrace.diff.facts.evidence import CallDifference, EventView
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.finding import Finding, Mode, Source
+from rsltrace.model.printable import printable, shortened, told_apart
+
+CALLS_MAX = 20
+EARLIER_MAX = 3
+_CALL_MAX = 60
+_ANSWERED = (Source.SOCKET, Source.PROCESS)
+_FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
+"""The folder of an absolute path between quotes."""
+
+STARTED_BY = "subprocess.Popen("
+_STARTED = "started"
+_ANSWER_MAX = 60
+_CHANGED = re.compile(r"(\d+ bytes), changed \d+")
+_VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
+_FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
+_CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
+
+_Numbered = tuple[int, int, Finding]
+"""A finding with its event, and its number among those of its run."""
+
+
+def call_differences(
+    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None, node: str = ""
+) -> tuple[CallDifference, ...]:
+    """Return the calls made inside two events, those with different answers first.
+
+    If all answers agree, the first calls before them in the same node, or when its modules were
+    imported, that gave different ones come first: what was read earlier may show only now. ``node``
+    is another node that is to blame.
+    """
+    inside = _paired(_inside(run_a, a), _inside(run_b, b))
+    differing = [call for call in inside if call.differs]
+    if differing:
+        return (*differing, *(call for call in inside if not call.differs))[:CALLS_MAX]
+    some = a or b
+    is_somebodys = some is not None and (node or subject_of(some))
+    # Where one run has no such event: up to there the two agree, indexes and all.
+    sides = (_before(run_a, a or b, node), _before(run_b, b or a, node)) if is_somebodys else ()
+    before = _paired(*sides) if sides else []
+    earlier = [call for call in before if call.differs][:EARLIER_MAX]
+    places = {call.where for call in earlier}
+    programs = [c for c in before if c.call.startswith(STARTED_BY) and c.where in places]
+    programs = [call for call in programs if call not in earlier][:EARLIER_MAX]
+    return (*earlier, *programs, *inside)[:CALLS_MAX]
+
+
+def unrecorded_answer(run: Run, view: EventView) -> UnrecordedAnswer | None:
+    """Return which answer of a socket or a program nobody kept: the last one in an event, else the
+    last one before it in its node; None if there was none."""
+    found = [*_before(run, view), *_inside(run, view)]
+    kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
+    one = next(kept, None)
+    if one is None:
+        return None
+    call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
+    place = one.stack.partition(" in ")[0]
+    return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
+
+
+def _inside(run: Run, view: EventView | None) -> list[Finding]:
+    return run.trace.answers.get(view.index, []) if view is not None else []
+
+
+def _before(run: Run, view: EventView | None, other: str = "") -> list[Finding]:
+    """Return what a node called before an event: the event's own, or its main if it is of none, or
+    another one."""
+    if view is None:
+        return []
+    node = other or view.node
+    files = _files_of(run, view, node)
+    return [
+        finding
+        for index, found in run.trace.answers.items()
+        for finding in found
+        if (index < view.index and _is_of(run, finding, node, view))
+        or _is_of_import(finding, files)
+    ]
+
+
+def _is_of(run: Run, finding: Finding, node: str, view: EventView) -> bool:
+    if finding.node or node:
+        return finding.node == node
+    entity = run.trace.entities.get(finding.entity)
+    return entity is not None and entity.kind is EntityKind.MAIN and entity.name == view.entity.name
+
+
+def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
+    """Whether a call was made while a module was imported, for no node in particular."""
+    place, _, function = finding.stack.partition("\n")[0].partition(" in ")
+    return not finding.node and function == "<module>" and place.rpartition(":")[0] in files
+
+
+def _files_of(run: Run, view: EventView, node: str) -> frozenset[str]:
+    """Return the files of the modules that a node or main uses, as places in code name them."""
+    entities = run.trace.entities.values()
+    if node:
+        module = next((e.type for e in entities if e.name == node and e.type), "").partition(":")[0]
+    else:
+        mains = (e for e in entities if e.kind is EntityKind.MAIN and e.name == view.entity.name)
+        file = next((e.source for e in mains), "").rpartition(":")[0]
+        module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    names = [name.replace(".", "/") for name in used_by((run.trace, run.trace), module) if name]
+    return frozenset(f"{name}{end}" for name in names for end in (".py", "/__init__.py"))
+
+
+def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
+    """Pair the n-th findings of each call at each place; a file may lie in another folder.
+
+    They come in the order in which they were made, in whichever run that was first.
+    """
+    places: dict[tuple[str, str], tuple[list[_Numbered], list[_Numbered]]] = {}
+    for side, findings in enumerate((a, b)):
+        for number, finding in enumerate(findings):
+            place = (_FOLDER.sub(r"\1", finding.call), finding.stack)
+            places.setdefault(place, ([], []))[side].append((finding.event, number, finding))
+    calls = []
+    for place, (of_a, of_b) in places.items():
+        for x, y in zip_longest(of_a, of_b):
+            made = min(one[:2] for one in (x, y) if one is not None)
+            calls.append((made, place, _difference(x and x[2], y and y[2])))
+    return [call for *_, call in sorted(calls, key=itemgetter(0, 1))]
+
+
+def _difference(a: Finding | None, b: Finding | None) -> CallDifference:
+    one = a or b
+    assert one is not None
+    return call_difference(
+        one.source.value,
+        one.call,
+        one.stack.partition("\n")[0],
+        (None if a is None else a.event, None if b is None else b.event),
+        (None if a is None else answer_text(a), None if b is None else answer_text(b)),
+    )
+
+
+def call_difference(
+    source: str,
+    call: str,
+    where: str,
+    events: tuple[int | None, int | None],
+    answers: tuple[str | None, str | None],
+) -> CallDifference:
+    """Return a call of both runs, or of one, with what tells its answers apart."""
+    a, b = answers
+    touched = [_CHANGED.fullmatch(value or "") for value in answers]
+    return CallDifference(
+        source,
+        call,
+        where,
+        *events,
+        a,
+        b,
+        subject=subject_of_call(source, call),
+        short=("", "") if a is None or b is None else _short(source, a, b),
+        only_touched=bool(touched[0] and touched[1] and touched[0][1] == touched[1][1]),
+    )
+
+
+def subject_of_call(source: str, call: str) -> str:
+    """Return what a call asks for: ``MOTOR_SEED``, ``gains.yaml``; else the call."""
+    found = None
+    if source == Source.ENVIRONMENT.value:
+        found = _VARIABLE.match(call)
+    elif source in (Source.FILE.value, Source.DIRECTORY.value):
+        found = _FILE.match(call)
+    return found[2] if found else call
+
+
+def _short(source: str, a: str, b: str) -> tuple[str, str]:
+    contents = _CONTENT.fullmatch(a), _CONTENT.fullmatch(b)
+    if contents[0] and contents[1] and contents[0][1] == contents[1][1]:
+        a, b = contents[0][2], contents[1][2]
+    sizes = _CHANGED.fullmatch(a), _CHANGED.fullmatch(b)
+    if sizes[0] and sizes[1] and sizes[0][1] != sizes[1][1]:
+        a, b = sizes[0][1], sizes[1][1]
+    if source == Source.ENVIRONMENT.value:
+        a, b = unquoted(a), unquoted(b)
+    return told_apart(a, b, _ANSWER_MAX)
+
+
+def unquoted(text: str, quote: str = "'") -> str:
+    """Return a plain word without its quotes."""
+    inner = text[1:-1]
+    quoted = len(text) > 2 and text[0] == text[-1] == quote
+    return inner if quoted and re.fullmatch(r"[\w./:+-]+", inner) else text
+
+
+def answer_text(finding: Finding) -> str:
+    """Return ``b'1.5\\n'`` of an answer that is kept as JSON, ``exit status 4`` of how a program
+    ended; of a program that was started no more than that, as its number is another one each
+    time. Other answers are returned as they are."""
+    if finding.mode is not Mode.RECORD:
+        return finding.value
+    if finding.call.startswith(STARTED_BY) and finding.value.isdecimal():
+        return _STARTED
+    try:
+        value = json.loads(finding.value)
+        value = value["then"] if isinstance(value, dict) and "of" in value else value
+        return _exit_text(value) if finding.call == "os.waitpid()" else _text(value)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError):
+        return finding.value
+
+
+def _exit_text(value: Any) -> str:
+    status = os.waitstatus_to_exitcode(int(value["tuple"][1]))
+    return f"exit status {status}" if status >= 0 else f"ended by signal {-status}"
+
+
+def _text(value: Any) -> str:
+    return str(_Shown(value)) if isinstance(value, (dict, list)) else repr(value)
+
+
+class _Shown:
+    """A decoded value whose ``repr`` is that of the answer itself."""
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def __repr__(self) -> str:
+        value = self._value
+        if isinstance(value, list):
+            return repr([_Shown(item) for item in value])
+        if isinstance(value, dict) and "bytes" in value:
+            return repr(base64.b64decode(value["bytes"], validate=True))
+        if isinstance(value, dict) and "tuple" in value:
+            return repr(tuple(_Shown(item) for item in value["tuple"]))
+        if isinstance(value, dict) and "error" in value:
+            kind, _, text, *_ = value["error"]
+            return f"{kind}: {text}"
+        return repr(value)

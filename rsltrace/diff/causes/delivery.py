@@ -1,0 +1,241 @@
+"""Why an event happened in one run only, or at another time: messages that did not arrive, calls
+that waited, sleeps, periods of timers, messages of a bag that changed places.
+
+In the trace a wait is two events of its entity; what it was for stands at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsltrace.diff.alignment.rows import BAG, Run, load_rows
+from rsltrace.diff.facts.causes import (
+    Loss,
+    NothingArrives,
+    QueueOverflowed,
+    Slept,
+    StillWaits,
+)
+from rsltrace.diff.facts.evidence import (
+    EntitiesChanged,
+    EntityChange,
+    EntityProperty,
+    EventView,
+    MessageDifference,
+)
+from rsltrace.model.endless_wait import EndlessWait, waits_of
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+
+_LOOKED_AT_MAX = 1000
+_QOS_EVENT = EntityKind.QOS_EVENT.label
+_OF_QOS = (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT, EventKind.QOS_EVENT)
+"""Events of endpoints."""
+
+
+# -- messages that both runs sent and only one received ------------------------------------------
+
+
+def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Loss | None:
+    """Say that a queue overflowed, that a subscription is gone or has another QoS; None where that
+    is not so.
+
+    ``a`` or ``b`` is the event of the run that received the message, the other is None.
+    """
+    view = a or b
+    if view is None or (a and b):
+        return None
+    if view.kind in _OF_QOS and (changed := entity_changes(run_a, run_b, topics_of(view, ()))):
+        return changed
+    if view.kind is not EventKind.SUBSCRIPTION or view.cause_event == NO_EVENT:
+        return None
+    has_not, name = (run_b, "b") if a is not None else (run_a, "a")
+    has = run_a if a is not None else run_b
+    number = has_not.matching.by_key[view.entity]
+    later = _received_after(has_not, number, view.cause_event, view.cause_output)
+    if later is None:
+        more = _received_after(has, number, view.cause_event, view.cause_output)
+        return NothingArrives(name) if more is not None else None
+    depth = _depth(has_not, number)
+    sent = _sent_between(has_not, view, later)
+    if depth is not None and sent >= depth:
+        return QueueOverflowed(depth, name)
+    return None
+
+
+def _received_after(
+    run: Run, number: int, cause_event: int, cause_output: int
+) -> tuple[int, int, int] | None:
+    """Return the next event of a subscription after a message was sent that is of a later one:
+    its index, and which output of which event it received."""
+    rows = load_rows(run, cause_event, cause_event + _LOOKED_AT_MAX)
+    for place, other in enumerate(rows.number):
+        if other != number or rows.kind[place] != EventKind.SUBSCRIPTION:
+            continue
+        cause = rows.cause[place], rows.cause_output[place]
+        if cause[0] != NO_EVENT and cause > (cause_event, cause_output):
+            return rows.first + place, *cause
+    return None
+
+
+def _sent_between(run: Run, view: EventView, later: tuple[int, int, int]) -> int:
+    """Return how many messages of the topic were sent after one, until the next was received."""
+    index, cause_event, _ = later
+    last = max(cause_event, min(index, cause_event + _LOOKED_AT_MAX))
+    rows = load_rows(run, view.cause_event, last + 1)
+    keys = run.matching.keys
+    count = 0
+    for place in range(len(rows)):
+        for nth, (kind, number, _, _) in enumerate(rows.outputs(rows.first + place)):
+            if kind != OutputKind.MESSAGE or keys[number].name != view.entity.name:
+                continue
+            count += (rows.first + place, nth) > (view.cause_event, view.cause_output)
+    return count
+
+
+def _depth(run: Run, number: int) -> int | None:
+    depth = _qos(run, number).get("depth")
+    return depth if isinstance(depth, int) else None
+
+
+def _qos(run: Run, number: int) -> dict[str, object]:
+    qos = _detail(run, number).get("qos")
+    return qos if isinstance(qos, dict) else {}
+
+
+def _detail(run: Run, number: int) -> dict[str, object]:
+    """Return what the trace says of an entity, nothing if the run has it not."""
+    table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
+    ids = (table == number).nonzero()[0]
+    return run.trace.entities[int(ids[0])].detail if len(ids) else {}
+
+
+# -- entities with other properties ---------------------------------------------------------------
+
+
+def topics_of(view: EventView, messages: Sequence[MessageDifference]) -> frozenset[str]:
+    """Return the topics and services whose QoS an event, or what differs in it, can depend on."""
+    met = [view.entity] if view.kind in _OF_QOS else []
+    met += [m.entity for m in messages if m.kind in (OutputKind.ENTITY, OutputKind.DRAW)]
+    # A QoS event goes by its topic and its status: "/scan incompatible".
+    return frozenset(
+        key.name.rpartition(" ")[0] if key.kind == _QOS_EVENT else key.name for key in met
+    )
+
+
+def entity_changes(
+    run_a: Run, run_b: Run, topics: frozenset[str], nodes: frozenset[str] = frozenset()
+) -> EntitiesChanged | None:
+    """Return which entities of both runs have another QoS, of some topics and services, or are in
+    another callback group, of some nodes; None if there are none.
+
+    A depth is not told: it shows in another way.
+    """
+    alone = {*run_a.matching.only_a, *run_a.matching.only_b}
+    found = []
+    for number, key in enumerate(run_a.matching.keys):
+        if number in alone or not (key.name in topics or key.node in nodes):
+            continue
+        a, b = _detail(run_a, number), _detail(run_b, number)
+        if key.name in topics and (values := _policies(a.get("qos"), b.get("qos"))):
+            found.append(EntityChange(key, EntityProperty.QOS, values))
+        if key.node in nodes and (groups := (a.get("group"), b.get("group")))[0] != groups[1]:
+            one, other = (str(group or "default") for group in groups)
+            found.append(EntityChange(key, EntityProperty.GROUP, (("", one, other),)))
+    return EntitiesChanged(tuple(found)) if found else None
+
+
+def _policies(a: object, b: object) -> tuple[tuple[str, str | int | None, str | int | None], ...]:
+    if not isinstance(a, dict) or not isinstance(b, dict):
+        return ()
+    names = [name for name in {**a, **b} if name != "depth" and a.get(name) != b.get(name)]
+    return tuple((name, a.get(name), b.get(name)) for name in names)
+
+
+# -- calls that waited, callbacks that slept -----------------------------------------------------
+
+
+def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Loss | None:
+    """Say which call waited to the end of a run and kept an event from happening there that the
+    other has; None if there is no such call."""
+    view = a or b
+    if view is None or (a and b):
+        return None
+    name, lacking, having = ("b", run_b, run_a) if a else ("a", run_a, run_b)
+    elsewhere = {one.text for one in _waits(having)}
+    number = lacking.matching.by_key[view.entity]
+    table = lacking.matching.numbers_b if lacking.of_b else lacking.matching.numbers_a
+    for wait in _waits(lacking):
+        is_held = any(0 <= one < len(table) and table[one] == number for one in wait.held)
+        if wait.since_ns <= view.stamp_ns and (is_held or wait.text not in elsewhere):
+            return StillWaits(wait.text, wait.since_ns, name)
+    return None
+
+
+def _waits(run: Run) -> list[EndlessWait]:
+    return waits_of(run.trace.result) if run.trace.complete else []
+
+
+def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Slept | None:
+    """Return how long two events of one callback slept, or the callback before them; None if it was
+    as long in both, or if they did not."""
+    if a is None or b is None or a.kind is not b.kind:
+        return None
+    in_a, in_b = _slept_ns(run_a, a), _slept_ns(run_b, b)
+    return None if in_a == in_b else Slept(in_a, in_b)
+
+
+def _slept_ns(run: Run, view: EventView) -> int | None:
+    """Return how long a callback slept after an event, or before one with which it went on."""
+    number = run.matching.by_key[view.entity]
+    if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
+        rows = load_rows(run, max(view.index - _LOOKED_AT_MAX, 0), view.index)
+        for place in reversed(range(len(rows))):
+            if rows.number[place] == number:
+                suspended = rows.flags[place] & EventFlag.SUSPENDED
+                slept_ns = view.stamp_ns - rows.stamp[place]
+                return slept_ns or None if suspended else None
+    elif view.flags & EventFlag.SUSPENDED:
+        rows = load_rows(run, view.index + 1, view.index + 1 + _LOOKED_AT_MAX)
+        for place in range(len(rows)):
+            if rows.number[place] == number:
+                slept = rows.kind[place] == EventKind.RESUME and rows.cause[place] == NO_EVENT
+                slept_ns = rows.stamp[place] - view.stamp_ns
+                return slept_ns or None if slept else None
+    return None
+
+
+# -- timers, and bags ----------------------------------------------------------------------------
+
+
+def periods(
+    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
+) -> tuple[int, int] | None:
+    """Return the periods of a timer in both runs (ns), if they differ."""
+    view = a or b
+    if view is None or view.kind is not EventKind.TIMER:
+        return None
+    number = run_a.matching.by_key[view.entity]
+    one, other = (_detail(run, number).get("period_ns") for run in (run_a, run_b))
+    if isinstance(one, int) and isinstance(other, int) and one != other:
+        return one, other
+    return None
+
+
+def are_swapped(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> bool:
+    """Whether b plays what a plays at the time of ``a``, and at that time what a plays then."""
+    if a is None or b is None or a.kind is not EventKind.BAG or a.stamp_ns == b.stamp_ns:
+        return False
+    first = min(a.index, b.index)
+    played = [
+        {
+            (rows.stamp[place], rows.input[place])
+            for place, kind in enumerate(rows.kind)
+            if kind == BAG and rows.number[place] == run.matching.by_key[a.entity]
+        }
+        for run in (run_a, run_b)
+        for rows in [load_rows(run, first, first + _LOOKED_AT_MAX)]
+    ]
+    there_a = {content for stamp, content in played[0] if stamp == b.stamp_ns}
+    there_b = {content for stamp, content in played[1] if stamp == a.stamp_ns}
+    return bool(there_a & there_b)

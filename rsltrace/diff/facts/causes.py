@@ -1,0 +1,417 @@
+"""What a divergence is, and where it comes from.
+
+A ``Judgement`` holds both: ``what`` happened, ``why``, and what is likely behind it. Of ``What``
+and ``Why``, those that say nothing but themselves are members of an enum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from rsltrace.diff.facts.evidence import (
+    CallDifference,
+    EntitiesChanged,
+    EventView,
+    Fact,
+    MessageDifference,
+    Setting,
+    StateDifference,
+)
+
+
+class Verdict(Enum):
+    """Why two runs diverge. The set is closed; ``Diff.sentence`` puts it in words."""
+
+    IDENTICAL = "identical"
+    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
+    """One of the recordings is cut, and until there they agree: nobody knows what came after."""
+    DIFFERENT_JOBS = "different-jobs"
+    """One of the runs has no event to compare, and their jobs or graphs are others."""
+    SAME_INPUT_DIFFERENT_OUTPUT = "same-input-different-output"
+    DIFFERENT_INPUT = "different-input"
+    SCHEDULE = "schedule"
+    TIMING = "timing"
+    MISSING = "missing"
+    EXTRA = "extra"
+    ENDED_EARLY = "ended-early"
+    RAN_LONGER = "ran-longer"
+    EXCEPTION = "exception"
+    DRAW = "draw"
+    """What chance decided about a message: its delay, whether it is lost."""
+    GRAPH = "graph"
+    ENVIRONMENT = "environment"
+    SAME_CONTENT = "same-content"
+    """A run is native, and all messages say the same but for times: what differs is timing, and
+    perhaps the order of callbacks."""
+    OTHER_CONTENT = "other-content"
+    """A run is native, and messages say something else, or are missing."""
+
+
+class Root(Enum):
+    """Where the cause chain of a different input ends."""
+
+    EXTERNAL_INPUT = "external-input"
+    """A bag message (or another value from outside) is itself different."""
+    CALLBACK = "callback"
+    """An event whose inputs agree and whose outputs do not."""
+    SCHEDULE = "schedule"
+    TIMING = "timing"
+    MISSING = "missing"
+    EXTRA = "extra"
+    EXCEPTION = "exception"
+    DRAW = "draw"
+    """A delay, a loss or an execution time was drawn differently."""
+    JOB = "job"
+    """Parameters, seed, code: the constructor already behaved differently."""
+    UNKNOWN = "unknown"
+
+
+# -- circumstances -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Slept:
+    """How long a callback slept in each run (ns), None where it did not."""
+
+    a: int | None
+    b: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class StillWaits(Fact):
+    """A call that waited to the end of ``run`` and kept an event from happening there."""
+
+    text: str
+    since_ns: int
+    run: str
+
+
+@dataclass(frozen=True, slots=True)
+class QueueOverflowed(Fact):
+    """The queue of a subscription was full in ``run``."""
+
+    depth: int
+    run: str
+
+
+@dataclass(frozen=True, slots=True)
+class NothingArrives(Fact):
+    """A subscription receives nothing more in ``run``."""
+
+    run: str
+
+
+Loss = StillWaits | QueueOverflowed | NothingArrives | EntitiesChanged
+"""Why an event did not happen in one of the runs, as far as that is known."""
+
+
+# -- what --------------------------------------------------------------------------------------
+
+
+class Happening(Enum):
+    """What happened, where the events and messages say the rest."""
+
+    CONSTRUCTED_IN_ONE = "constructed-in-one"
+    NODE_RENAMED = "node-renamed"
+    CONSTRUCTION_ORDER = "construction-order"
+    OTHER_ENTITIES = "other-entities"
+    OTHER_CONSTRUCTION = "other-construction"
+    OTHER_CONSTRUCTION_SAME_JOB = "other-construction-same-job"
+    BAG_MESSAGES_SWAPPED = "bag-messages-swapped"
+    BAG_MESSAGE_MOVED = "bag-message-moved"
+    OTHER_BAG_MESSAGE = "other-bag-message"
+    OTHER_FROM_OUTSIDE = "other-from-outside"
+    OTHER_DONE_OUTSIDE = "other-done-outside"
+    ONLY_ZERO_DELAYS = "only-zero-delays"
+    OTHER_SENDER = "other-sender"
+    THREAD_SWITCHED = "thread-switched"
+    OTHER_STATE = "other-state"
+
+
+@dataclass(frozen=True, slots=True)
+class OtherOrder(Fact):
+    """The same events ran in another order. ``event`` is one that moved."""
+
+    event: EventView
+
+
+@dataclass(frozen=True, slots=True)
+class OnlyInOne(Fact):
+    """An event that only one run has; ``instead`` is what the other went on with."""
+
+    instead: EventView | None = None
+    loss: Loss | None = None
+    periods_ns: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RaisedInOne(Fact):
+    """An exception in one run only, from the same input."""
+
+    error: str
+    after_shutdown: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class OtherTime(Fact):
+    """An event that both runs have, at another time (or due at another one)."""
+
+    periods_ns: tuple[int, int] | None = None
+    slept: Slept | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OtherInput(Fact):
+    """An event that received something else; ``topic`` is empty if that was no message."""
+
+    topic: str
+
+
+@dataclass(frozen=True, slots=True)
+class OtherDraw(Fact):
+    """Chance decided otherwise about ``message``, and about ``more``. ``connected`` is False where
+    one run has nothing to draw for: what it sends reaches nobody there."""
+
+    message: MessageDifference
+    more: int
+    of_clock: bool
+    of_event: bool
+    connected: bool
+
+
+@dataclass(frozen=True, slots=True)
+class OtherOutput(Fact):
+    """The same input, another output."""
+
+    slept: Slept | None = None
+    only_slept: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class RunEnd:
+    """How one run ended. ``stuck`` says who waited for what, if it ended so."""
+
+    run: str
+    end_ns: int
+    reason: str
+    has_events: bool = True
+    exit_code: int = 0
+    error: str = ""
+    stuck: str = ""
+    nothing_left: bool = False
+    raised: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class EndedBefore(Fact):
+    """One run was over, the other did the same until then and went on."""
+
+    over: RunEnd
+    other: RunEnd
+
+
+What = (
+    Happening
+    | OtherOrder
+    | OnlyInOne
+    | RaisedInOne
+    | OtherTime
+    | OtherInput
+    | OtherDraw
+    | OtherOutput
+    | EndedBefore
+    | EntitiesChanged
+)
+
+
+# -- why ---------------------------------------------------------------------------------------
+
+
+class Reason(Enum):
+    """Why, where events, messages and settings say the rest. If settings are to blame that is what
+    is told; else what its name says."""
+
+    CONSTRUCTOR = "constructor"
+    READY_AT_ONCE = "ready-at-once"
+    ONLY_IN_ONE_BAG = "only-in-one-bag"
+    DRIVEN_IN_ONE = "driven-in-one"
+    DRIVEN_DIFFERENTLY = "driven-differently"
+    FAULT_IN_ONE = "fault-in-one"
+    NOTHING_MADE_IT_RUN = "nothing-made-it-run"
+    BAGS_SWAPPED = "bags-swapped"
+    BAGS_AT_OTHER_TIMES = "bags-at-other-times"
+    BAGS_DIFFER = "bags-differ"
+    OTHER_CONTENT_ARRIVED = "other-content-arrived"
+    SENDER_UNKNOWN = "sender-unknown"
+    DELAY_IN_ONE = "delay-in-one"
+    EQUAL_MESSAGES_SWAPPED = "equal-messages-swapped"
+    STREAM_MOVED = "stream-moved"
+    NOT_CONNECTED = "not-connected"
+    POLICY_CHOSE = "policy-chose"
+    CUT_OFF = "cut-off"
+    STOPS_DIFFER = "stops-differ"
+    ENDED = "ended"
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterFiles(Fact):
+    """Parameters differ that a parameter file may give: its content is not in the trace."""
+
+    parameters: tuple[str, ...]
+    files: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class WaitedFor(Fact):
+    """A callback that waited, in one run only, for what ``cause`` sent."""
+
+    cause: EventView
+
+
+@dataclass(frozen=True, slots=True)
+class NotDelivered(Fact):
+    """``cause`` sent it in both runs; it arrived only in one."""
+
+    cause: EventView
+    loss: Loss | None
+
+
+@dataclass(frozen=True, slots=True)
+class CameFrom(Fact):
+    """The inputs came from other events."""
+
+    a: EventView
+    b: EventView
+
+
+@dataclass(frozen=True, slots=True)
+class NothingBefore(Fact):
+    """Nothing that the traces show differs before. ``doubt`` is what is not deterministic if no
+    setting explains it: the kind of what ran, or ``time``."""
+
+    doubt: str
+    state_unknown: bool
+    guard_is_off: bool
+
+
+@dataclass(frozen=True, slots=True)
+class NothingLeft(Fact):
+    """``run`` had nothing left to do, since an event is missing in it: see ``alone``."""
+
+    run: str
+    alone: Judgement
+
+
+@dataclass(frozen=True, slots=True)
+class FollowsFrom(Fact):
+    """A consequence: ``root`` is where the runs diverged before."""
+
+    root: Judgement
+
+
+@dataclass(frozen=True, slots=True)
+class CauseOf(Fact):
+    """The same as that of ``first``: of an effect, the cause of how its node was set up."""
+
+    first: Judgement
+
+
+Why = (
+    Reason
+    | ParameterFiles
+    | WaitedFor
+    | NotDelivered
+    | CameFrom
+    | NothingBefore
+    | NothingLeft
+    | FollowsFrom
+    | CauseOf
+)
+
+
+# -- what is likely behind it ------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class OutsideAnswers(Fact):
+    """``subject`` (a node or main, or nobody) asked the outside and got other answers."""
+
+    subject: str
+    calls: tuple[CallDifference, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SetOrder(Fact):
+    """``what`` (``order of the set self.landmarks``) at ``place`` shows in a message; ``more`` such
+    lines are there."""
+
+    what: str
+    place: str
+    more: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class UnrecordedAnswer(Fact):
+    """An answer from outside that nobody kept: it may be behind it. ``source`` is the key of
+    ``guard:`` that keeps it."""
+
+    call: str
+    place: str
+    source: str
+
+
+LikelyCause = OutsideAnswers | SetOrder | UnrecordedAnswer | EntitiesChanged
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A verdict with its reasons.
+
+    ``a`` and ``b`` are the events to show. Of a schedule they are what either run did first: two
+    events, not one; else one is None where that run has no counterpart. ``why`` is None where a
+    consequence needs none. ``settings`` are those of the settings that differ which can be the
+    cause, ``likely`` what came from outside and explains it. ``failed`` is how one of the runs then
+    failed, if only one did. ``node_diverged``: it is a consequence of what its node did before.
+    """
+
+    verdict: Verdict
+    root: Root
+    what: What
+    why: Why | None
+    a: EventView | None
+    b: EventView | None
+    messages: tuple[MessageDifference, ...] = ()
+    state: tuple[StateDifference, ...] = ()
+    settings: tuple[Setting, ...] = ()
+    likely: LikelyCause | None = None
+    failed: RunEnd | None = None
+    node_diverged: bool = False
+
+    @property
+    def one(self) -> EventView | None:
+        """The event, of whichever run has it."""
+        return self.a or self.b
+
+    @property
+    def changed(self) -> EntitiesChanged | None:
+        """The entities whose properties show in it."""
+        if isinstance(self.what, OnlyInOne) and isinstance(self.what.loss, EntitiesChanged):
+            return self.what.loss
+        return self.what if isinstance(self.what, EntitiesChanged) else None
+
+    @property
+    def is_unexplained(self) -> bool:
+        """Whether something is not deterministic, and nothing that is known explains it."""
+        if self.settings:
+            return False
+        why, one = self.why, self.one
+        if isinstance(why, NotDelivered):
+            return isinstance(why.loss, NothingArrives | EntitiesChanged)
+        if why is Reason.NOTHING_MADE_IT_RUN:
+            return one is not None and bool(one.entity.node or one.entity.kind in NO_CALLBACKS)
+        return why is Reason.CONSTRUCTOR or isinstance(why, NothingBefore | WaitedFor)
+
+
+NO_CALLBACKS = ("main", "thread")
+"""Kinds of entities that run without being called."""

@@ -1,0 +1,209 @@
+"""What else there is to know of a comparison, and the answer it comes to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from rsltrace.diff.facts.evidence import Fact
+
+
+@dataclass(frozen=True, slots=True)
+class Told(Fact):
+    """What a reader of recordings has said."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Interrupted(Fact):
+    """The recording of ``run`` is cut off."""
+
+    run: str
+    path: str
+    events: int
+    end_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class EndedByException(Fact):
+    """An exception ended ``run``, and not the other one."""
+
+    run: str
+    reason: str
+    event: int
+    stamp_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class OtherEnd(Fact):
+    """Identical events, another ``what`` (reason, exit code)."""
+
+    what: str
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedAs(Fact):
+    """Two names of one program."""
+
+    a: str
+    b: str
+
+
+@dataclass(frozen=True, slots=True)
+class NothingAskedFor(Fact):
+    """No difference among what was asked for (globs)."""
+
+    asked: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShownLater(Fact):
+    """The runs diverge at event ``start``; shown is where what was asked for differs."""
+
+    start: int
+    asked: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ShownPastTolerated(Fact):
+    """At event ``start`` all that differs is ignored or within tolerance; shown is what is not."""
+
+    start: int
+
+
+@dataclass(frozen=True, slots=True)
+class MoreDivergences(Fact):
+    """Divergences that are not listed."""
+
+    count: int
+    all_shown: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CannotRepeat(Fact):
+    """There is no command to record a trace once more: it takes ``options`` that could run code, or
+    the ``job`` is not here."""
+
+    trace: str
+    options: tuple[str, ...] = ()
+    job: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class JobChanged(Fact):
+    """The job file here is not what a trace was recorded with."""
+
+    trace: str
+    job: str
+
+
+@dataclass(frozen=True, slots=True)
+class LogTimesIgnored(Fact):
+    """Log times of recordings are not compared."""
+
+
+@dataclass(frozen=True, slots=True)
+class OtherType(Fact):
+    """A topic that has another type in each recording."""
+
+    topic: str
+    a: str
+    b: str
+
+
+@dataclass(frozen=True, slots=True)
+class ComparedByBytes(Fact):
+    """Messages that could not be decoded."""
+
+    error: str
+
+
+Remark = (
+    Told
+    | Interrupted
+    | EndedByException
+    | OtherEnd
+    | ComparedAs
+    | NothingAskedFor
+    | ShownLater
+    | ShownPastTolerated
+    | MoreDivergences
+    | CannotRepeat
+    | JobChanged
+    | LogTimesIgnored
+    | OtherType
+    | ComparedByBytes
+)
+
+
+# -- the answer --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Identical(Fact):
+    """All events are the same; ``names_differ``: but for names of programs."""
+
+    events: int
+    digest: str = ""
+    names_differ: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AgreeUntilCut(Fact):
+    """They agree as far as the recordings go that are ``cut``."""
+
+    events: int
+    cut: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class DifferentJobs(Fact):
+    """The runs in ``empty`` have no event to compare."""
+
+    jobs: tuple[str, str]
+    empty: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Diverged(Fact):
+    """See the divergences. ``searched_to`` is the event up to which no effect of another set-up was
+    found (-1: to the end), None if none was looked for, or one was found. ``foreign`` are the names
+    of the jobs where the runs have no node in common."""
+
+    searched_to: int | None = None
+    foreign: tuple[str, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class NativeCompared(Fact):
+    """See ``Diff.native``."""
+
+
+Outcome = Identical | AgreeUntilCut | DifferentJobs | Diverged | NativeCompared
+
+
+# -- which of two runs a third one repeats -------------------------------------------------------
+
+
+class Repeats(Enum):
+    """What a third run did where two diverge."""
+
+    A = "a"
+    B = "b"
+    NEITHER = "a third result"
+    TOO_SHORT = "too short"
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatedRun:
+    """The answer. ``place`` is the event where a and b diverge, None if they do not; ``from_a`` and
+    ``from_b`` are the events from which on the third run differs from each."""
+
+    repeats: Repeats
+    again: str
+    place: int | None
+    from_a: int | None
+    from_b: int | None

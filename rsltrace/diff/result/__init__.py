@@ -1,1 +1,0 @@
-"""What a diff says: frozen values that the comparisons fill and the reports print."""

@@ -1,0 +1,766 @@
+"""What is said of a divergence: what happened, why, what is likely behind it, and the headline."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsltrace.diff.facts.causes import (
+    NO_CALLBACKS,
+    CameFrom,
+    CauseOf,
+    EndedBefore,
+    FollowsFrom,
+    Happening,
+    Judgement,
+    NotDelivered,
+    NothingArrives,
+    NothingBefore,
+    NothingLeft,
+    OnlyInOne,
+    OtherDraw,
+    OtherInput,
+    OtherOrder,
+    OtherOutput,
+    OtherTime,
+    OutsideAnswers,
+    ParameterFiles,
+    QueueOverflowed,
+    RaisedInOne,
+    Reason,
+    RunEnd,
+    SetOrder,
+    Slept,
+    StillWaits,
+    UnrecordedAnswer,
+    Verdict,
+    WaitedFor,
+)
+from rsltrace.diff.facts.evidence import (
+    CallDifference,
+    EntitiesChanged,
+    EntityChange,
+    EventView,
+    MessageDifference,
+    Presence,
+    Setting,
+    SettingKind,
+)
+from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences.values import (
+    IN_ONE,
+    NAMED_MAX,
+    a_first,
+    because_of,
+    durations,
+    fate_text,
+    field_text,
+    joined,
+    listed,
+    pair_text,
+    state_text,
+    what_differs,
+)
+from rsltrace.model.draw import Draw, draw_text, duration_of, is_switch, kind_of
+from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.finding import Source
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import durations_apart, format_duration
+from rsltrace.words.phrases import at_time, event_phrase, seconds_text
+
+PARAMETER_EVENTS = "/parameter_events"
+_VALUE_MAX = 40
+_WAITS_MAX = 160
+_PARAMETERS = ".parameters."
+
+
+def phrase(view: EventView) -> str:
+    """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
+    return event_phrase(view.kind, view.entity)
+
+
+def _at(view: EventView) -> str:
+    return f"{phrase(view)} {at_time(view.stamp_ns)}"
+
+
+def _both(of: Judgement) -> tuple[EventView, EventView]:
+    assert of.a is not None
+    assert of.b is not None
+    return of.a, of.b
+
+
+def _one(of: Judgement) -> EventView:
+    assert of.one is not None
+    return of.one
+
+
+def _has(of: Judgement) -> tuple[str, str]:
+    """Return the run that has the event, and the one that has it not."""
+    return ("a", "b") if of.b is None else ("b", "a")
+
+
+# -- what happened ---------------------------------------------------------------------------------
+
+
+def sentence_of(of: Judgement) -> str:
+    """Return what happened, and what is likely behind it."""
+    text = sentence(of.what, of)
+    if of.node_diverged:
+        text += ", because its node had already diverged"
+    if isinstance(of.what, EntitiesChanged):
+        text = f"the graphs differ: {text}"
+    if isinstance(of.likely, UnrecordedAnswer):
+        return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
+    return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
+
+
+@says(Happening.CONSTRUCTED_IN_ONE)
+def _(what: Happening, of: Judgement) -> str:
+    has, has_not = _has(of)
+    name = _one(of).entity.name or "a part of the run"
+    return f"the graphs differ: {name} is constructed in {has} and not in {has_not}"
+
+
+@says(Happening.NODE_RENAMED)
+def _(what: Happening, of: Judgement) -> str:
+    a, b = _both(of)
+    return f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
+
+
+@says(Happening.CONSTRUCTION_ORDER)
+def _(what: Happening, of: Judgement) -> str:
+    return "the nodes are constructed in another order"
+
+
+@says(Happening.OTHER_ENTITIES)
+def _(what: Happening, of: Judgement) -> str:
+    changed = a_first([m for m in of.messages if m.kind is OutputKind.ENTITY])
+    types: dict[str, list[str]] = {}
+    for m in changed:
+        types.setdefault(m.topic, []).append(m.type)
+    things = [
+        f"{m.topic} of type {m.type} {IN_ONE[m.presence]}"
+        if m.presence in IN_ONE and len({*types[m.topic]}) > 1
+        else f"{m.topic} {IN_ONE.get(m.presence, 'differs')}"
+        for m in changed
+    ]
+    return f"the graphs differ: {phrase(_one(of))} made other entities ({listed(things)})"
+
+
+@says(Happening.OTHER_CONSTRUCTION, Happening.OTHER_CONSTRUCTION_SAME_JOB)
+def _(what: Happening, of: Judgement) -> str:
+    text = f"{phrase(_one(of))} {_did(of.messages)}"
+    same = what is Happening.OTHER_CONSTRUCTION_SAME_JOB
+    return f"{text}, in the same job and environment" if same else text
+
+
+@says(OtherOrder)
+def _(what: OtherOrder, of: Judgement) -> str:
+    text = f"{at_time(what.event.stamp_ns)} the same events ran in another order"
+    if of.a is None or of.b is None:
+        return text
+    if of.a.entity == of.b.entity:
+        return f"{text}: {phrase(what.event)} took two inputs the other way round"
+    return f"{text}: first {phrase(of.a)} in a, first {phrase(of.b)} in b"
+
+
+@says(OnlyInOne)
+def _(what: OnlyInOne, of: Judgement) -> str:
+    has, has_not = _has(of)
+    text = f"{_at(_one(of))} happened only in {has}"
+    if what.loss is not None:
+        return f"{text}: {sentence(what.loss)}"
+    if what.periods_ns is not None:
+        return f"{text}: timer period {durations(*what.periods_ns)}"
+    if what.instead is not None:
+        return f"{text}; {has_not} went on with {_at(what.instead)}"
+    return text
+
+
+@says(RaisedInOne)
+def _(what: RaisedInOne, of: Judgement) -> str:
+    a, _ = _both(of)
+    where, not_where = ("a", "b") if a.raised else ("b", "a")
+    raised = f"raised {what.error or 'an exception'} in {where} and not in {not_where}"
+    text = f"{_at(a)} {raised}, from the same input"
+    return f"{text}, after it had shut its context down" if what.after_shutdown else text
+
+
+@says(OtherTime)
+def _(what: OtherTime, of: Judgement) -> str:
+    a, b = _both(of)
+    if a.stamp_ns == b.stamp_ns:
+        return f"{_at(a)} was due at another time in a than in b"
+    text = f"{phrase(a)} ran {_times(a, b)}"
+    if what.periods_ns is not None:
+        return f"{text}: timer period {durations(*what.periods_ns)}"
+    return f"{text}: it {slept_text(what.slept)}" if what.slept is not None else text
+
+
+def _times(a: EventView, b: EventView) -> str:
+    late_ns = b.stamp_ns - a.stamp_ns
+    late = "later" if late_ns > 0 else "earlier"
+    times = f"{at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b"
+    return f"{times}, {format_duration(abs(late_ns))} {late}"
+
+
+def slept_text(slept: Slept) -> str:
+    """Return ``slept 7 ms in b and not in a``."""
+    if slept.a is not None and slept.b is not None:
+        in_a, in_b = durations_apart(slept.a, slept.b)
+        return f"slept {in_a} in a and {in_b} in b"
+    if slept.a is not None:
+        return f"slept {format_duration(slept.a)} in a and not in b"
+    return f"slept {format_duration(slept.b or 0)} in b and not in a"
+
+
+@says(Happening.BAG_MESSAGES_SWAPPED)
+def _(what: Happening, of: Judgement) -> str:
+    a, b = _both(of)
+    early, late = sorted((a.stamp_ns, b.stamp_ns))
+    times = f"{at_time(early)} and {at_time(late)}"
+    return f"the bag's messages on {a.entity.name} {times} are swapped"
+
+
+@says(Happening.BAG_MESSAGE_MOVED)
+def _(what: Happening, of: Judgement) -> str:
+    a, b = _both(of)
+    return f"{phrase(a)} was played {_times(a, b)}"
+
+
+@says(Happening.OTHER_BAG_MESSAGE)
+def _(what: Happening, of: Judgement) -> str:
+    values = next((field_text(m.fields, m.more_fields) for m in of.messages), "")
+    return f"{_at(_one(of))} is different{f' ({values})' if values else ''}"
+
+
+@says(Happening.OTHER_FROM_OUTSIDE)
+def _(what: Happening, of: Judgement) -> str:
+    return f"{_at(_one(of))} is different"
+
+
+@says(Happening.OTHER_DONE_OUTSIDE)
+def _(what: Happening, of: Judgement) -> str:
+    return f"{_at(_one(of))} is different{what_differs(of.messages)}"
+
+
+@says(OtherInput)
+def _(what: OtherInput, of: Judgement) -> str:
+    return f"{_at(_one(of))} received a different {what.topic or 'input'}"
+
+
+@says(Happening.ONLY_ZERO_DELAYS)
+def _(what: Happening, of: Judgement) -> str:
+    how = "did the same in both runs, but in one of them with delays of 0 ns"
+    return f"{_at(_one(of))} {how}, which change nothing"
+
+
+@says(Happening.OTHER_SENDER)
+def _(what: Happening, of: Judgement) -> str:
+    a, b = _both(of)
+    text = f"{_at(a)} received equal inputs, but of other "
+    if a.cause_event == b.cause_event:
+        return f"{text}outputs of {_event(a.cause_event)}"
+    return f"{text}events: {_event(a.cause_event)} in a, {_event(b.cause_event)} in b"
+
+
+def _event(index: int) -> str:
+    return "no event" if index == NO_EVENT else f"event {index}"
+
+
+_DRAWS: dict[Draw | None, str] = {
+    Draw.DELAY: "delay",
+    Draw.DUPLICATE: "second copy",
+    Draw.EXECUTION: "execution time",
+    Draw.CLOCK_AHEAD: "change",
+    Draw.CLOCK_BACK: "change",
+}
+
+
+@says(OtherDraw)
+def _(what: OtherDraw, of: Judgement) -> str:
+    m = what.message
+    same = "read a clock" if what.of_clock else "did the same in both runs"
+    if not what.connected:
+        drawn = f"what it sent goes to {m.topic} {IN_ONE[m.presence]}"
+    elif what.of_event and not what.of_clock:
+        took = (_took(m.hash_a, m.hash_b), _took(m.hash_b, m.hash_a))
+        drawn = "took {} in a and {} in b".format(*took)
+    else:
+        drawn = f"{m.topic}: {_drawn(m.hash_a, m.hash_b)} in a, {_drawn(m.hash_b, m.hash_a)} in b"
+    told = what.connected and (not of.settings or any(s.key == "seed" for s in of.settings))
+    chance = "chance decided differently: " if told else ""
+    text = f"{_at(_one(of))} {same}, but {chance}{drawn}"
+    return f"{text} (and {what.more} more)" if what.more else text
+
+
+def _drawn(number: int | None, other: int | None) -> str:
+    """Return a decision in words, in which it differs from the other."""
+    if number is None:
+        return f"no {_DRAWS.get(kind_of(other or 0), 'loss')}"
+    text = draw_text(number)
+    if other is not None and text == draw_text(other):
+        return draw_text(number, 17)
+    return text
+
+
+def _took(number: int | None, other: int | None) -> str:
+    if number is None:
+        return "no time"
+    took_ns = duration_of(number, Draw.EXECUTION)
+    if took_ns is None:
+        return _drawn(number, other)
+    other_ns = duration_of(other, Draw.EXECUTION) if other is not None else None
+    return durations_apart(took_ns, took_ns if other_ns is None else other_ns)[0]
+
+
+@says(Happening.THREAD_SWITCHED)
+def _(what: Happening, of: Judgement) -> str:
+    met = next(m for m in of.messages if is_switch(m.hash_a or 0) or is_switch(m.hash_b or 0))
+    in_a, in_b = (is_switch(number or 0) for number in (met.hash_a, met.hash_b))
+    places = met.code or ("a line that is not known",)
+    gave = f"{_at(_one(of))} gave way to another thread before {places[0]}"
+    if in_a and in_b:
+        return f"{gave} in a, before {places[-1]} in b"
+    one, other = ("a", "b") if in_a else ("b", "a")
+    return f"{gave} in {one}; in {other} it went on"
+
+
+@says(OtherOutput)
+def _(what: OtherOutput, of: Judgement) -> str:
+    one, differs = _one(of), what_differs(of.messages)
+    if what.slept is not None and what.only_slept:
+        text = f"{_at(one)} {slept_text(what.slept)}{differs}"
+    else:
+        text = f"{_received(one)} {_did(of.messages)}"
+        text += f", and {slept_text(what.slept)}" if what.slept is not None else ""
+    return text
+
+
+@says(Happening.OTHER_STATE)
+def _(what: Happening, of: Judgement) -> str:
+    left = "sent the same, but left its node in a different state"
+    return f"{_received(_one(of), 'and')} {left}{state_text(of.state)}"
+
+
+def _received(one: EventView, joint: str = "but") -> str:
+    """Return ``/filter: the callback for /scan at 2.1 s received the same input in both runs but``,
+    as far as it received something."""
+    who = _at(one)
+    if one.kind in _CALLED_FOR and one.entity.node and not one.entity.ordinal:
+        who = f"{one.entity.node}: the callback for {one.entity.name} {at_time(one.stamp_ns)}"
+    return f"{who} received the same input in both runs {joint}" if one.input_hash else who
+
+
+_CALLED_FOR = (EventKind.SUBSCRIPTION, EventKind.SERVICE)
+
+
+def _did(messages: Sequence[MessageDifference]) -> str:
+    """Return what a callback did: ``published a different /push (data 1 → 2)``."""
+    outputs = [message for message in messages if not message.is_input]
+    if len(outputs) == 1 and outputs[0].kind is OutputKind.MESSAGE:
+        (one,) = outputs
+        if one.presence is Presence.BOTH and one.fate is None:
+            values = field_text(one.fields, one.more_fields)
+            return f"published a different {one.topic}{f' ({values})' if values else ''}"
+    return f"did something different{what_differs(messages)}"
+
+
+@says(EndedBefore)
+def _(what: EndedBefore, of: Judgement) -> str:
+    over, other = what.over, what.other
+    where = f" {at_time(over.end_ns)}" if over.has_events else ""
+    how = f"ended{where} ({over.reason})"
+    if over.stuck:
+        how = f"got stuck{where} ({shortened(over.stuck, _WAITS_MAX)})"
+    to = "to" if other.end_ns != over.end_ns else "until"
+    return (
+        f"run {over.run} {how}, {other.run} did the same until then and went on {to} "
+        f"{seconds_text(other.end_ns)} s ({other.reason})"
+    )
+
+
+# -- entities with other properties ---------------------------------------------------------------
+
+
+@says(EntitiesChanged)
+def _(changed: EntitiesChanged, of: object) -> str:
+    return joined([_change_text(change) for change in changed.changes])
+
+
+def _change_text(change: EntityChange) -> str:
+    entity = change.entity
+    values = ", ".join(_property_text(*value) for value in change.values)
+    made = f"{entity.node} made {entity.kind} {printable(entity.name)}"
+    return f"{made} with another {change.property.value}: {values}"
+
+
+def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
+    word = f"{name.removesuffix('_ns')} " if name else ""
+    if isinstance(a, int) and isinstance(b, int) and name.endswith("_ns"):
+        return f"{word}{durations(a, b)}"
+    one, other = (_policy(name, value) for value in (a, b))
+    return f"{word}{pair_text(one, other)}"
+
+
+def _policy(name: str, value: str | int | None) -> str:
+    if value is None:  # a trace has only what is no default
+        return "automatic" if name == "liveliness" else "none"
+    return format_duration(value) if isinstance(value, int) else value
+
+
+# -- what became of a message ----------------------------------------------------------------------
+
+
+@says(StillWaits)
+def _(loss: StillWaits, of: object) -> str:
+    since = seconds_text(loss.since_ns)
+    return f"{shortened(loss.text, _WAITS_MAX)}, from {since} s to the end of {loss.run}"
+
+
+@says(QueueOverflowed)
+def _(loss: QueueOverflowed, of: object) -> str:
+    return f"its queue of {loss.depth} overflowed in {loss.run}"
+
+
+@says(NothingArrives)
+def _(loss: NothingArrives, of: object) -> str:
+    return f"nothing more reaches it in {loss.run}"
+
+
+# -- why -------------------------------------------------------------------------------------------
+
+
+def cause_of(of: Judgement) -> str:
+    """Return where it comes from, and how one of the runs failed; "" if there is nothing to say."""
+    if of.why is None:
+        return ""
+    text = sentence(of.why, of)
+    if isinstance(of.likely, UnrecordedAnswer):
+        kept = f"guard: {{{of.likely.source}: record}} in the job keeps it"
+        text = f"{text}; {sentence(of.likely)} is not recorded ({kept})"
+    elif of.likely is not None:
+        because = because_of(of.settings)
+        text = f"{sentence(of.likely)}; and {because}" if because else sentence(of.likely)
+    return f"{text}; {failure_text(of.failed)}" if of.failed is not None else text
+
+
+def failure_text(failed: RunEnd) -> str:
+    """Say how a run failed where the other did not."""
+    verb = "failed" if failed.error or failed.raised else "ended"
+    why = failed.error or failed.reason
+    return f"{failed.run} then {verb} (exit code {failed.exit_code}): {why}"
+
+
+_REASONS = {
+    Reason.DRIVEN_DIFFERENTLY: "the two simulations were not driven in the same way from outside",
+    Reason.BAGS_SWAPPED: "the bags that were played have these two messages in another order",
+    Reason.BAGS_AT_OTHER_TIMES: "the bags that were played have this message at another time",
+    Reason.BAGS_DIFFER: "the bags that were played differ in this message",
+    Reason.OTHER_CONTENT_ARRIVED: "the same message was sent to it, but something else arrived",
+    Reason.SENDER_UNKNOWN: "the trace does not say where it came from",
+    Reason.DELAY_IN_ONE: "only one of the runs gives what it sent a delay",
+    Reason.EQUAL_MESSAGES_SWAPPED: "two equal messages were delivered in another order",
+    Reason.STREAM_MOVED: "job and seed are the same as far as the traces tell, so the stream of "
+    "this link had been drawn from a different number of times before",
+    Reason.POLICY_CHOSE: "the policy chose another one of those that could run",
+}
+
+
+@says(*_REASONS)
+def _(why: Reason, of: Judgement) -> str:
+    return because_of(of.settings) or _REASONS[why]
+
+
+@says(Reason.CONSTRUCTOR)
+def _(why: Reason, of: Judgement) -> str:
+    which = "itself" if of.changed is None else f"of {of.changed.node}"
+    return because_of(of.settings) or (
+        f"job and environment are the same as far as the traces tell: the constructor {which} is "
+        "not deterministic, or its code changed"
+    )
+
+
+@says(Reason.READY_AT_ONCE)
+def _(why: Reason, of: Judgement) -> str:
+    if because := because_of(of.settings):
+        return f"both were ready at the same simulated time, and {because}"
+    return (
+        "both were ready at the same simulated time; whatever decides between them (order of "
+        "creation, of subscription, of delivery) is not the same in the two runs"
+    )
+
+
+@says(Reason.ONLY_IN_ONE_BAG)
+def _(why: Reason, of: Judgement) -> str:
+    return because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
+
+
+@says(Reason.DRIVEN_IN_ONE)
+def _(why: Reason, of: Judgement) -> str:
+    return f"only the simulation of {_has(of)[0]} was driven to do this from outside"
+
+
+@says(Reason.FAULT_IN_ONE)
+def _(why: Reason, of: Judgement) -> str:
+    return because_of(of.settings) or f"the job of {_has(of)[0]} has this fault"
+
+
+@says(Reason.NOTHING_MADE_IT_RUN)
+def _(why: Reason, of: Judgement) -> str:
+    if because := because_of(of.settings):
+        return f"nothing before it differs, but {because}"
+    one = _one(of)
+    has = _has(of)[0]
+    text = f"nothing before it differs, and nothing in the trace made it run in {has}"
+    who = f"the {one.entity.kind} itself" if one.entity.kind in NO_CALLBACKS else one.entity.node
+    return f"{text}: {who} is not deterministic" if who else text
+
+
+@says(Reason.NOT_CONNECTED)
+def _(why: Reason, of: Judgement) -> str:
+    assert isinstance(of.what, OtherDraw)
+    has_not = "a" if of.what.message.presence is Presence.ONLY_B else "b"
+    topic = of.what.message.topic
+    gone = f"in {has_not} nothing is under way to {topic}: it is gone, or not connected"
+    because = because_of(of.settings)
+    return f"{gone}; {because}" if because else gone
+
+
+@says(ParameterFiles)
+def _(why: ParameterFiles, of: Judgement) -> str:
+    return because_of(of.settings) or (
+        f"parameter {listed(why.parameters)}: a parameter file ({listed(why.files)}) says "
+        "something else, or the constructor does"
+    )
+
+
+@says(WaitedFor)
+def _(why: WaitedFor, of: Judgement) -> str:
+    has, has_not = _has(of)
+    cause = f"{phrase(why.cause)} (event {why.cause.index})"
+    doubt = because_of(of.settings) or f"{_itself(_one(of).entity.kind)} is not deterministic"
+    return f"it waited for {cause} in {has}, and not in {has_not}; {doubt}"
+
+
+@says(NotDelivered)
+def _(why: NotDelivered, of: Judgement) -> str:
+    lost = f"arrived only in {_has(of)[0]}" if why.loss is None else sentence(why.loss)
+    sent = f"sent in both runs (event {why.cause.index}, {phrase(why.cause)})"
+    text = f"what it should have received was {sent}, but {lost}"
+    if because := because_of(of.settings):
+        return f"{text}; {because}"
+    if of.is_unexplained:
+        who = _one(of).entity.node if of.changed is None else of.changed.node
+        return f"{text}; {who} is not deterministic"
+    return text
+
+
+@says(CameFrom)
+def _(why: CameFrom, of: Judgement) -> str:
+    return (
+        f"in a it came from {phrase(why.a)} (event {why.a.index}), in b from "
+        f"{phrase(why.b)} (event {why.b.index})"
+    )
+
+
+@says(NothingBefore)
+def _(why: NothingBefore, of: Judgement) -> str:
+    if because := because_of(of.settings):
+        return f"nothing before it differs, but {because}"
+    doubt = "what sets its time" if why.doubt == "time" else _itself(why.doubt)
+    text = f"nothing before it differs: {doubt} is not deterministic"
+    if why.state_unknown:
+        text += (
+            f", or the state of {_one(of).entity.node} differed before (which "
+            "guard: {state: record} in the job tells)"
+        )
+    if why.guard_is_off:
+        text += "; with guard: false nobody saw what it read from outside"
+    return text
+
+
+def _itself(kind: str) -> str:
+    return f"the {kind if kind in NO_CALLBACKS else 'callback'} itself"
+
+
+@says(FollowsFrom)
+def _(why: FollowsFrom, of: Judgement) -> str:
+    return f"it follows from an earlier difference: {sentence(why.root.what, why.root)}"
+
+
+@says(CauseOf)
+def _(why: CauseOf, of: Judgement) -> str:
+    return cause_of(why.first)
+
+
+@says(Reason.CUT_OFF)
+def _(why: Reason, of: Judgement) -> str:
+    assert isinstance(of.what, EndedBefore)
+    return (
+        f"the recording of {of.what.over.run} was cut off: its run was killed, is still going on, "
+        "or the file is not whole"
+    )
+
+
+@says(Reason.STOPS_DIFFER)
+def _(why: Reason, of: Judgement) -> str:
+    stops = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in of.settings)
+    return f"both do the same as long as they last, and their jobs differ in {stops}"
+
+
+@says(NothingLeft)
+def _(why: NothingLeft, of: Judgement) -> str:
+    alone = why.alone
+    missing = f"{sentence(alone.what, alone)}; {cause_of(alone)}"
+    return f"{why.run} had nothing left to do: {missing}"
+
+
+@says(Reason.ENDED)
+def _(why: Reason, of: Judgement) -> str:
+    assert isinstance(of.what, EndedBefore)
+    over = of.what.over
+    if over.error:
+        how = f"{over.run} failed (exit code {over.exit_code}): {over.error}"
+    elif over.exit_code:
+        how = f"{over.run} ended with exit code {over.exit_code} ({over.reason})"
+    elif over.nothing_left:
+        how = f"{over.run} had nothing left to do"
+    else:
+        how = f"{over.run} ended because of this: {over.reason}"
+    because = because_of(of.settings)
+    return f"both do the same until then; {how}{f'; {because}' if because else ''}"
+
+
+# -- what is likely behind it ----------------------------------------------------------------------
+
+_CALLED = {
+    Source.ENVIRONMENT: "read",
+    Source.PID: "read",
+    Source.FILE: "read",
+    Source.DIRECTORY: "listed",
+    Source.CLOCK: "read",
+    Source.RANDOM: "drew",
+    Source.SOCKET: "called",
+}
+
+
+@says(OutsideAnswers)
+def _(cause: OutsideAnswers, of: object) -> str:
+    who = cause.subject or "the run"
+    told = list(dict.fromkeys(call_text(call) for call in cause.calls))
+    more = len(told) - NAMED_MAX
+    text = f"{who} {'; '.join(told[:NAMED_MAX])}"
+    return f"{text}; and {more} more" if more > 0 else text
+
+
+def call_text(call: CallDifference) -> str:
+    """Return ``read MOTOR_SEED, 6 in a and 4 in b, at picker.py:24``."""
+    done = f"{_CALLED.get(Source(call.source), 'called')} {printable(call.subject)}"
+    place = call.where.partition(" in ")[0]
+    if call.a is None or call.b is None:
+        return f"{done} only in {'b' if call.a is None else 'a'}, at {place}"
+    return f"{done}, {call.short[0]} in a and {call.short[1]} in b, at {place}"
+
+
+@says(SetOrder)
+def _(cause: SetOrder, of: object) -> str:
+    more = f" (and {cause.more} more)" if cause.more else ""
+    return f"the {cause.what}, at {cause.place}{more}"
+
+
+@says(UnrecordedAnswer)
+def _(cause: UnrecordedAnswer, of: object) -> str:
+    return f"what came back from {cause.call} at {cause.place}"
+
+
+# -- the headline ----------------------------------------------------------------------------------
+
+_OTHER_OUTPUT = (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Verdict.ENVIRONMENT)
+_SENT = {
+    OutputKind.MESSAGE: ("published", "on "),
+    OutputKind.REQUEST: ("called", ""),
+    OutputKind.RESPONSE: ("answered", ""),
+}
+
+
+def headline(first: Judgement, effect: Judgement | None, searched_to: int | None) -> str:
+    """Return what a person wants to know of two runs that diverge: the settings that are to blame,
+    and the first effect they had.
+
+    ``searched_to`` is up to which event no effect was found (-1: to the end), None if it was not
+    looked for.
+    """
+    settings = (*(effect.settings if effect is not None else ()), *first.settings)
+    set_up = effect is not None or searched_to is not None
+    lead = _lead(tuple(dict.fromkeys(settings)), set_up=set_up)
+    if effect is not None:
+        known = first.likely is not None and not isinstance(first.likely, UnrecordedAnswer)
+        lead = lead or (sentence(first.likely) if known else sentence_of(first))
+        return f"{lead}; first effect: {effect_text(effect)}"
+    if not lead:
+        return sentence_of(first)
+    one = first.one
+    if searched_to is not None and one is not None:
+        topics = listed([message.topic for message in first.messages if not message.is_input])
+        where = f"on {topics}" if topics else f"on the state of {one.node}"
+        up_to = "" if searched_to < 0 else f" up to event {searched_to}"
+        return f"{lead}; no effect{up_to} but {where}, by {phrase(one)}"
+    return f"{lead}; first effect: {effect_text(first)}"
+
+
+def effect_text(found: Judgement) -> str:
+    """Return ``/follower published another linear.x on /cmd_vel at 0.1 s (linear.x 1 → 2)``, or
+    the sentence of a divergence that is no other output."""
+    one = found.one
+    sent = [m for m in found.messages if m.kind in _SENT and m.topic != PARAMETER_EVENTS]
+    told = found.verdict in _OTHER_OUTPUT and not any(m.is_input for m in found.messages)
+    if one is None or not told or not sent:
+        return sentence_of(found)
+    if found.messages[0].kind not in (*_SENT, OutputKind.LOG):
+        return sentence_of(found)
+    message = sent[0]
+    values = field_text(message.fields, message.more_fields)
+    who = one.node or (f"{one.entity.kind} {one.entity.name}" if one.entity.name else "the run")
+    is_made = one.kind is EventKind.CONSTRUCT
+    when = "in its constructor" if is_made else at_time(one.stamp_ns)
+    more = f" and {len(sent) - 1} more" if len(sent) > 1 else ""
+    return f"{who} {_done(message)} {when}{f' ({values})' if values else ''}{more}"
+
+
+def _done(message: MessageDifference) -> str:
+    verb, on = _SENT[message.kind or OutputKind.MESSAGE]
+    if message.fate is not None or message.presence is not Presence.BOTH:
+        what = fate_text(message) or IN_ONE[message.presence]
+        return f"{verb} {on}{message.topic} {what}"
+    fields = message.fields
+    other = "message" if message.kind is OutputKind.MESSAGE else "content"
+    if fields:
+        more = len(fields) - 1 + message.more_fields
+        other = fields[0].path
+        other += f" and {more} more field{'s' if more > 1 else ''}" if more else ""
+    if message.kind is OutputKind.MESSAGE:
+        return f"published a different {other} on {message.topic}"
+    return f"{verb} {message.topic} with a different {other}"
+
+
+def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
+    """Return the keys of the job that are to blame, with their lines; of what a constructor did,
+    the code, too."""
+    of_job = [_setting(setting) for setting in settings if setting.key]
+    if not of_job and set_up:
+        code = (setting for setting in settings if setting.kind is SettingKind.CODE)
+        of_job = [f"the {setting.place} differs" for setting in code]
+    return listed(of_job)
+
+
+def _setting(setting: Setting) -> str:
+    parameter = setting.key.partition(_PARAMETERS)[2]
+    name = printable(f"parameter {parameter}" if parameter else f"setting {setting.key}")
+    place = f" ({printable(setting.place)})" if setting.line else ""
+    values = [value for value in (setting.a, setting.b) if value is not None]
+    only = f"only in {'b' if setting.a is None else 'a'}"
+    if any(len(value) > _VALUE_MAX or "\n" in value for value in values):
+        return f"{name} {'differs' if len(values) == 2 else only}{place}"
+    if len(values) == 2:
+        return f"{name} {pair_text(setting.a, setting.b)}{place}"
+    return f"{name} {printable(''.join(values))} {only}{place}"

@@ -1,0 +1,354 @@
+"""What is said of two runs, or recordings, as a whole: the answer, and what else to know."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from rsltrace.diff.facts.bags import (
+    BagComparison,
+    BagVerdict,
+    MessageDivergence,
+    NativeComparison,
+    Tail,
+    TopicDiff,
+)
+from rsltrace.diff.facts.causes import Judgement
+from rsltrace.diff.facts.evidence import Presence
+from rsltrace.diff.facts.remarks import (
+    AgreeUntilCut,
+    CannotRepeat,
+    ComparedAs,
+    ComparedByBytes,
+    DifferentJobs,
+    Diverged,
+    EndedByException,
+    Identical,
+    Interrupted,
+    JobChanged,
+    LogTimesIgnored,
+    MoreDivergences,
+    NativeCompared,
+    NothingAskedFor,
+    OtherEnd,
+    OtherType,
+    Outcome,
+    Remark,
+    RepeatedRun,
+    Repeats,
+    ShownLater,
+    ShownPastTolerated,
+    Told,
+)
+from rsltrace.diff.sentences import says, sentence
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_seconds
+from rsltrace.words.phrases import seconds_text
+
+_OPTIONS_MAX = 3
+_TEXT_MAX = 200
+ALL_HINT = "--all shows them"
+
+
+class Compared(Protocol):
+    """What the answer for two runs is told by."""
+
+    @property
+    def outcome(self) -> Outcome:
+        """The answer itself."""
+
+    @property
+    def divergences(self) -> Sequence[Judgement]:
+        """Where they diverge."""
+
+    @property
+    def effect(self) -> Judgement | None:
+        """The first effect of a node that was set up differently."""
+
+    @property
+    def native(self) -> NativeComparison | None:
+        """What is compared of native runs."""
+
+
+def answer(of: Compared) -> str:
+    """Return the answer for two runs."""
+    return sentence(of.outcome, of)
+
+
+def remark_text(remark: Remark) -> str:
+    """Return what else there is to know."""
+    return sentence(remark)
+
+
+# -- the answer ------------------------------------------------------------------------------------
+
+
+@says(Identical)
+def _(outcome: Identical, of: object) -> str:
+    but = " but for names of programs" if outcome.names_differ else ""
+    digest = f", digest {outcome.digest}" if outcome.digest else ""
+    return f"the two runs are identical{but}: {outcome.events} events{digest}"
+
+
+@says(AgreeUntilCut)
+def _(outcome: AgreeUntilCut, of: object) -> str:
+    cut = outcome.cut
+    are_cut = "both recordings are cut" if len(cut) == 2 else f"the recording of {cut[0]} is cut"
+    if outcome.events:
+        return f"the two runs agree as far as they go, {outcome.events} events: {are_cut}"
+    return f"nothing can be compared: {are_cut}, and has no event"
+
+
+@says(DifferentJobs)
+def _(outcome: DifferentJobs, of: object) -> str:
+    names = [f'"{name}"' for name in outcome.jobs]
+    which = f" ({names[0]}, {names[1]})" if names[0] != names[1] else ""
+    have = "have" if len(outcome.empty) > 1 else "has"
+    empty = f"{' and '.join(outcome.empty)} {have} no event to compare"
+    return f"these are runs of different jobs{which}, and {empty}"
+
+
+@says(Diverged)
+def _(outcome: Diverged, of: Compared) -> str:
+    from rsltrace.diff.sentences.divergence import headline, sentence_of
+
+    first = of.divergences[0]
+    if outcome.foreign is None:
+        return headline(first, of.effect, outcome.searched_to)
+    jobs = [f'"{name}"' for name in outcome.foreign]
+    which = f" ({jobs[0]}, {jobs[1]})" if len(set(jobs)) == 2 else ""
+    unlike = f"these are runs of different jobs{which} without a common node"
+    return f"{unlike}: {sentence_of(first)}"
+
+
+@says(NativeCompared)
+def _(outcome: NativeCompared, of: Compared) -> str:
+    found = of.native
+    assert found is not None
+    which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
+    said = sum(topic.agreeing for topic in found.content.topics)
+    order = (
+        f"{found.moved} of the {found.compared} callbacks of both began in another order"
+        if found.moved
+        else f"the {found.compared} callbacks of both began in the same order"
+    )
+    if found.differs:
+        return f"{which}, and the contents differ{_where(found)}; {order}"
+    return (
+        f"{which}, and the contents are the same but for times: {said} messages on "
+        f"{len(found.content.topics)} topics; {order}"
+    )
+
+
+def _where(found: NativeComparison) -> str:
+    first = found.first
+    if first is None:
+        lone = (*found.content.topics_only_a, *found.content.topics_only_b)
+        return f": only one run has messages on {lone[0].topic}"
+    shown = first.a or first.b
+    text = f", first on {first.topic}"
+    if shown is None:
+        return text
+    text += f": message {shown.index} "
+    if first.moved:
+        return f"{text}came in another order, and others are missing or differ"
+    if first.presence is not Presence.BOTH:
+        return f"{text}is {first.presence.value}"
+    return text + (f"has a different {first.fields[0].path}" if first.fields else "differs")
+
+
+def tail_text(tail: Tail) -> str:
+    """Return ``/odom: 2 more messages in a, at its end``."""
+    more = f"{tail.more} more message{'' if tail.more == 1 else 's'}"
+    return f"{tail.topic}: {more} in {tail.run}, at its end"
+
+
+# -- recordings ------------------------------------------------------------------------------------
+
+
+def recordings_sentence(of: BagComparison, name: str = "The recordings") -> str:
+    """Return the answer for two recordings, or for the messages of two runs."""
+    topics, first = of.topics, of.first
+    messages = sum(topic.agreeing for topic in topics)
+    counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
+    if of.verdict is BagVerdict.EQUAL:
+        return f"{name} are equal: {counted} say the same."
+    if of.verdict is not BagVerdict.DIFFERENT:
+        return _nearly_equal(of.verdict, topics, counted, name)
+    if first is None:
+        lone = [f"{topic.topic} is only in a" for topic in of.topics_only_a]
+        lone += [f"{topic.topic} is only in b" for topic in of.topics_only_b]
+        more = f" and {len(lone) - 3} more" if len(lone) > 3 else ""
+        same = f"{counted} in both agree, but " if messages else ""
+        text = f"{same}{', '.join(lone[:3])}{more}."
+        return text[0].upper() + text[1:]
+    when = f"{format_seconds(first.after_ns)} s after the start"
+    return f"{name} first diverge on {first.topic}, {when}: {_first_message(first)}."
+
+
+def _nearly_equal(verdict: BagVerdict, topics: Sequence[TopicDiff], counted: str, name: str) -> str:
+    tolerated = sum(topic.tolerated for topic in topics)
+    ignored = sum(topic.ignored for topic in topics)
+    if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
+        how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
+        how += f" but for what is ignored ({ignored} differ in it)" if ignored else ""
+        agree = f"{name[:1].lower()}{name[1:]} agree: {counted} {how}"
+        return f"As far as they go, {agree}; not both are whole."
+    if not tolerated:
+        ignoring = f"{ignored} of {counted} differ in it"
+        return f"{name} are equal but for what is ignored, not identical: {ignoring}."
+    also = f", {ignored} more in what is ignored" if ignored else ""
+    return (
+        f"{name} are equal within tolerance, not identical: {tolerated} of {counted} "
+        f"differ, none by more than is tolerated{also}."
+    )
+
+
+def _first_message(first: MessageDivergence) -> str:
+    if first.moved:
+        return moved_text(first)
+    if first.presence is Presence.ONLY_A:
+        assert first.a is not None
+        return f"message {first.a.index} of a is missing in b"
+    if first.presence is Presence.ONLY_B:
+        assert first.b is not None
+        return f"message {first.b.index} of b is extra, not in a"
+    assert first.a is not None
+    text = f"message {first.a.index}"
+    differing = len(first.fields) + first.more_fields
+    if not first.fields:
+        return f"{text} differs"
+    text = f"{text} has a different {first.fields[0].path}"
+    return text if differing == 1 else f"{text} (and {_number(differing - 1, 'other field')})"
+
+
+def moved_text(found: MessageDivergence) -> str:
+    """Say where a message is in each recording; "" if it is in the same place of both."""
+    if not found.moved or found.a is None or found.b is None:
+        return ""
+    if found.swapped_at is not None:
+        return f"messages {found.swapped_at} and {found.swapped_at + 1} are swapped"
+    return f"message {found.a.index} of a is message {found.b.index} of b, in another order"
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+# -- what else to know -----------------------------------------------------------------------------
+
+
+@says(Told)
+def _(remark: Told, of: object) -> str:
+    return remark.text
+
+
+@says(Interrupted)
+def _(remark: Interrupted, of: object) -> str:
+    there = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
+    was = f"the recording of {remark.run} ({remark.path}) was interrupted"
+    return f"{was}: compared is what is there, {there}"
+
+
+@says(EndedByException)
+def _(remark: EndedByException, of: object) -> str:
+    when = f"event {remark.event}, {seconds_text(remark.stamp_ns)} s"
+    return f"{remark.run} ended by an exception: {remark.reason}, {when}"
+
+
+@says(OtherEnd)
+def _(remark: OtherEnd, of: object) -> str:
+    return f"{remark.what}: {remark.a} in a, {remark.b} in b"
+
+
+@says(ComparedAs)
+def _(remark: ComparedAs, of: object) -> str:
+    return f"{printable(remark.a)} in a is compared with {printable(remark.b)} in b"
+
+
+def _asked(globs: Sequence[str]) -> str:
+    return printable(", ".join(globs))
+
+
+@says(NothingAskedFor)
+def _(remark: NothingAskedFor, of: object) -> str:
+    return (
+        f"nothing that was asked for ({_asked(remark.asked)}) differs among the events that were "
+        "aligned; shown is where the runs diverge"
+    )
+
+
+@says(ShownLater)
+def _(remark: ShownLater, of: object) -> str:
+    where = f"shown is where {_asked(remark.asked)} differs"
+    return f"the runs diverge at event {remark.start}; {where}"
+
+
+@says(ShownPastTolerated)
+def _(remark: ShownPastTolerated, of: object) -> str:
+    covered = "only in what is ignored or within tolerance"
+    shown = "shown is the first difference that is not"
+    return f"the runs diverge at event {remark.start}, but there {covered}; {shown}"
+
+
+@says(MoreDivergences)
+def _(remark: MoreDivergences, of: object) -> str:
+    hint = "" if remark.all_shown else f"; {ALL_HINT}"
+    return f"{remark.count} more independent divergences{hint}"
+
+
+@says(CannotRepeat)
+def _(remark: CannotRepeat, of: object) -> str:
+    if remark.job:
+        return f"{remark.trace} was made elsewhere: its job {_shown(remark.job)} is not here"
+    more = len(remark.options) - _OPTIONS_MAX
+    told = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
+    told += f" and {more} more" if more > 0 else ""
+    return (
+        f"no command to reproduce this: {remark.trace} comes from a job that could run code "
+        f"({told}); use that only if you know where the trace is from"
+    )
+
+
+def _shown(text: str) -> str:
+    return shortened(printable(text), _TEXT_MAX)
+
+
+@says(JobChanged)
+def _(remark: JobChanged, of: object) -> str:
+    return (
+        f"{remark.job} is not what {remark.trace} was recorded with: it was made elsewhere, or the "
+        "job has been changed since"
+    )
+
+
+@says(LogTimesIgnored)
+def _(remark: LogTimesIgnored, of: object) -> str:
+    return "log times are not compared (--by stamp matches messages by them)"
+
+
+@says(OtherType)
+def _(remark: OtherType, of: object) -> str:
+    a, b = remark.a or "of unknown type", remark.b or "of unknown type"
+    return f"{remark.topic} is {a} in a, {b} in b"
+
+
+@says(ComparedByBytes)
+def _(remark: ComparedByBytes, of: object) -> str:
+    return f"{remark.error}; compared byte by byte, padding included"
+
+
+def reproduction_text(of: RepeatedRun) -> str:
+    """Return which of two runs a third one repeats."""
+    if of.place is None:
+        too = "too" if of.repeats is Repeats.A else "another one"
+        return f"a and b are the same run, and {of.again} {too}"
+    third, where = f"the third run ({of.again})", f"at event {of.place}, where a and b diverge"
+    if of.repeats in (Repeats.A, Repeats.B):
+        return f"{third} reproduces {of.repeats.value}: it does the same {where}"
+    if of.repeats is Repeats.TOO_SHORT:
+        return f"{third} ends before event {of.place}, where a and b diverge: record more"
+    return (
+        f"{third} is a third result: it differs from a at event {of.from_a} and from b at event "
+        f"{of.from_b}; a and b diverge at event {of.place}"
+    )

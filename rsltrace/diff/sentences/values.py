@@ -1,0 +1,285 @@
+"""Values inside of sentences: what a field, a setting, a state was in one run and in the other."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+from rsltrace.diff.facts.bags import MessageDivergence
+from rsltrace.diff.facts.evidence import (
+    FieldDifference,
+    FieldNote,
+    FieldNoteKind,
+    Link,
+    LinkKind,
+    MessageDifference,
+    Moved,
+    NoFields,
+    ParametersChanged,
+    ParametersSet,
+    Presence,
+    SentLater,
+    SentTimes,
+    Setting,
+    SettingKind,
+    StateDifference,
+    TimerCancelled,
+    TimerPeriodSet,
+)
+from rsltrace.diff.sentences import says, sentence
+from rsltrace.model.event import OutputKind
+from rsltrace.model.printable import printable, shortened, told_apart
+from rsltrace.model.stamp import durations_apart, format_duration
+
+NAMED_MAX = 3
+_VALUE_MAX = 40
+_SETTING_MAX = 60
+
+IN_ONE = {Presence.ONLY_A: "only in a", Presence.ONLY_B: "only in b"}
+_LABELS = {OutputKind.REQUEST: "call ", OutputKind.RESPONSE: "reply "}
+_NOTES = {
+    FieldNoteKind.OTHER_TYPES: "different types",
+    FieldNoteKind.NO_SUCH_FIELD: "only one of the types has this field",
+    FieldNoteKind.LENGTHS: "length {a} and {b}",
+    FieldNoteKind.SAME_ELEMENTS: "the same elements in another order",
+    FieldNoteKind.SAME_WORDS: "the same words in another order",
+    FieldNoteKind.FIRST_BYTE: "first at byte {a}",
+    FieldNoteKind.FIRST_CHARACTER: "first at character {a}",
+    FieldNoteKind.CONSTANTS: "{a} → {b}",
+    FieldNoteKind.NAN_PAYLOAD: "NaN with another payload",
+    FieldNoteKind.NAN_IN_A: "NaN in a only",
+    FieldNoteKind.NAN_IN_B: "NaN in b only",
+    FieldNoteKind.INFINITE_IN_A: "infinite in a only",
+    FieldNoteKind.INFINITE_IN_B: "infinite in b only",
+    FieldNoteKind.OPPOSITE_INFINITIES: "infinities of opposite sign",
+    FieldNoteKind.SIGN_OF_ZERO: "sign of zero",
+}
+_LINKS = {
+    LinkKind.PUBLISHED: "published",
+    LinkKind.CALLED: "called",
+    LinkKind.ANSWERED: "answered",
+    LinkKind.LOGGED: "logged to",
+    LinkKind.TRIGGERED: "triggered",
+    LinkKind.MADE_TASK: "made or resumed a task of",
+    LinkKind.CAUSED: "caused",
+    LinkKind.CHANGED_STATE: "may have changed the state of",
+    LinkKind.DRAWN_AGAIN: "draws a different value in",
+    LinkKind.MADE_RECEIVER: "made a receiver of",
+    LinkKind.KEEPS_WAITING: "keeps waiting",
+    LinkKind.ENDED_BEFORE: "ended before",
+}
+
+
+# -- two values that differ ------------------------------------------------------------------------
+
+
+def durations(a_ns: int, b_ns: int) -> str:
+    """Return two durations, with one unit where that is the same: ``20 → 26 ms``."""
+    a, b = durations_apart(a_ns, b_ns)
+    (number, unit), (_, other_unit) = a.split(), b.split()
+    return f"{number} → {b}" if unit == other_unit else f"{a} → {b}"
+
+
+def pair_text(a: str | None, b: str | None, nothing: str = "nothing") -> str:
+    """Return ``old → new``, in which one sees what differs."""
+    one, other = told_apart(nothing if a is None else a, nothing if b is None else b)
+    return f"{one} → {other}"
+
+
+def listed(things: Sequence[str]) -> str:
+    """Return the first things with commas, each once, and how many more there are."""
+    unique = list(dict.fromkeys(things))
+    more = len(unique) - NAMED_MAX
+    return ", ".join(unique[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
+
+
+def joined(things: Sequence[str]) -> str:
+    """Return things with commas and an ``and`` before the last."""
+    unique = list(dict.fromkeys(things))
+    if len(unique) > NAMED_MAX:
+        return listed(unique)
+    return " and ".join(filter(None, (", ".join(unique[:-1]), unique[-1])))
+
+
+# -- fields and states -----------------------------------------------------------------------------
+
+
+def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
+    """Return what differs in a message: ``data 0.28026 → 0.28027``, and how many more fields."""
+    if not fields:
+        return ""
+    first = fields[0]
+    if same := first.note_of(FieldNoteKind.SAME_ELEMENTS):
+        text = f"{first.path} has {note_text(same)}"
+    elif first.elements is not None and first.elements[0] > 1:
+        text = f"{first.elements[0]} of {first.elements[1]} elements of {first.path}"
+    else:
+        text = f"{first.path} {pair_text(first.a, first.b)}"
+        named = first.note_of(FieldNoteKind.CONSTANTS, FieldNoteKind.SAME_WORDS)
+        text += f" ({note_text(named)})" if named else ""
+    more = len(fields) - 1 + more_fields
+    return f"{text} and {more} more field{'s' if more > 1 else ''}" if more else text
+
+
+def note_text(note: FieldNote) -> str:
+    """Return what is special about two values."""
+    text = _NOTES[note.kind].format(a=note.a, b=note.b)
+    return f"{text}: {note.count}" if note.count else text
+
+
+def notes_text(found: FieldDifference) -> str:
+    """Return all that is special about two values."""
+    return "; ".join(map(note_text, found.notes))
+
+
+def state_text(state: Sequence[StateDifference]) -> str:
+    """Return `` (count 3 → 4)``, "" if nothing is known of it."""
+    if not state:
+        return ""
+    more = f" and {len(state) - 1} more" if len(state) > 1 else ""
+    return f" ({state[0].path} {pair_text(state[0].a, state[0].b)}{more})"
+
+
+# -- settings --------------------------------------------------------------------------------------
+
+
+def setting_name(setting: Setting) -> str:
+    """Return ``job.yaml:12: delay``, ``environment: numpy``."""
+    return f"{setting.place}: {setting.key}" if setting.key else setting.place
+
+
+def because_of(settings: Sequence[Setting]) -> str:
+    """Say that the runs had different settings, and which; "" if they had not."""
+    if not settings:
+        return ""
+    return f"the runs had different settings: {listed([_setting_text(one) for one in settings])}"
+
+
+def _setting_text(setting: Setting) -> str:
+    name = setting_name(setting)
+    values = [value for value in (setting.a, setting.b) if value is not None]
+    if setting.kind is SettingKind.ENVIRONMENT and setting.a is not None and setting.b is not None:
+        shown = told_apart(setting.a, setting.b, _SETTING_MAX)
+        return f"environment.{printable(setting.name)} ({', '.join(shown)})"
+    if not setting.key or any(len(value) > _SETTING_MAX or "\n" in value for value in values):
+        return name
+    if len(values) == 2:
+        return f"{name} {' → '.join(values)}"
+    return f"{name} ({values[0]} only in {'b' if setting.a is None else 'a'})" if values else ""
+
+
+# -- messages and other outputs --------------------------------------------------------------------
+
+
+def a_first(messages: Sequence[MessageDifference]) -> list[MessageDifference]:
+    """Return messages with what is only in a in front, among as many as a sentence names."""
+    named = sorted(messages[:NAMED_MAX], key=lambda m: m.presence is Presence.ONLY_B)
+    return [*named, *messages[NAMED_MAX:]]
+
+
+def what_differs(messages: Sequence[MessageDifference]) -> str:
+    """Return `` (/odom: pose.x 1.0 → 1.5, call /plan only in b)``, "" if no output differs."""
+    outputs = [m for m in messages if not m.is_input]
+    moved = [_label(m) for m in outputs if isinstance(m.fate, Moved)]
+    things = [_thing(m) for m in a_first([m for m in outputs if not isinstance(m.fate, Moved)])]
+    times = Counter(things)
+    things = [f"{thing}, {n} times" if n > 1 else thing for thing, n in times.items()]
+    if moved:
+        things.insert(0, f"{joined(moved)} {sentence(Moved())}")
+    return f" ({listed(things)})" if things else ""
+
+
+def _thing(message: MessageDifference) -> str:
+    label, fate = _label(message), message.fate
+    if message.presence is Presence.BOTH:
+        if isinstance(fate, ParametersChanged):
+            return f"parameter {sentence(fate)}"
+        if fate is not None:
+            return f"{label}: {sentence(fate)}"
+        fields = field_text(message.fields, message.more_fields)
+        return f"{label}: {fields}" if fields else label
+    if message.kind is OutputKind.LOG and message.preview:
+        label = f"log {message.preview}"
+    if fate is not None and not isinstance(fate, ParametersSet):
+        return f"{label} {sentence(fate)}"
+    if fate is not None:
+        label = f"{label}: {sentence(fate)}"
+    return f"{label} {IN_ONE[message.presence]}"
+
+
+def _label(message: MessageDifference) -> str:
+    return f"{_LABELS.get(message.kind, '') if message.kind else ''}{message.topic}"
+
+
+@says(Moved)
+def _(fate: Moved, of: object) -> str:
+    return "in another order"
+
+
+@says(SentTimes)
+def _(fate: SentTimes, of: object) -> str:
+    times = {(1, 2): "twice in b", (2, 1): "twice in a"}
+    return times.get((fate.a, fate.b), f"{fate.a} times in a, {fate.b} times in b")
+
+
+@says(SentLater)
+def _(fate: SentLater, of: object) -> str:
+    return f"{format_duration(fate.by_ns)} later in {fate.run}"
+
+
+@says(TimerCancelled)
+def _(fate: TimerCancelled, of: object) -> str:
+    return f"cancelled in {fate.run}"
+
+
+@says(TimerPeriodSet)
+def _(fate: TimerPeriodSet, of: object) -> str:
+    if fate.before_ns is None:
+        return f"set to a period of {format_duration(fate.after_ns)} in {fate.run}"
+    return f"period {durations(fate.before_ns, fate.after_ns)} in {fate.run}"
+
+
+@says(ParametersSet)
+def _(fate: ParametersSet, of: object) -> str:
+    return ", ".join(f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fate.values)
+
+
+@says(ParametersChanged)
+def _(fate: ParametersChanged, of: object) -> str:
+    return ", ".join(f"{name} {pair_text(a, b)}" for name, a, b in fate.values)
+
+
+def fate_text(message: MessageDifference) -> str:
+    """Return what became of an output, "" if there is nothing to say."""
+    return "" if message.fate is None else sentence(message.fate)
+
+
+def no_fields_text(message: MessageDifference | MessageDivergence) -> str:
+    """Say why no field of a message is shown, and how to see it; "" where there are some."""
+    if isinstance(message, MessageDifference) and isinstance(message.fate, Moved):
+        return "sent in another order"
+    return "" if message.no_fields is None else sentence(message.no_fields, message)
+
+
+@says(*NoFields)
+def _(why: NoFields, of: MessageDifference | MessageDivergence) -> str:
+    if why is NoFields.ALL_IGNORED:
+        return "all fields that differ are ignored"
+    if why is NoFields.EQUAL_FIELDS:
+        return "its fields are equal, but what the recorder hashed of it is not"
+    if why is NoFields.UNREADABLE:
+        return of.error
+    if why is NoFields.UNDESCRIBED_BYTES:
+        return "the messages differ in bytes that their types do not describe"
+    where = "a" if why is NoFields.NOT_RECORDED_IN_A else "b"
+    return (
+        f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
+        f"and a topic glob that matches {of.topic} (record: in the job)"
+    )
+
+
+def link_text(link: Link) -> str:
+    """Return how an event led to the next one: ``published /odom``."""
+    if link.kind is LinkKind.MORE_STEPS:
+        return f"led, in {link.steps} more steps, to"
+    return f"{_LINKS.get(link.kind, '')} {link.name}".strip()

@@ -1,0 +1,221 @@
+"""Entities that both runs made with other properties are named, whoever shows it first: the node,
+the policy and both values, whichever run is a."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+import rsltrace
+from rsltrace.diff.result import Diff
+
+pytestmark = pytest.mark.ros
+
+NODES = """
+import os
+import time
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import (
+    DurabilityPolicy, HistoryPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy,
+)
+from std_msgs.msg import UInt64
+
+def qos(end):
+    text = os.environ.get(end, "")  # what no trace tells: a hidden input
+    return QoSProfile(depth=5, **eval(f"dict({text})"))
+
+class Source(Node):
+    def __init__(self):
+        super().__init__("source")
+        self.count = 0
+        self.out = self.create_publisher(UInt64, "/signal", qos("OFFERED"))
+        self.timer = self.create_timer(float(os.environ.get("PERIOD", "0.1")), self.tick)
+
+    def tick(self):
+        self.count += 1
+        self.out.publish(UInt64(data=self.count))
+
+class Sink(Node):
+    def __init__(self):
+        super().__init__("sink")
+        self.out = self.create_publisher(UInt64, "/heard", 5)
+        self.create_subscription(UInt64, "/signal", self.heard, qos("REQUESTED"))
+
+    def heard(self, message):
+        self.out.publish(message)
+
+class Busy(Node):
+    def __init__(self):
+        super().__init__("busy")
+        self.out = self.create_publisher(UInt64, "/done", 5)
+        self.group = MutuallyExclusiveCallbackGroup()
+        group = {"own": self.group, "free": ReentrantCallbackGroup()}.get(os.environ.get("GROUP"))
+        self.create_timer(0.1, self.work, callback_group=self.group)
+        self.create_timer(0.1, self.more, callback_group=group)
+
+    def work(self):
+        time.sleep(0.03)
+        self.out.publish(UInt64(data=1))
+
+    def more(self):
+        self.out.publish(UInt64(data=2))
+"""
+JOB = """
+nodes:
+  - node: changed_nodes:Source
+  - node: changed_nodes:Sink
+stop: {duration: 1s}
+guard: {environment: allow}
+"""
+BUSY = """
+nodes:
+  - node: changed_nodes:Busy
+executors: [{nodes: [/busy], workers: 2}]
+stop: {duration: 1s}
+guard: {environment: allow}
+"""
+
+
+def recorded(
+    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch, job: str = JOB, **values: str
+) -> Path:
+    from rsltrace.run import run
+
+    (folder / "changed_nodes.py").write_text(NODES)
+    (folder / "job.yaml").write_text(job)
+    with monkeypatch.context() as patch:
+        for key, value in values.items():
+            patch.setenv(key, value)
+        run(rsltrace.load_job(folder / "job.yaml"), folder / name, force=True)
+    return folder / name
+
+
+QOS = [
+    ("OFFERED", "reliability=ReliabilityPolicy.BEST_EFFORT", "reliability reliable → best_effort"),
+    ("OFFERED", "liveliness=LivelinessPolicy.MANUAL_BY_TOPIC", ""),
+    (
+        "REQUESTED",
+        "durability=DurabilityPolicy.TRANSIENT_LOCAL",
+        "durability volatile → transient_local",
+    ),
+    ("REQUESTED", "deadline=Duration(seconds=0.05)", "deadline none → 50 ms"),
+    (
+        "REQUESTED",
+        "liveliness=LivelinessPolicy.MANUAL_BY_TOPIC",
+        "liveliness automatic → manual_by_topic",
+    ),
+    ("REQUESTED", "liveliness_lease_duration=Duration(seconds=0.2)", "lease none → 200 ms"),
+]
+
+
+@pytest.mark.parametrize(("end", "changed", "told"), QOS)
+def test_qos_that_fits_no_more(
+    end: str, changed: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a = recorded(tmp_path, "a.mcap", monkeypatch)
+    b = recorded(tmp_path, "b.mcap", monkeypatch, **{end: changed})
+    diff, back = rsltrace.diff(a, b), rsltrace.diff(b, a)
+    if not told:
+        assert diff.identical
+        return
+    who = (
+        "/source made publisher /signal" if end == "OFFERED" else "/sink made subscription /signal"
+    )
+    name, old, _, *new = told.split(" ")
+    backwards = f"{name} {' '.join(new)} → {old}"
+    for found, values in ((diff, told), (back, backwards)):
+        assert f"{who} with another QoS: {values}" in found.sentence
+        assert_blames(found, who.split()[0])
+
+
+def assert_blames(diff: Diff, node: str) -> None:
+    other = "/sink" if node == "/source" else "/source"
+    for said in (diff.sentence, diff.divergences[0].root_sentence):
+        assert f"{other} is not deterministic" not in said
+        assert f"the constructor of {other}" not in said
+
+
+@pytest.mark.parametrize(
+    ("end", "requested", "offered", "told"),
+    [
+        (
+            "OFFERED",
+            "reliability=ReliabilityPolicy.RELIABLE",
+            "reliability=ReliabilityPolicy.BEST_EFFORT",
+            "reliability reliable → best_effort",
+        ),
+        (
+            "OFFERED",
+            "durability=DurabilityPolicy.TRANSIENT_LOCAL",
+            "durability=DurabilityPolicy.VOLATILE",
+            "durability transient_local → volatile",
+        ),
+        (
+            "OFFERED",
+            "deadline=Duration(seconds=0.2)",
+            "deadline=Duration(seconds=0.5)",
+            "deadline 200 → 500 ms",
+        ),
+        (
+            "OFFERED",
+            "liveliness_lease_duration=Duration(seconds=0.2)",
+            "liveliness_lease_duration=Duration(seconds=0.2000001)",
+            "lease 200 → 200.0001 ms",
+        ),
+    ],
+)
+def test_qos_that_is_offered_no_more(
+    end: str,
+    requested: str,
+    offered: str,
+    told: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    same = {"OFFERED": requested, "REQUESTED": requested}
+    a = recorded(tmp_path, "a.mcap", monkeypatch, **same)
+    b = recorded(tmp_path, "b.mcap", monkeypatch, **{**same, end: offered})
+    diff = rsltrace.diff(a, b)
+    assert f"/source made publisher /signal with another QoS: {told}" in diff.sentence
+    assert_blames(diff, "/source")
+
+
+def test_what_the_other_node_read_is_the_likely_cause(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job = JOB.replace("guard: {environment: allow}\n", "")
+    a = recorded(tmp_path, "a.mcap", monkeypatch, job)
+    changed = QOS[0][1]
+    b = recorded(tmp_path, "b.mcap", monkeypatch, job, OFFERED=changed)
+    assert "/source read OFFERED" in rsltrace.diff(a, b).sentence
+
+
+def test_periods_that_differ_are_shown_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    a = recorded(tmp_path, "a.mcap", monkeypatch)
+    b = recorded(tmp_path, "b.mcap", monkeypatch, PERIOD="0.1000001")
+    assert "timer period 100 → 100.0001 ms" in rsltrace.diff(a, b).sentence
+    assert "timer period 100.0001 → 100 ms" in rsltrace.diff(b, a).sentence
+
+
+@pytest.mark.parametrize(
+    ("groups", "told"),
+    [
+        (("own", ""), "exclusive 1 → default"),
+        (("", "own"), "default → exclusive 1"),
+        (("own", "free"), "exclusive 1 → reentrant 2"),
+    ],
+)
+def test_another_callback_group(
+    groups: tuple[str, str], told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b = (
+        recorded(tmp_path, f"{name}.mcap", monkeypatch, BUSY, GROUP=group)
+        for name, group in zip("ab", groups, strict=True)
+    )
+    diff = rsltrace.diff(a, b)
+    assert f"/busy made timer Busy.more with another callback group: {told}" in diff.sentence
