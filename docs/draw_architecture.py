@@ -51,9 +51,7 @@ BOXES = (
     Box(658, 160, 268, 64, "report", "text, JSON, Markdown, one line", ROOM),
     Box(658, 232, 268, 64, "causes · traces · bags", "roots, consequences, evidence", ROOM),
     Box(658, 304, 268, 64, "alignment · values · result", "which event is which", ROOM),
-    Box(
-        646, 388, 280, 54, "words · latency · fit", "in words; through chains; from native", READING
-    ),
+    Box(646, 388, 280, 54, "words · conditions · latency · fit", "said; held; measured", READING),
     Box(646, 452, 354, 136, "trace", "events, outputs, payloads, hashes", READING),
     Box(1010, 452, 80, 136, "bag", "rosbag2", READING),
     Box(646, 598, 444, 132, "mcap", "records, chunks, indexes; cut-off, remote", READING, 49),
