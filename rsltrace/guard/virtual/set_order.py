@@ -197,7 +197,9 @@ def ordered(thing: Any) -> Any:
 
 def _making(real: Callable[..., Any]) -> Callable[..., Any]:
     def make(*arguments: Any, **options: Any) -> Any:
-        return real(*map(ordered, arguments), **options)
+        if arguments and type(arguments[-1]) in _TYPES:
+            arguments = (*arguments[:-1], ordered(arguments[-1]))
+        return real(*arguments, **options)
 
     return make
 
