@@ -1,15 +1,15 @@
 """Edits: what is to be other than in the trace, each at one place in the run.
 
     812: message.pose.position.x = 3.0         what event 812 receives
-    2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on (2.5 s after
-                                               the start; @2.5s: at simulated time 2.5 s)
+    2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on
     812: node("/ekf").P[0][0] = 1e-3           an attribute, before event 812
     2.5s: parameters("/ekf")["rate"] = 20.0    a parameter
     812: drop()    2.5s: drop("/odom")         an event; the next message on a topic
     812: delay("5ms")                          it comes later
     812: defer()   812: defer(1)               it runs after all others (one other) due at its time
 
-An edit is Python text that is parsed and never run; its values are literals.
+A time counts from the start of the run; @2.5s is simulated time 2.5 s. An edit is Python text that
+is parsed and never run; its values are literals.
 """
 
 from __future__ import annotations

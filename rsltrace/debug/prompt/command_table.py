@@ -26,7 +26,9 @@ def _count(text: str, otherwise: int = 1) -> int:
 
 def _place(text: str) -> int | str:
     if not text:
-        raise DebugError("where to? 812 is an event, 2.5s a simulated time")
+        raise DebugError(
+            "where to? 812 is an event, 2.5s a time of the run"
+        )
     return int(text) if text.isascii() and text.isdecimal() else text.removeprefix("t=")
 
 
@@ -62,7 +64,7 @@ def _continue(shell: Prompt, rest: str) -> None:
 
 @_add("run-to", "until", "u", usage="PLACE", topic="running")
 def _run_to(shell: Prompt, rest: str) -> None:
-    """Run to an event (812) or a time (2.5s), or to a breakpoint before it.
+    """Run to an event (812) or a time of the run (2.5s), or to a breakpoint before it.
 
     At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to then.
     """
@@ -92,7 +94,7 @@ def _reverse_continue(shell: Prompt, rest: str) -> None:
 
 @_add("goto", "g", usage="PLACE", topic="going back")
 def _goto(shell: Prompt, rest: str) -> None:
-    """Go to an event (812) or a time (2.5s), ahead or back; no breakpoint stops."""
+    """Go to an event (812) or a time of the run (2.5s), ahead or back; no breakpoint stops."""
     shell.stopped(shell.session.go_to(_place(rest)))
 
 
@@ -104,7 +106,7 @@ def _break(shell: Prompt, rest: str) -> None:
     """Set a breakpoint.
 
     812                           before event 812
-    t=2.5s                        before the first event at that simulated time or later
+    t=2.5s                        before the first event at that time of the run or later
     node /ekf, entity /scan       before an event of a node, of an entity (by name or #number)
     topic /odom                   before who receives a message, after who sends one
     /odom: pose.pose.position.x > 3    the same, of messages of which that is true
