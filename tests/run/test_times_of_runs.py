@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-
-import rsltrace
 from rsltrace.debug.conditions.names import Names
 from rsltrace.debug.conditions.text import parse_condition
+
+import rsltrace
 from rsltrace.job import load_job
 from rsltrace.model.event import EventKind
 from rsltrace.run import run

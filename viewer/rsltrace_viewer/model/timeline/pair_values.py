@@ -7,6 +7,8 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from rsltrace.diff.facts.evidence import Presence
+from rsltrace.diff.sentences.values import IN_ONE, no_fields_text
 from rsltrace.errors import TraceError
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import printable, shortened
@@ -78,10 +80,10 @@ def _message_text(one: MessageDifference, *, brief: bool) -> tuple[str, str]:
     topic = "log" if is_log else "got" if one.position < 0 else one.topic
     if one.kind in _CALLS:
         topic = f"{_CALLS[one.kind]} {topic}"
-    if one.presence != "both":
-        return topic, shortened(f"{one.preview} {one.presence.replace(' ', ' in ')}".strip(), 80)
+    if one.presence is not Presence.BOTH:
+        return topic, shortened(f"{one.preview} {IN_ONE[one.presence]}".strip(), 80)
     if not one.fields:
-        return topic, one.reason or "differs"
+        return topic, no_fields_text(one) or "differs"
     fields = one.fields[:_FIELDS_MAX]
     names = [] if is_log else [field_name(field.path) for field in fields]
     if len(set(names)) < len(names):
