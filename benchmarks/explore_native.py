@@ -30,8 +30,8 @@ from rsltrace import Job, load_job
 from rsltrace.checks.conditions import condition, opposite, plain, topic_of
 from rsltrace.checks.evaluate import title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
-from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.model.stamp import NS_PER_S
+from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.stamp import NS_PER_S
 
 DISCOVERY_S_MAX = 30.0
 SETTLE_S = 0.2

@@ -24,11 +24,11 @@ from rclpy.node import Node
 from std_msgs.msg import UInt8
 
 from rsltrace import Simulation
-from rsltrace.chance.stream import Stream
-from rsltrace.explore.steps import Watch
 from rsltrace.job import Job
-from rsltrace.loop.search_policies import Pct, pct_bound
 from rsltrace.run.session import Session
+from rsltrace.search.explore.steps import Watch
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.search_policies import Pct, pct_bound
 
 TOPICS = ("a", "b", "c")
 MESSAGES = 4

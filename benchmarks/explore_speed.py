@@ -22,10 +22,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.trial import JobSource, Trial
-from rsltrace.explore.workers import Worker
 from rsltrace.job.values.times import parse_time
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.trial import JobSource, Trial
+from rsltrace.search.explore.workers import Worker
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ROOT / "campaigns/explore/bugs/order/command_after_stop/job.yaml"

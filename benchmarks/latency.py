@@ -18,7 +18,7 @@ from pathlib import Path
 
 from synthetic import Shape, write_trace
 
-from rsltrace.latency.measure import MEASURES, measure_latencies
+from rsltrace.checks.latency.measure import MEASURES, measure_latencies
 from rsltrace.trace.reader import Trace
 
 EVENTS = 1_000_000

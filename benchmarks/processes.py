@@ -18,7 +18,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from rsltrace.doors.processes.build import find_compiler, find_ros, library
+from rsltrace.adapters.processes.build import find_compiler, find_ros, library
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "tests" / "processes" / "counter.c"

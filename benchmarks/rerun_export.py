@@ -15,9 +15,9 @@ import tempfile
 import time
 from pathlib import Path
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT_CONTENT
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 

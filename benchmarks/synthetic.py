@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace import chunks
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import (
@@ -26,6 +24,8 @@ from rsltrace.trace.format import (
     OUTPUT_HASHED,
     SEGMENT_DTYPE,
 )
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.writer import TraceWriter
 
 NODES = 8

@@ -19,9 +19,9 @@ from pathlib import Path
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT, OUTPUT_CONTENT
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 

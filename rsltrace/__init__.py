@@ -18,6 +18,7 @@ from rsltrace._version import __version__
 
 if TYPE_CHECKING:
     from rsltrace.checks.evaluate import CheckResult, evaluate_checks
+    from rsltrace.checks.latency.measure import ChainLatency, measure_latencies
     from rsltrace.checks.metrics import MetricResult, evaluate_metrics
     from rsltrace.debug.client import DebugSession
     from rsltrace.diff import diff_files as diff
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
         TopicStop,
         load_job,
     )
-    from rsltrace.latency.measure import ChainLatency, measure_latencies
     from rsltrace.replay import replay_trace as replay
     from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.result import ReplayResult
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagDiff": "rsltrace.diff.result",
     "BagSpec": "rsltrace.job",
-    "ChainLatency": "rsltrace.latency.measure",
+    "ChainLatency": "rsltrace.checks.latency.measure",
     "CheckResult": "rsltrace.checks.evaluate",
     "CheckSpec": "rsltrace.job",
     "DebugSession": "rsltrace.debug.client",
@@ -77,7 +77,7 @@ _HOMES = {
     "evaluate_checks": "rsltrace.checks.evaluate",
     "evaluate_metrics": "rsltrace.checks.metrics",
     "load_job": "rsltrace.job",
-    "measure_latencies": "rsltrace.latency.measure",
+    "measure_latencies": "rsltrace.checks.latency.measure",
     "record": "rsltrace.run",
 }
 

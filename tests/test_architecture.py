@@ -42,8 +42,8 @@ def test_help_and_version_load_nothing_heavy() -> None:
 @pytest.mark.parametrize(
     ("module", "allowed"),
     [
-        ("rsltrace.loop.loop", set()),
-        ("rsltrace.model.event", set()),
+        ("rsltrace.simulation.loop.loop", set()),
+        ("rsltrace.trace.model.event", set()),
         ("rsltrace.job", {"pydantic", "ruamel"}),
         ("rsltrace.trace.reader", {"numpy"}),
         ("rsltrace.trace.writer", {"numpy"}),
@@ -213,23 +213,23 @@ def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
 
 
 _NO_METHODS_OF_OURS = {
-    ("rsltrace/doors/rclpy/boundary/quick_publish.py", "publish"): "of rclpy's Publisher",
-    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "__init__"): "of asyncio's loops",
-    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "_watcher"): "of asyncio's policies",
-    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "step"): "a slot of RecordedPoll",
-    ("rsltrace/doors/rclpy/handles/logs.py", "_line"): "a field of a message",
-    ("rsltrace/explore/report/page.py", "tail"): "the text after an element of XML",
-    ("rsltrace/doors/rclpy/stacks/exit_handlers.py", "register"): "of the module atexit",
-    ("rsltrace/doors/rclpy/stacks/exit_handlers.py", "unregister"): "of the module atexit",
-    ("rsltrace/doors/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
+    ("rsltrace/adapters/rclpy/boundary/quick_publish.py", "publish"): "of rclpy's Publisher",
+    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "__init__"): "of asyncio's loops",
+    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "_watcher"): "of asyncio's policies",
+    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "step"): "a slot of RecordedPoll",
+    ("rsltrace/adapters/rclpy/handles/logs.py", "_line"): "a field of a message",
+    ("rsltrace/search/explore/report/page.py", "tail"): "the text after an element of XML",
+    ("rsltrace/adapters/rclpy/stacks/exit_handlers.py", "register"): "of the module atexit",
+    ("rsltrace/adapters/rclpy/stacks/exit_handlers.py", "unregister"): "of the module atexit",
+    ("rsltrace/adapters/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
     ("rsltrace/guard/virtual/set_order.py", "exec_module"): "of Python's loaders",
-    ("rsltrace/launch/python_file.py", "include"): "a slot of LaunchContext",
+    ("rsltrace/adapters/launch/python_file.py", "include"): "a slot of LaunchContext",
 }
 """What has the name of a method, and why it is none of the product's objects'."""
 
 
 def test_no_method_of_another_object_is_replaced() -> None:
-    """Whoever watches or steers a run is an observer (``middleware/events/observer.py``)."""
+    """Whoever watches or steers a run is an observer (``simulation/middleware/events/observer.py``)."""
     modules = parsed()
     found = replaced_methods(modules)
     assert found <= set(_NO_METHODS_OF_OURS), sorted(found - set(_NO_METHODS_OF_OURS))
@@ -260,25 +260,25 @@ RUNS_CODE = {
     "rsltrace/cli/main.py": "import_module",  # the module of a command
     "rsltrace/job/__init__.py": "import_module",  # public names of jobs
     "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
-    "rsltrace/doors/rclpy/boundary/type_support.py": "exec_module import_module",  # of rosidl
-    "rsltrace/doors/rclpy/executors/exchanged.py": "import_module",  # functions of rclpy
+    "rsltrace/adapters/rclpy/boundary/type_support.py": "exec_module import_module",  # of rosidl
+    "rsltrace/adapters/rclpy/executors/exchanged.py": "import_module",  # functions of rclpy
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
-    "rsltrace/workspace/build_files.py": "compile exec import_module",  # tomli; setup.py, as colcon
+    "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # tomli; setup.py, as colcon
     # What a run, and only a run, does with code that its job names.
-    "rsltrace/doors/rclpy/wire/interface_classes.py": "import_module",  # classes of messages
-    "rsltrace/doors/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
-    "rsltrace/explore/worker.py": "import_module",  # libraries that the last run has imported
+    "rsltrace/adapters/rclpy/wire/interface_classes.py": "import_module",  # classes of messages
+    "rsltrace/adapters/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
+    "rsltrace/search/explore/worker.py": "import_module",  # libraries that the last run has imported
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
     "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
     "rsltrace/run/plans/target.py": "import_module",  # node: module:Class
-    "rsltrace/campaign/perturb.py": "runpy",  # this command once more, in another environment
-    "rsltrace/campaign/processes.py": "runpy",  # a command of ours, in a process
+    "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment
+    "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
-    "rsltrace/launch/api/names.py": "import_module",  # stand-ins for modules of launch
-    "rsltrace/launch/api/substitutions.py": "eval import_module",  # PythonExpression
-    "rsltrace/launch/api/sources.py": "exec_module",  # a Python launch file
-    "rsltrace/launch/apart.py": "pickle",  # the answer of that process
+    "rsltrace/adapters/launch/api/names.py": "import_module",  # stand-ins for modules of launch
+    "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
+    "rsltrace/adapters/launch/api/sources.py": "exec_module",  # a Python launch file
+    "rsltrace/adapters/launch/apart.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
     "rsltrace/native/apart/link.py": "pickle",  # of user code: plain values only
     "rsltrace/run/copying.py": "pickle",  # what a copy of the simulation returns

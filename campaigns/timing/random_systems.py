@@ -12,11 +12,11 @@ from rclpy.node import Node
 from std_msgs.msg import Empty
 
 from rsltrace.job import Job
+from rsltrace.native.timing.bounds import Bound, bounds
+from rsltrace.native.timing.model import Wanted, longest_times, system_of
+from rsltrace.native.timing.observed import ObservedChains
+from rsltrace.native.timing.observed import Path as Chain
 from rsltrace.run import record
-from rsltrace.timing.bounds import Bound, bounds
-from rsltrace.timing.model import Wanted, longest_times, system_of
-from rsltrace.timing.observed import ObservedChains
-from rsltrace.timing.observed import Path as Chain
 from rsltrace.trace.reader import Trace
 
 POLICIES = ("fifo", "rate_monotonic", "wait_set", "rclpy", "permutation", "priority")

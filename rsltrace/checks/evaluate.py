@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from rsltrace.checks.conditions import compared, condition, opposite
 from rsltrace.checks.functions import violations
-from rsltrace.checks.latency import Known, LatencyResult, check_latency, latency_title
+from rsltrace.checks.latency_checks import Known, LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
 from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names, names_of
@@ -18,7 +18,7 @@ from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.values.target import Target, target_text
-from rsltrace.model.stamp import NS_PER_S, format_duration
+from rsltrace.trace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.reader import Trace
 
 PASSED, VIOLATED, UNDECIDED, SKIPPED = "passed", "violated", "undecided", "skipped"

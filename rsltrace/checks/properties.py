@@ -12,8 +12,8 @@ from rsltrace.conditions.condition import Armed, error_text, shown
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.trace_events import TraceEvent
 from rsltrace.errors import RsltraceError
-from rsltrace.model.event import OutputKind
-from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.stamp import NS_PER_S, format_duration, format_seconds
 
 _SHOWN_MAX = 3
 KEPT_MAX = 1000

@@ -16,14 +16,14 @@ from rsltrace.cli.job_source import set_option
 from rsltrace.cli.output.picture import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.timing.analysis import Analysis
-    from rsltrace.timing.curves import Supply
-    from rsltrace.timing.observed import ObservedChains
+    from rsltrace.native.timing.analysis import Analysis
+    from rsltrace.native.timing.curves import Supply
+    from rsltrace.native.timing.observed import ObservedChains
 
 
 @click.command()
@@ -92,9 +92,9 @@ def analyze(
       rsltrace analyze job.yaml native.mcap --times max --plot bounds.png
     """
     from rsltrace.job import load_job
+    from rsltrace.native.timing import analysis as timing
+    from rsltrace.native.timing.model import Wanted, check_job
     from rsltrace.run.launch_files import without_launch_files
-    from rsltrace.timing import analysis as timing
-    from rsltrace.timing.model import Wanted, check_job
 
     supply = _supply(reservation)
     by_end = dict(_deadline(text) for text in deadlines)
@@ -141,7 +141,7 @@ def analyze(
 
 
 def _supply(reservation: str | None) -> Supply:
-    from rsltrace.timing.curves import PROCESSOR, Supply
+    from rsltrace.native.timing.curves import PROCESSOR, Supply
 
     if reservation is None:
         return PROCESSOR
@@ -172,7 +172,7 @@ def _opened(
 
     :raises TraceError: there are several simulated ones, or one is damaged.
     """
-    from rsltrace.timing.observed import ObservedChains
+    from rsltrace.native.timing.observed import ObservedChains
     from rsltrace.trace.native import is_native
     from rsltrace.trace.reader import Trace
 
@@ -194,8 +194,8 @@ def _simulated(job: Job, stack: ExitStack) -> ObservedChains:
 
     :raises RunError: the run fails.
     """
+    from rsltrace.native.timing.observed import ObservedChains
     from rsltrace.run import record
-    from rsltrace.timing.observed import ObservedChains
     from rsltrace.trace.reader import Trace
 
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rsltrace-"))

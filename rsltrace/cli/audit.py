@@ -13,11 +13,11 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import EXIT_USAGE
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 
 if TYPE_CHECKING:
-    from rsltrace.audit.model import Audit, Found
+    from rsltrace.guard.audit.model import Audit, Found
 
 _FORMATS = ("text", "json", "github")
 
@@ -60,7 +60,7 @@ def audit(
     The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
     """
     result = _look(words, launch, skip, overrides)
-    from rsltrace.audit.model import IS_SAFE
+    from rsltrace.guard.audit.model import IS_SAFE
 
     found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
     for trouble in result.troubles:
@@ -77,7 +77,7 @@ def audit(
 
 
 def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]) -> Audit:
-    from rsltrace.audit.audit import audit_job, audit_path
+    from rsltrace.guard.audit.audit import audit_job, audit_path
 
     only = Path(words[0]) if len(words) == 1 and launch is None else None
     if only is not None and (only.is_dir() or only.suffix == ".py"):
@@ -129,8 +129,8 @@ def _as_json(result: Audit, found: Sequence[Found]) -> str:
 
 
 def _annotation(one: Found) -> str:
-    from rsltrace.audit.model import IS_SAFE
     from rsltrace.diff.report.ci import command_data, command_property
+    from rsltrace.guard.audit.model import IS_SAFE
 
     level = "notice" if one.treatment in IS_SAFE else "warning"
     place = f"file={command_property(printable(_shown(one.path)))},line={one.line},col={one.column}"

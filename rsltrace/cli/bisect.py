@@ -17,12 +17,12 @@ from rsltrace.errors import BisectError, JobError, OutputError
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.campaign.bisect.judges import Check
-    from rsltrace.campaign.bisect.repository import Repository
-    from rsltrace.campaign.bisect.runs import Runner
-    from rsltrace.campaign.bisect.search import Found
-    from rsltrace.campaign.processes import Processes
+    from rsltrace.child_processes import Processes
     from rsltrace.job import Job
+    from rsltrace.search.bisect.judges import Check
+    from rsltrace.search.bisect.repository import Repository
+    from rsltrace.search.bisect.runs import Runner
+    from rsltrace.search.bisect.search import Found
 
 _BEFORE, _AFTER = "before.mcap", "after.mcap"
 
@@ -106,12 +106,12 @@ def bisect(
     The exit status is 0 if one commit is named, 1 if only several of which one is it, 2 for
     trouble: ends that do not differ, a job that is not deterministic, no repository.
     """
-    from rsltrace.campaign.bisect.repository import Repository
-    from rsltrace.campaign.bisect.runs import Runner
-    from rsltrace.campaign.bisect.search import Search
-    from rsltrace.campaign.bisect.worktree import Worktree
-    from rsltrace.campaign.processes import Processes
+    from rsltrace.child_processes import Processes
     from rsltrace.cli.output.bisect_text import line_of
+    from rsltrace.search.bisect.repository import Repository
+    from rsltrace.search.bisect.runs import Runner
+    from rsltrace.search.bisect.search import Search
+    from rsltrace.search.bisect.worktree import Worktree
 
     if expression is not None and shell is not None:
         raise click.UsageError("--check or --run, not both")
@@ -148,7 +148,7 @@ def bisect(
 
 
 def _check(expression: str | None, shell: str | None, processes: Processes) -> Check | None:
-    from rsltrace.campaign.bisect.judges import check_of, command
+    from rsltrace.search.bisect.judges import check_of, command
 
     if expression is not None:
         return check_of(expression)
@@ -208,8 +208,8 @@ def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> It
 
 def _same_everywhere(repository: Repository, job: Job) -> Iterator[str]:
     """Yield notes on code that no revision has another version of, as far as runs are concerned."""
-    from rsltrace.campaign.bisect.runs import python_folders
     from rsltrace.replay.code import code_of, file_of
+    from rsltrace.search.bisect.runs import python_folders
 
     relative = [path for path in job.search_path if not os.path.isabs(path)]
     folders = [*map(str, python_folders(repository)), *(str(job.resolve(p)) for p in relative)]

@@ -18,13 +18,13 @@ from rsltrace.cli.output.event_json import EventJson
 from rsltrace.cli.output.event_line import EventLines
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import TraceError, did_you_mean
-from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.model.event import Event, EventKind, Output
-from rsltrace.model.printable import printable
 from rsltrace.terminal import line_writer
+from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
+from rsltrace.trace.model.event import Event, EventKind, Output
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
-from rsltrace.words.times import TimeInRun, parse_time_in_run
+from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
 
 _NAMES_MAX = 12
 

@@ -13,15 +13,15 @@ import click
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import say, tell
-from rsltrace.words.table import table
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.table import table
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.middleware.overview import Link
     from rsltrace.run.checking import Checked
+    from rsltrace.simulation.middleware.overview import Link
 
 
 @click.command(cls=RosArgsCommand)

@@ -11,8 +11,8 @@ import click
 
 from rsltrace.cli.job_source import set_option
 from rsltrace.cli.replay import agree, code_lines
-from rsltrace.model.printable import printable
 from rsltrace.terminal import tell
+from rsltrace.trace.model.printable import printable
 
 
 @click.command()

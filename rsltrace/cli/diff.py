@@ -207,7 +207,7 @@ def _which(a: str, others: Sequence[str], again: str) -> int:
     """Say which of two traces a third one repeats."""
     from rsltrace.diff.file_kind import is_recording
     from rsltrace.diff.traces.reproduction import reproduction
-    from rsltrace.words.phrases import as_sentence
+    from rsltrace.trace.words.phrases import as_sentence
 
     if len(others) != 1 or any(map(is_recording, (a, *others, again))):
         raise click.UsageError("--again needs two traces to compare a third one with")

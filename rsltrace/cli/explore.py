@@ -20,14 +20,14 @@ from rsltrace.cli.job_source import (
 from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import terminated
 from rsltrace.errors import ExploreError
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 
 if TYPE_CHECKING:
-    from rsltrace.explore.search import Budget, Pool, Search
-    from rsltrace.explore.small.causes import SmallRun
-    from rsltrace.explore.trial import JobSource, TrialResult
     from rsltrace.job import Job
+    from rsltrace.search.explore.search import Budget, Pool, Search
+    from rsltrace.search.explore.small.causes import SmallRun
+    from rsltrace.search.explore.trial import JobSource, TrialResult
 
 STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 _FORMAT = 1
@@ -36,9 +36,9 @@ _INTERRUPTED = 130
 
 def _budget(context: click.Context, option: click.Parameter, text: str) -> Budget:
     """Read ``1000`` (trials) or ``10min`` (of real time)."""
-    from rsltrace.explore.search import Budget
     from rsltrace.job.values.times import parse_time
-    from rsltrace.model.stamp import NS_PER_S
+    from rsltrace.search.explore.search import Budget
+    from rsltrace.trace.model.stamp import NS_PER_S
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:
@@ -186,11 +186,11 @@ def explore(
     """
     from rsltrace.checks.evaluate import check_texts
     from rsltrace.checks.metrics import check_metrics
-    from rsltrace.explore.search import Search
-    from rsltrace.explore.strategies.named import strategy_named
-    from rsltrace.explore.table import Table
-    from rsltrace.explore.trial import JobSource
-    from rsltrace.explore.vary import check_vary
+    from rsltrace.search.explore.search import Search
+    from rsltrace.search.explore.strategies.named import strategy_named
+    from rsltrace.search.explore.table import Table
+    from rsltrace.search.explore.trial import JobSource
+    from rsltrace.search.explore.vary import check_vary
 
     if resume and force:
         raise click.UsageError("--resume goes on with a search, --force replaces it: give one")
@@ -242,14 +242,14 @@ def _pool(
     source: JobSource, job: Job, jobs: int | None, cluster: str | None
 ) -> AbstractContextManager[Pool]:
     """Return where the trials are run: here, or on a cluster."""
-    from rsltrace.explore.workers import Workers, default_jobs
+    from rsltrace.search.explore.workers import Workers, default_jobs
 
     if cluster is None:
         return Workers(source, jobs or default_jobs(), pins=job.guard.pins)
     if jobs is not None:
         raise click.UsageError("--jobs is for this machine: a cluster has as many as it has")
     try:
-        from rsltrace.explore.cluster import Cluster
+        from rsltrace.search.explore.cluster import Cluster
     except ImportError:
         raise ExploreError(
             "a cluster needs dask.distributed: pip install 'rsltrace[explore]'"
@@ -312,7 +312,7 @@ class _End:
 
     def make_small(self, job: Job, timeout_s: float | None, *, quiet: bool) -> None:
         """Make one run of each cause small."""
-        from rsltrace.explore.small.causes import make_small
+        from rsltrace.search.explore.small.causes import make_small
 
         def on_begin(cause: str) -> None:
             if not quiet:
@@ -339,11 +339,11 @@ class _End:
     def report(self, job: Job) -> None:
         """Write the page and the table, and print what came of the search."""
         from rsltrace.cli.output.search_text import search_lines
-        from rsltrace.explore.report.exploration import Exploration, Reduced
-        from rsltrace.explore.report.formats import github_text, json_text, junit_text
-        from rsltrace.explore.report.page import write_page
-        from rsltrace.explore.report.parquet import write_parquet
-        from rsltrace.explore.table import PAGE, PARQUET, rows
+        from rsltrace.search.explore.report.exploration import Exploration, Reduced
+        from rsltrace.search.explore.report.formats import github_text, json_text, junit_text
+        from rsltrace.search.explore.report.page import write_page
+        from rsltrace.search.explore.report.parquet import write_parquet
+        from rsltrace.search.explore.table import PAGE, PARQUET, rows
 
         source, search = self._source, self._search
         explored = Exploration(

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import tell
+from rsltrace.trace.model.stamp import format_seconds
 
 EXIT_CUT = 1
 
@@ -36,9 +36,9 @@ def export(
     The exit status is 0 if the bag is all there is, 1 if TRACE is cut (its run was killed): the bag
     then ends where the trace does.
     """
-    from rsltrace.bag.export import export_bag
     from rsltrace.cli.output.progress import working
     from rsltrace.trace.reader import Trace
+    from rsltrace.trace.recordings.export import export_bag
 
     with Trace.open(trace) as opened:
         whole, events, end = opened.complete, opened.event_count, format_seconds(opened.end_ns)

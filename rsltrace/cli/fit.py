@@ -19,14 +19,14 @@ from rsltrace.cli.output.fit_text import as_json, checked_text, text
 from rsltrace.cli.output.picture import check_picture, save_picture
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import OutputError, RunError, TraceError
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.fit.checked import Chains
-    from rsltrace.fit.parts import Fit
     from rsltrace.job import Job
+    from rsltrace.native.fit.checked import Chains
+    from rsltrace.native.fit.parts import Fit
 
 
 @click.command()
@@ -93,10 +93,10 @@ def fit(
     of the simulated one, their ratio with its 95 % interval, and a two-sample test; beside them the
     same of the first run, since the robot is not like itself every time.
     """
-    from rsltrace.fit.checked import check
-    from rsltrace.fit.measured import measured
-    from rsltrace.fit.parts import fit as fitted_to
-    from rsltrace.fit.parts import notes
+    from rsltrace.native.fit.checked import check
+    from rsltrace.native.fit.measured import measured
+    from rsltrace.native.fit.parts import fit as fitted_to
+    from rsltrace.native.fit.parts import notes
 
     if simulated is not None and second is None:
         raise click.UsageError("--simulated goes with --check")
@@ -120,7 +120,7 @@ def fit(
         if output is not None:
             _write(output, found, job, path, first, settings)
         if plot is not None:
-            from rsltrace.fit.picture import picture_of
+            from rsltrace.native.fit.picture import picture_of
 
             save_picture(picture_of(found, first.name), plot)
         checked = None
@@ -196,7 +196,7 @@ def _write(
     settings: Mapping[str, Any],
 ) -> None:
     """Write the fitted job, and see that it can be read."""
-    from rsltrace.fit.parts import fitted_job, with_files
+    from rsltrace.native.fit.parts import fitted_job, with_files
 
     if output.exists() and job_file.exists() and output.samefile(job_file):
         raise OutputError(f"{output} is the job itself, which the fitted one extends: name another")
@@ -253,8 +253,8 @@ def _chains(second: Trace) -> Chains:
     :raises SetupError: if what compares them is missing.
     :raises TraceError: if there are none.
     """
-    from rsltrace.fit.checked import chains_of
-    from rsltrace.fit.comparison import need_scipy
+    from rsltrace.native.fit.checked import chains_of
+    from rsltrace.native.fit.comparison import need_scipy
 
     need_scipy()
     return chains_of(second)

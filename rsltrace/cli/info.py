@@ -11,22 +11,22 @@ from typing import Any, TypeAlias
 import click
 
 from rsltrace.cli.output.native_text import NO_DIGEST, native_json, native_lines, real_time
-from rsltrace.model.built_in import is_built_in
-from rsltrace.model.drop import drops_of
-from rsltrace.model.endless_wait import waits_of
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
+from rsltrace.trace.model.built_in import is_built_in
+from rsltrace.trace.model.drop import drops_of
+from rsltrace.trace.model.endless_wait import waits_of
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import entity_places, places_text
-from rsltrace.words.kinds import kind_label
-from rsltrace.words.table import table
+from rsltrace.trace.words.code import entity_places, places_text
+from rsltrace.trace.words.kinds import kind_label
+from rsltrace.trace.words.table import table
 
 _Kinds: TypeAlias = type[EventKind] | type[OutputKind]
 _VALUE_MAX = 100

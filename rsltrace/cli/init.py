@@ -12,8 +12,8 @@ import click
 from rsltrace.cli.output.text_file import undone, write_text
 from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
-from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import tell
+from rsltrace.trace.model.stamp import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.job.reading.node_source import Found
@@ -181,8 +181,8 @@ def _yaml(value: Any) -> str:
 
 
 def _bag_text(source: str, folder: Path) -> str:
-    from rsltrace.bag import open_bag
     from rsltrace.run.plans.bags import never_plays
+    from rsltrace.trace.recordings import open_bag
 
     try:
         with open_bag(source, recover=True, skip=never_plays) as bag:

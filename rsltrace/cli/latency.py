@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rsltrace.checks.latency.measure import measure_latencies
 from rsltrace.cli.output.latency_text import (
     as_csv,
     as_json,
@@ -19,13 +20,12 @@ from rsltrace.cli.output.latency_text import (
     text,
 )
 from rsltrace.errors import TraceError
-from rsltrace.latency.measure import measure_latencies
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.latency.measure import Latencies
+    from rsltrace.checks.latency.measure import Latencies
 
 
 @click.command()

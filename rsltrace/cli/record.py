@@ -18,16 +18,16 @@ from rsltrace.cli.output.exit_status import reopen_standard_streams, status_with
 from rsltrace.cli.output.watching import interruptible, progress
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
-from rsltrace.model.finding import READ_BY, Source
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
-from rsltrace.words.silent_topics import silent_topics, without_server
+from rsltrace.trace.model.finding import READ_BY, Source
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.words.silent_topics import silent_topics, without_server
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked
     from rsltrace.job import Job
-    from rsltrace.loop.stop import Stop
     from rsltrace.run import RunResult
+    from rsltrace.simulation.loop.stop import Stop
 
 
 @click.command(cls=RosArgsCommand)
@@ -209,7 +209,7 @@ def _check_options(
 def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
     """Raise what would be wrong after the run: a bag that is there already, a check's text."""
     if bag is not None:
-        from rsltrace.bag.export import check_bag_folder
+        from rsltrace.trace.recordings.export import check_bag_folder
 
         check_bag_folder(bag, force=force)
     if job.checks or job.metrics:
@@ -299,7 +299,7 @@ def _record_native(
 
 
 def _export(trace: Path, bag: Path, *, force: bool) -> None:
-    from rsltrace.bag.export import export_bag
+    from rsltrace.trace.recordings.export import export_bag
 
     count = export_bag(trace, bag, force=force)
     tell(f"wrote {bag}: {count} messages")

@@ -23,8 +23,8 @@ from rsltrace.cli.replay_node import (
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.guard.pin import unpin
-from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.printable import printable
 
 if TYPE_CHECKING:
     from rsltrace.replay.edits import Edit

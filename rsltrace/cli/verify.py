@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.campaign.perturb import KINDS
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
 from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.search.perturb import KINDS
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.campaign.perturb import Recorded, Surroundings
-    from rsltrace.campaign.verify import Verified
+    from rsltrace.search.perturb import Recorded, Surroundings
+    from rsltrace.search.verify import Verified
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,7 @@ def _verify(
     *,
     as_json: bool,
 ) -> int:
-    from rsltrace.campaign.verify import Verification
+    from rsltrace.search.verify import Verification
 
     def on_run(recorded: Recorded) -> None:
         if sys.stderr.isatty():
@@ -223,7 +223,7 @@ def _one_run(
     only: str | None,
     output: Path | None,
 ) -> int:
-    from rsltrace.campaign.perturb import record_in, surroundings
+    from rsltrace.search.perturb import record_in, surroundings
 
     around = surroundings(number, perturbations)
     if only is not None:

@@ -7,9 +7,9 @@ from typing import Any
 from rsltrace.conditions.condition import Armed, error_text, shown
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, Moment
-from rsltrace.model.event import EventKind
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.times import TimeInRun
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.times import TimeInRun
 
 _NOT_THERE = "(not there)"
 

@@ -15,11 +15,11 @@ from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.topic_fields import plain, topic_of
 from rsltrace.conditions.view import Sent
 from rsltrace.errors import ConditionError, TraceError
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
-from rsltrace.words.logs import log_record
-from rsltrace.words.matching import is_named
+from rsltrace.trace.words.logs import log_record
+from rsltrace.trace.words.matching import is_named
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 

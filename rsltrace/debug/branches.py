@@ -13,10 +13,10 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from rsltrace.campaign.processes import Done, Processes, rsltrace_command
+from rsltrace.child_processes import Done, Processes, rsltrace_command
 from rsltrace.errors import DebugError, EditError, OutputError
-from rsltrace.model.regular_file import in_the_way
 from rsltrace.replay.edits import parse_edit
+from rsltrace.trace.model.regular_file import in_the_way
 
 _ERROR = "rsltrace: error: "
 _HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")

@@ -23,9 +23,9 @@ from typing import Any
 
 from rsltrace import errors
 from rsltrace.debug.branches import Branches
-from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.positions import Breakpoint, Position, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.line_protocol import Lines, Message
 
 _END_S = 10.0
 

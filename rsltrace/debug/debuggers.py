@@ -8,9 +8,9 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
-from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.source import code_of
 from rsltrace.debug.view import View
+from rsltrace.line_protocol import Lines, Message
 
 Calls = Callable[..., None]
 """Takes a callback and its arguments."""

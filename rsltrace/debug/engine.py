@@ -23,15 +23,15 @@ from rsltrace.debug import inspection
 from rsltrace.debug.debuggers import debugger
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described
-from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.view import NO_CALL, Call, View, call_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage
 from rsltrace.guard.redirect import copy_of
-from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
-from rsltrace.model.event import EventKind
+from rsltrace.line_protocol import Lines, Message
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.trace.format import EVENT_REST
+from rsltrace.trace.model.event import EventKind
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session

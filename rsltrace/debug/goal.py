@@ -9,8 +9,8 @@ from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.lines import Message
 from rsltrace.debug.view import View
+from rsltrace.line_protocol import Message
 
 NOWHERE = 1 << 62
 

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from typing import Protocol
 
 from rsltrace.guard.redirect import copy_of
-from rsltrace.loop.stop import Stop
 from rsltrace.replay.verification import limit_of
+from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.reader import Trace
 

@@ -14,8 +14,8 @@ from rsltrace.conditions.names import nodes_called, short_name
 from rsltrace.debug.python_expression import PythonError, python_value
 from rsltrace.debug.source import source
 from rsltrace.errors import DebugError, did_you_mean
-from rsltrace.middleware.overview import overview
-from rsltrace.middleware.receiver import Receiver
+from rsltrace.simulation.middleware.overview import overview
+from rsltrace.simulation.middleware.receiver import Receiver
 
 if TYPE_CHECKING:
     from rsltrace.conditions.names import Names
@@ -131,7 +131,7 @@ def attributes(run: Standing, name: str) -> dict[str, str]:
 
     Of objects that Python shows by their address only there are the attributes: ``_ekf.P``.
     """
-    from rsltrace.doors.rclpy.handles.node_state import own_attributes
+    from rsltrace.adapters.rclpy.handles.node_state import own_attributes
 
     own = own_attributes(node_named(run, name))
     found = islice(_within(own, "", _DEPTH_MAX), _ATTRIBUTES_MAX)

@@ -13,13 +13,13 @@ from itertools import islice
 from typing import Any
 
 from rsltrace.debug.history import History
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
-from rsltrace.model.finding import Finding
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
+from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.reader import RUN
+from rsltrace.trace.words.outputs import counted, output_text
 from rsltrace.trace.writer import TraceWriter
-from rsltrace.words.outputs import counted, output_text
 
 Payload = tuple[int, bytes]
 """The channel of a message, and its canonical CDR."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.stamp import format_seconds
 
 
 @dataclass(frozen=True, slots=True)

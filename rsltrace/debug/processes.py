@@ -13,8 +13,8 @@ import time
 from contextlib import suppress
 from typing import Any
 
-from rsltrace.debug.lines import Lines
 from rsltrace.errors import DebugError
+from rsltrace.line_protocol import Lines
 
 _PR_SET_CHILD_SUBREAPER = 36
 _MAIN = "rsltrace.debug.simulation"

@@ -15,10 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.debug.lines import Lines
 from rsltrace.errors import ReplayError, RsltraceError
 from rsltrace.forking import die_with_parent, end_process
 from rsltrace.guard.pin import pin, unpin
+from rsltrace.line_protocol import Lines
 
 if TYPE_CHECKING:
     from rsltrace.debug.history import History
@@ -126,7 +126,7 @@ def _serve(
 
 def _middleware_threads() -> frozenset[int]:
     """Return the threads that DDS starts when it is loaded, and nobody uses in a simulation."""
-    from rsltrace.doors.rclpy.boundary.installation import check_free
+    from rsltrace.adapters.rclpy.boundary.installation import check_free
     from rsltrace.forking import other_threads
 
     check_free()

@@ -10,8 +10,8 @@ from functools import cache
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.model.event import EventFlag, EventKind
 from rsltrace.trace.format import EVENT_REST
+from rsltrace.trace.model.event import EventFlag, EventKind
 
 if TYPE_CHECKING:
     from rsltrace.debug.ledger import Ledger

@@ -15,9 +15,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.tree import ClientGone, Over, Tree
 from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.line_protocol import Lines, Message
 
 
 class Supervisor:
@@ -127,7 +127,7 @@ class Supervisor:
         text = str(place).strip()
         if text.isascii() and text.isdigit():
             return {"until": int(text)}
-        from rsltrace.words.times import parse_time_in_run
+        from rsltrace.trace.words.times import parse_time_in_run
 
         try:
             return {"until_ns": parse_time_in_run(text).stamp_ns(self.tree.start_ns)}

@@ -9,9 +9,9 @@ from collections import deque
 from typing import Any
 
 from rsltrace.debug.checkpoints import COUNT_MAX, Checkpoint, Checkpoints
-from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.processes import Family, Lost, SimProcess, memory_bytes
 from rsltrace.errors import DebugError
+from rsltrace.line_protocol import Lines, Message
 
 _INTERVAL_S = 0.05
 _APART_LIMIT_S = 20.0

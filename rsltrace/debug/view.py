@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 from rsltrace.conditions.view import Sent
-from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
-from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.doors.rclpy.wire.interfaces import get_message_class
-from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.words.logs import parse_log
+from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.words.logs import parse_log
 
 if TYPE_CHECKING:
     from rsltrace.debug.ledger import Ledger, Payload

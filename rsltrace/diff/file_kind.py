@@ -11,9 +11,9 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from rsltrace.mcap.records import MAGIC, Damaged, Fields, parse_header
-from rsltrace.model.regular_file import not_regular
 from rsltrace.trace.format import METADATA_FORMAT, begins_a_trace
+from rsltrace.trace.mcap.records import MAGIC, Damaged, Fields, parse_header
+from rsltrace.trace.model.regular_file import not_regular
 
 _HEAD_BYTES = 4096
 _SQLITE_MAGIC = b"SQLite format 3\0"

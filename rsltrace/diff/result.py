@@ -16,7 +16,7 @@ from rsltrace.diff.facts.evidence import CallDifference, CauseStep, EventView, R
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
 
 if TYPE_CHECKING:
-    from rsltrace.words.entities import EntityKey
+    from rsltrace.trace.words.entities import EntityKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,9 +202,9 @@ class Diff:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it."""
-        from rsltrace.model.html import Sheet
-        from rsltrace.model.stamp import format_seconds
-        from rsltrace.words.phrases import as_sentence
+        from rsltrace.trace.model.html import Sheet
+        from rsltrace.trace.model.stamp import format_seconds
+        from rsltrace.trace.words.phrases import as_sentence
 
         sheet = Sheet(as_sentence(self.sentence))
         sheet.line(f"{self.verdict.value}; the first {self.agreeing} events agree")

@@ -17,7 +17,7 @@ from weakref import ReferenceType, WeakSet
 
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _ADDRESS = re.compile(r"\S* at 0x(?!52[0-9a-f]{10}\b)[0-9a-f]{6,}")
 """An address in a text; not what the guard shows in place of one."""

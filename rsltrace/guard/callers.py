@@ -22,8 +22,8 @@ USER, OURS, STANDARD, _PACKAGE, _LIBRARY, _IMPORT = range(6)
 """Whose a file is: the user's (a ``_PACKAGE`` is installed), Python's, a library's, rclpy's or
 ours, or a part of importing."""
 
-_DOOR = os.path.join(_HERE, "doors", "rclpy")
-_CALLS_BACK = os.path.join(_HERE, "middleware", "events", "dispatcher.py")
+_DOOR = os.path.join(_HERE, "adapters", "rclpy")
+_CALLS_BACK = os.path.join(_HERE, "simulation", "middleware", "events", "dispatcher.py")
 """The one of our files that calls callbacks; rclpy's own do, too."""
 _THREADS = os.path.join(_DOOR, "stacks", "threads.py")
 _STANDS_IN = (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from rsltrace.model.finding import Policy
+from rsltrace.trace.model.finding import Policy
 
 
 class Context(Protocol):

@@ -13,7 +13,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from rsltrace.guard.redirect import copy_of
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 _Identity = tuple[int, int]

@@ -37,7 +37,7 @@ from rsltrace.guard.random_streams import RandomStreams
 from rsltrace.guard.real_time import RealTimePace
 from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
-from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
+from rsltrace.trace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
 _guards: WeakSet[Guard] = WeakSet()

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import GuardError
-from rsltrace.model.finding import Finding, Mode
+from rsltrace.trace.model.finding import Finding, Mode
 
 _ERRORS = {
     error.__name__: error

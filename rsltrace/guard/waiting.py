@@ -20,8 +20,8 @@ from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.real_time import STEP_NS
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
-from rsltrace.model.finding import Mode, Source
-from rsltrace.model.stamp import patience_ns
+from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.stamp import patience_ns
 
 NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""

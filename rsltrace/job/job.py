@@ -51,7 +51,7 @@ class Job(JobFields):
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it."""
-        from rsltrace.model.html import Sheet
+        from rsltrace.trace.model.html import Sheet
 
         sheet = Sheet(f"job {self.source_name}")
         sheet.table(

@@ -14,13 +14,13 @@ from functools import wraps
 from itertools import count
 from typing import Any
 
-from rsltrace.doors.rclpy.handles.lifecycle import transition_event
-from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.model.event import OutputKind
+from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
+from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.native.ledger import Ledger, Logged, Sent, Span, Taken, now_ns
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
 from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import OutputKind
 
 _MESSAGE = int(OutputKind.MESSAGE)
 _REQUEST = int(OutputKind.REQUEST)

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections import defaultdict, deque
 
-from rsltrace.model.event import NO_EVENT
 from rsltrace.native.boundary import channel_of
 from rsltrace.native.ledger import Sent, Taken
+from rsltrace.trace.model.event import NO_EVENT
 
 KEPT = 200_000
 """Messages sent that are remembered: what comes later than after so many has no known cause."""

@@ -7,13 +7,13 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rsltrace.doors.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.errors import JobError
-from rsltrace.model.event import EventKind
 from rsltrace.native.executors import failure_of
 from rsltrace.native.ledger import Ledger
 from rsltrace.native.nodes import Nodes
 from rsltrace.native.things import Things
+from rsltrace.trace.model.event import EventKind
 
 
 class RunningEntry(threading.Thread):

@@ -9,13 +9,13 @@ from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
 from typing import Any
 
-from rsltrace.middleware.events.failure import text_of, user_traceback
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.native.boundary import Boundary
 from rsltrace.native.ledger import Failed, Ledger, Scheduled, Span, Taken
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
+from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 
 EXECUTORS = {"single": "SingleThreadedExecutor", "multi": "MultiThreadedExecutor"}
 _KINDS = {

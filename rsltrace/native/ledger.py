@@ -12,9 +12,9 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import EventFlag, EventKind
 from rsltrace.native.things import Thing
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import EventFlag, EventKind
 
 now_ns = time.monotonic_ns
 _SUSPENDED = int(EventFlag.SUSPENDED)

@@ -8,17 +8,17 @@ from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any
 
-from rsltrace.doors.rclpy.arguments import RosArguments
-from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.doors.rclpy.handles.logs import QOS_ROSOUT
-from rsltrace.doors.rclpy.handles.qos_profiles import qos_of
-from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.doors.rclpy.wire.interfaces import message_type, service_type
-from rsltrace.middleware.entity import callback_name
-from rsltrace.model.built_in import NODE_SERVICES
-from rsltrace.model.entity import EntityKind
+from rsltrace.adapters.rclpy.arguments import RosArguments
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
+from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.wire.interfaces import message_type, service_type
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
+from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.trace.model.built_in import NODE_SERVICES
+from rsltrace.trace.model.entity import EntityKind
 
 _ROSOUT = "/rosout"
 

@@ -12,16 +12,16 @@ from typing import Protocol
 
 import numpy as np
 
-from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_EVENT, OutputKind
-from rsltrace.model.stamp import NS_PER_S
+from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.native.causes import Causes
 from rsltrace.native.ledger import Failed, Logged, Scheduled, Sent, Span
 from rsltrace.native.things import Thing
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TIMING
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.model.stamp import NS_PER_S
 from rsltrace.trace.native import CUT_AFTER_NS
 from rsltrace.trace.recorder import Recorder
 

@@ -16,10 +16,10 @@ from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any
 
-from rsltrace.loop.policy import Candidate, PriorityRule
-from rsltrace.model.entity import EntityKind
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
+from rsltrace.simulation.loop.policy import Candidate, PriorityRule
+from rsltrace.trace.model.entity import EntityKind
 
 LEVEL_MAX, LEVEL_MIN = 89, 10
 """Real-time priorities of executors by rate: 99 and the like are the kernel's own."""

@@ -11,13 +11,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rsltrace.doors.rclpy.exit_code_topic import watch_exit_code
+from rsltrace.adapters.rclpy.exit_code_topic import watch_exit_code
 from rsltrace.errors import RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
-from rsltrace.loop.policy import PriorityRule
-from rsltrace.loop.stop import Progress, Stop
-from rsltrace.mcap.sink import unfinished
-from rsltrace.middleware.events.failure import text_of
 from rsltrace.native import support
 from rsltrace.native.pen import Clocks, Pen, Spans
 from rsltrace.native.priorities import order, real_time_class
@@ -25,7 +21,11 @@ from rsltrace.run.inputs import check_output
 from rsltrace.run.plans.stopping import end_ns_of, stop_conditions
 from rsltrace.run.process import Observer
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.simulation.loop.policy import PriorityRule
+from rsltrace.simulation.loop.stop import Progress, Stop
+from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_NATIVE
+from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 

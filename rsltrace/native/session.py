@@ -8,11 +8,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rsltrace.doors.rclpy.boundary.installation import boundary, check_free
+from rsltrace.adapters.rclpy.boundary.installation import boundary, check_free
 from rsltrace.errors import JobError, NodeError, RunError
 from rsltrace.job import Job
-from rsltrace.loop.stop import Stop
-from rsltrace.middleware.events.failure import text_of, user_traceback
 from rsltrace.native import support
 from rsltrace.native.apart.run import InProcesses
 from rsltrace.native.boundary import Boundary
@@ -34,6 +32,8 @@ from rsltrace.native.things import Things
 from rsltrace.run.launch_files import without_launch_files
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import Observer, kept_process, search_path
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
 
 _CONSTRUCTED_WITHIN_S = 5.0
 """How long others wait for a constructor, which may itself wait for one of them."""

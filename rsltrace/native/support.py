@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
-from rsltrace.loop.policy import PriorityRule
+from rsltrace.simulation.loop.policy import PriorityRule
 
 _STEERING = (
     "start_ns",

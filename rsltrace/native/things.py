@@ -12,10 +12,10 @@ from itertools import count
 from typing import Any
 from weakref import WeakKeyDictionary
 
-from rsltrace.middleware.entity import callback_name
-from rsltrace.middleware.interface import MessageType
-from rsltrace.middleware.source_position import source_of
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.simulation.middleware.source_position import source_of
+from rsltrace.trace.model.entity import Entity, EntityKind
 
 
 @dataclass(slots=True)

@@ -11,12 +11,12 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from typing import Any
 
+from rsltrace.adapters.workspace.installs import module_folders
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.values.target import target_text
-from rsltrace.model.module_search import find_module
 from rsltrace.run.plans.executables import source_of
-from rsltrace.workspace.installs import module_folders
+from rsltrace.trace.model.module_search import find_module
 
 _OF_FILES = "file:"
 

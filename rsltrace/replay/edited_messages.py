@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.errors import EditError, did_you_mean
-from rsltrace.middleware.events.observer import EventCall
-from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import Edit, SetMessage, change, path_text
+from rsltrace.simulation.middleware.events.observer import EventCall
 from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import EventKind
 
 
 def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
@@ -16,8 +16,8 @@ def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
 
     :raises EditError: it has no such field, or that cannot have such a value.
     """
-    from rsltrace.doors.rclpy.wire.codec import codec_for
-    from rsltrace.doors.rclpy.wire.interfaces import class_of
+    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.wire.interfaces import class_of
 
     return _recoded(codec_for(class_of(endpoint)), edit, data)
 
@@ -27,7 +27,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 
     :raises EditError: it receives none, or that cannot be edited so.
     """
-    from rsltrace.doors.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.wire.codec import codec_for
 
     handle, kind, args = call.handle, call.kind, call.args
     is_coroutine = hasattr(handle, "task")
@@ -53,7 +53,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 def arrived_for_action(handle: Any, kind: int) -> Any:
     """Return the part of an action of which a coroutine is going to take what has arrived: a goal,
     a response, feedback. None if it is going to do something else."""
-    from rsltrace.doors.rclpy.actions.parts import Part
+    from rsltrace.adapters.rclpy.actions.parts import Part
 
     parts = (one for one in _begun_with(handle, kind) if isinstance(one, Part) and one.queue)
     return next(parts, None) if kind == EventKind.ACTION else None
@@ -68,8 +68,8 @@ def _begun_with(run: Any, kind: int) -> list[Any]:
 
 def _change_arrival(part: Any, edit: Edit) -> int:
     """Change what has arrived first; return its hash."""
-    from rsltrace.doors.rclpy.actions.parts import GoalClient, GoalService
-    from rsltrace.doors.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.actions.parts import GoalClient, GoalService
+    from rsltrace.adapters.rclpy.wire.codec import codec_for
 
     if isinstance(part, GoalService):
         codec = codec_for(part.srv_type.Request)

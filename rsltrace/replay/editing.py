@@ -14,13 +14,6 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import EditError, did_you_mean
-from rsltrace.loop.loop import Dispatchable, EventLoop
-from rsltrace.loop.stop import Stop
-from rsltrace.middleware.events.dispatcher import Dispatcher
-from rsltrace.middleware.events.event import OutsideEvent
-from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
-from rsltrace.model.event import EventKind
-from rsltrace.model.stamp import format_seconds
 from rsltrace.replay.edited_messages import arrived_for_action, changed_data, receive_edited
 from rsltrace.replay.edits import (
     Defer,
@@ -32,6 +25,13 @@ from rsltrace.replay.edits import (
     SetParameter,
     change,
 )
+from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session

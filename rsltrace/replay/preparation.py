@@ -9,13 +9,13 @@ from pathlib import Path
 
 from rsltrace.errors import ReplayError
 from rsltrace.job import Job
-from rsltrace.model.event import EventKind
 from rsltrace.replay.code import Code, code_of
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
 from rsltrace.replay.job_folder import folder_of, job_in_trace
 from rsltrace.replay.trust import why_not_trusted
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 
@@ -111,7 +111,7 @@ def count_to(trace: Trace, position: Position) -> int:
 
     :raises ReplayError: if it is no position, or before the first event.
     """
-    from rsltrace.words.times import parse_time_in_run
+    from rsltrace.trace.words.times import parse_time_in_run
 
     text = str(position).strip()
     if text.isascii() and text.isdigit():

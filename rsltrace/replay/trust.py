@@ -13,13 +13,13 @@ import json
 from pathlib import Path
 from typing import Any
 
+from rsltrace.adapters.launch import ros_launch
 from rsltrace.errors import JobError
 from rsltrace.job import Job, job_from_text, load_job
-from rsltrace.launch import ros_launch
-from rsltrace.model.finding import Mode
 from rsltrace.replay.edits import edits_of
 from rsltrace.replay.job_folder import job_name, without_bags
 from rsltrace.run.launch_files import without_launch_files
+from rsltrace.trace.model.finding import Mode
 from rsltrace.trace.reader import Trace
 
 _LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from rsltrace.loop.stop import Stop, StopCondition, stop_at
-from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
-from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import edits_of
+from rsltrace.simulation.loop.stop import Stop, StopCondition, stop_at
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.format import REPLAY_DIVERGED
+from rsltrace.trace.model.event import EventKind
 
 if TYPE_CHECKING:
     from rsltrace.run.session import RunResult, Session

@@ -1,7 +1,7 @@
 """Standing still in the middle of a run, from where the runs of other jobs go on.
 
 These differ in nothing but what comes later (``Session.becomes``), so each is what it would have
-been from the beginning. See ``rsltrace.explore.prefix`` for who makes the copies.
+been from the beginning. See ``rsltrace.search.explore.prefix`` for who makes the copies.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from greenlet import getcurrent
 
 from rsltrace.job import Job
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.loop.search_policies import Departures
-from rsltrace.model.stamp import format_seconds
 from rsltrace.run.driver import time_of_step
 from rsltrace.run.session import Session
+from rsltrace.simulation.loop.search_policies import Departures
+from rsltrace.trace.model.stamp import format_seconds
 
 
 def run_up_to(session: Session, time_ns: int) -> bool:

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job
-from rsltrace.loop.stop import Stop
 from rsltrace.run.plans.bags import PLAYER
 from rsltrace.run.plans.executables import source_of
 from rsltrace.run.plans.starts import impossible_starts
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
+from rsltrace.simulation.loop.stop import Stop
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.overview import Overview
+    from rsltrace.simulation.middleware.overview import Overview
 
 
 _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_events"))
@@ -49,7 +49,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     :raises JobError, SetupError, BagError: the job cannot run.
     :raises RunError: a constructor raised.
     """
-    from rsltrace.middleware.overview import overview
+    from rsltrace.simulation.middleware.overview import overview
 
     notes: list[str] = []
     observer = Observer(note=notes.append)
@@ -84,7 +84,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
 
 def _divisions_by_nothing(job: Job) -> Iterator[str]:
     """Yield where nodes divide by the difference of two ROS times of one callback."""
-    from rsltrace.audit.audit import audit_job
+    from rsltrace.guard.audit.audit import audit_job
 
     if any(clock.advances and clock.node == "*" for clock in job.clocks):
         return

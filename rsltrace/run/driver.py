@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent
 
 from rsltrace.errors import RunError
-from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.stop import quiet_until_ns
 from rsltrace.run.session import Session
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.stop import quiet_until_ns
 
 if TYPE_CHECKING:
-    from rsltrace.doors.driver import Outside
+    from rsltrace.adapters.driver import Outside
 
 _INTERRUPTED = 130
 
@@ -47,7 +47,7 @@ class Driver:
     """
 
     def __init__(self, session: Session) -> None:
-        from rsltrace.doors.driver import Outside
+        from rsltrace.adapters.driver import Outside
 
         self.session = session
         self.loop = session.loop

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rsltrace.middleware.receiver import Receiver
-from rsltrace.model.drop import Drop
+from rsltrace.simulation.middleware.receiver import Receiver
+from rsltrace.trace.model.drop import Drop
 
 _TOLD = 5
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from rsltrace.adapters.launch.expanded import Expanded
 from rsltrace.job import Job
-from rsltrace.launch.expanded import Expanded
 from rsltrace.run.plans.executables import compiled_file, why_not
 from rsltrace.run.process import search_path
 
@@ -16,7 +16,7 @@ def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
     """
     if not job.launch:
         return Expanded(job)
-    from rsltrace.launch.expand import expand
+    from rsltrace.adapters.launch.expand import expand
 
     with search_path(job):
         return expand(job, why_not=why_not, is_process=_is_process, programs=programs)

@@ -16,16 +16,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from rsltrace.doors.rclpy.wire.interface_classes import forget_interfaces
+from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
+from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.guard.callers import is_own
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job
-from rsltrace.loop.stop import Stop
-from rsltrace.mcap.descriptor import Descriptor
-from rsltrace.workspace.imports import unbuilt_packages
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.mcap.descriptor import Descriptor
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.events.dispatcher import Dispatcher
+    from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 
 _PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000

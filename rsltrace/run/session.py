@@ -14,21 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from rsltrace.doors.processes.door import ProcessDoor
+from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
-from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.ordered import OrderedLoop
-from rsltrace.loop.stop import Stop
-from rsltrace.loop.timer_queue import timer_queue
-from rsltrace.mcap.sink import unfinished
-from rsltrace.middleware.events.census import Census
-from rsltrace.middleware.faults import FaultsOfAll
-from rsltrace.model.drop import kept_drops
-from rsltrace.model.endless_wait import EndlessWait, kept_waits
-from rsltrace.model.finding import GuardCount
-from rsltrace.model.printable import shortened
-from rsltrace.model.stamp import format_seconds
 from rsltrace.run.full_queues import drop_notes, drops
 from rsltrace.run.inputs import check_output
 from rsltrace.run.launch_files import without_launch_files
@@ -75,18 +63,30 @@ from rsltrace.run.unused_rules import (
     unused_rules,
 )
 from rsltrace.run.watchdog import Watchdog
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.ordered import OrderedLoop
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.loop.timer_queue import timer_queue
+from rsltrace.simulation.middleware.events.census import Census
+from rsltrace.simulation.middleware.faults import FaultsOfAll
 from rsltrace.trace.format import METADATA_ENVIRONMENT
+from rsltrace.trace.mcap.sink import unfinished
+from rsltrace.trace.model.drop import kept_drops
+from rsltrace.trace.model.endless_wait import EndlessWait, kept_waits
+from rsltrace.trace.model.finding import GuardCount
+from rsltrace.trace.model.printable import shortened
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.chance.network import NetworkPlan
-    from rsltrace.doors.rclpy.entry import Entry
-    from rsltrace.doors.rclpy.faults import NodeFaults
-    from rsltrace.doors.rclpy.world import World
-    from rsltrace.middleware.events.observed_run import ObservedRun
-    from rsltrace.middleware.events.recorded_run import RecordedRun
+    from rsltrace.adapters.rclpy.entry import Entry
+    from rsltrace.adapters.rclpy.faults import NodeFaults
+    from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
+    from rsltrace.simulation.chance.network import NetworkPlan
+    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
+    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -221,8 +221,8 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
-        from rsltrace.doors.rclpy.boundary.installation import check_free
-        from rsltrace.doors.rclpy.world import World  # keeps functions that the guard redirects
+        from rsltrace.adapters.rclpy.boundary.installation import check_free
+        from rsltrace.adapters.rclpy.world import World  # keeps functions that the guard redirects
 
         check_free()
         expanded = without_launch_files(self.job)
@@ -386,7 +386,7 @@ class Session:
     def begin(self) -> None:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
         if self.job.stop.topic is not None:
-            from rsltrace.doors.rclpy.exit_code_topic import watch_exit_code
+            from rsltrace.adapters.rclpy.exit_code_topic import watch_exit_code
 
             watch = watch_exit_code(
                 self.loop,
@@ -473,7 +473,7 @@ class Session:
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
         """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
-        from rsltrace.doors.rclpy.parameters import parameters_of
+        from rsltrace.adapters.rclpy.parameters import parameters_of
 
         domain = self.world.domain
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None

@@ -12,14 +12,14 @@ from rsltrace.errors import DeadlockError, RunError, did_you_mean
 from rsltrace.job import FaultSpec, Job, load_job
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time
-from rsltrace.loop.loop import NOTHING_LEFT
-from rsltrace.loop.stop import Stop
-from rsltrace.model.stamp import format_seconds
 from rsltrace.run.driver import Driver
 from rsltrace.run.forked import ForkedRun, ForkResult
 from rsltrace.run.session import RunResult, Session
 from rsltrace.run.tap import Tap
-from rsltrace.words.times import parse_time_in_run
+from rsltrace.simulation.loop.loop import NOTHING_LEFT
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.times import parse_time_in_run
 
 T = TypeVar("T")
 Time = str | int | float
@@ -369,8 +369,8 @@ class Simulation:
             taps.remove(tap)
 
     def _watcher(self, taps: list[Tap]) -> Callable[[Any, bytes], None]:
-        from rsltrace.doors.rclpy.wire.codec import codec_for
-        from rsltrace.doors.rclpy.wire.interfaces import class_of
+        from rsltrace.adapters.rclpy.wire.codec import codec_for
+        from rsltrace.adapters.rclpy.wire.interfaces import class_of
 
         driver = self._driver
 

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from rsltrace.doors.rclpy.arguments import RosArguments
+from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.events.census import Asker, Census
 from rsltrace.run.plans.entries import entry_keys
+from rsltrace.simulation.middleware.events.census import Asker, Census
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""

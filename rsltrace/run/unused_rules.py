@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 
-from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
-from rsltrace.doors.rclpy.arguments import RosArguments
-from rsltrace.doors.rclpy.parameters import Parameters
+from rsltrace.adapters.rclpy.arguments import RosArguments
+from rsltrace.adapters.rclpy.parameters import Parameters
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.events.census import Census
-from rsltrace.model.built_in import NODE_SERVICES
-from rsltrace.model.stamp import format_duration
 from rsltrace.run.plans.entries import entry_keys
 from rsltrace.run.unused_remappings import has_remappings, unused_remappings
+from rsltrace.simulation.chance.network import QUIET_TOPICS, NetworkPlan
+from rsltrace.simulation.middleware.events.census import Census
+from rsltrace.trace.model.built_in import NODE_SERVICES
+from rsltrace.trace.model.stamp import format_duration
 
 
 def has_rules(job: Job) -> bool:

@@ -21,12 +21,12 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from rsltrace.guard.callers import in_import, is_user_file
-from rsltrace.middleware.events.dispatcher import Dispatcher
-from rsltrace.model.stamp import format_seconds
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.terminal import tell
+from rsltrace.trace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.domain import Domain
+    from rsltrace.simulation.middleware.domain import Domain
 
 LOOK_EVERY_S = 2.0
 _LOOKS_BEFORE_NOTE = 5
@@ -137,7 +137,7 @@ def _is_execute(frame: FrameType) -> bool:
 
 def _process_asked(frames: Iterable[FrameType]) -> str:
     """Name the process that the run waits for; "" if it waits for none."""
-    door = sys.modules.get("rsltrace.doors.processes.process")  # not loaded: there is none
+    door = sys.modules.get("rsltrace.adapters.processes.process")  # not loaded: there is none
     if door is None:
         return ""
     asks = door.Process._converse.__code__

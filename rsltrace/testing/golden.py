@@ -10,7 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
 
 from rsltrace.errors import OutputError, RsltraceError, TraceError
-from rsltrace.model.regular_file import in_the_way
+from rsltrace.trace.model.regular_file import in_the_way
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions

@@ -10,10 +10,10 @@ import json
 import struct
 
 from rsltrace.errors import TraceError
-from rsltrace.model.code_line import CodeLine
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.finding import Finding, Mode, Source
 from rsltrace.trace.format import CDR_HEADER
+from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.finding import Finding, Mode, Source
 
 _ENTITY_HEAD = struct.Struct("<IIB")
 _DETAIL_HEAD = struct.Struct("<QI")

@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from rsltrace.model.entity import Entity
 from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_HASHED
+from rsltrace.trace.model.entity import Entity
 
 hash64 = xxhash.xxh3_64_intdigest
 """``hash64(data: bytes, seed: int = 0) -> int``: XXH3-64 as an unsigned integer. The library's

@@ -11,13 +11,13 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.records import MAGIC, Damaged, parse_channel, parse_schema
-from rsltrace.mcap.source import ByteSource
-from rsltrace.mcap.summary import Summary, check_data
-from rsltrace.mcap.walk import read_body, walk_records
 from rsltrace.trace.chain import hash64, verify_chain
 from rsltrace.trace.format import OUTPUT_DTYPE, OUTPUT_HASHED
 from rsltrace.trace.index import TraceIndex
+from rsltrace.trace.mcap.records import MAGIC, Damaged, parse_channel, parse_schema
+from rsltrace.trace.mcap.source import ByteSource
+from rsltrace.trace.mcap.summary import Summary, check_data
+from rsltrace.trace.mcap.walk import read_body, walk_records
 from rsltrace.trace.pieces import damaged
 from rsltrace.trace.segments import SegmentReader
 

@@ -11,9 +11,6 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.mcap.chunk_body import ChunkBody, rows_chunk
-from rsltrace.mcap.records import MESSAGE, RECORD_HEAD
-from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.format import (
     CDR_HEADER,
     EVENT_DTYPE,
@@ -23,6 +20,9 @@ from rsltrace.trace.format import (
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
+from rsltrace.trace.mcap.chunk_body import ChunkBody, rows_chunk
+from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD
+from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 
 _SEQUENCE_MASK = 2**32 - 1
 _CHAINED_DTYPE = np.dtype([("chain_hash", "<u8"), ("rest", f"V{EVENT_REST_DTYPE.itemsize}")])

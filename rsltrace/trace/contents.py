@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_ROSOUT
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.reader import Trace
 
 _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)

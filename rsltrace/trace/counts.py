@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.model.event import OutputKind
-from rsltrace.model.stamp import NS_PER_S
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.stamp import NS_PER_S
 from rsltrace.trace.reader import Trace
 
 _ENTITY = int(OutputKind.ENTITY)

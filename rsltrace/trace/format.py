@@ -10,9 +10,9 @@ import struct
 
 import numpy as np
 
-from rsltrace.mcap.layout import MESSAGE_HEADER_DTYPE
-from rsltrace.mcap.records import Header
-from rsltrace.model.event import SEGMENT_EVENTS
+from rsltrace.trace.mcap.layout import MESSAGE_HEADER_DTYPE
+from rsltrace.trace.mcap.records import Header
+from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"

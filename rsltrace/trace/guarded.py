@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable
 
 from rsltrace.errors import TraceError
-from rsltrace.model.finding import GuardCount, Mode, Source
+from rsltrace.trace.model.finding import GuardCount, Mode, Source
 
 
 def counts_text(counts: Iterable[GuardCount]) -> str:

@@ -13,10 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceFormatError
-from rsltrace.mcap import summary as mcap_summary
-from rsltrace.mcap.records import MAGIC, ChunkIndex, CutOff, Damaged, Header, Schema, Span
-from rsltrace.mcap.source import ByteSource
-from rsltrace.mcap.summary import Summary
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     CHECKSUMS_KEY,
@@ -24,6 +20,10 @@ from rsltrace.trace.format import (
     METADATA_FORMAT,
     SEGMENT_DTYPE,
 )
+from rsltrace.trace.mcap import summary as mcap_summary
+from rsltrace.trace.mcap.records import MAGIC, ChunkIndex, CutOff, Damaged, Header, Schema, Span
+from rsltrace.trace.mcap.source import ByteSource
+from rsltrace.trace.mcap.summary import Summary
 from rsltrace.trace.pieces import damaged, read_attachment, read_metadata
 
 MESSAGE_INDEX_FIXED = 15

@@ -8,7 +8,7 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
-from rsltrace.model.placeholders import NO_FIELD
+from rsltrace.trace.model.placeholders import NO_FIELD
 from rsltrace.trace.wide_texts import STAND_IN_TYPE
 
 _DEPTH_MAX = 6

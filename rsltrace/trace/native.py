@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT
-from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING_DTYPE, TOPIC_TIMINGS
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT
+from rsltrace.trace.model.stamp import NS_PER_S
 from rsltrace.trace.reader import Trace
 
 CUT_AFTER_NS = 2 * NS_PER_S

@@ -15,10 +15,10 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.chunk import message_at
-from rsltrace.mcap.records import Damaged, Fields, Span
-from rsltrace.mcap.source import ByteSource
 from rsltrace.trace.index import MESSAGE_INDEX_FIXED, ChunkEntry, TraceIndex
+from rsltrace.trace.mcap.chunk import message_at
+from rsltrace.trace.mcap.records import Damaged, Fields, Span
+from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.pieces import damaged, messages_in, read_body, read_chunk
 
 _CHUNKS_CACHED = 4

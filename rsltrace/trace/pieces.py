@@ -9,11 +9,12 @@ import xxhash
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap import chunk as mcap_chunk
-from rsltrace.mcap import walk
-from rsltrace.mcap.checksum import crc32
-from rsltrace.mcap.limits import CHUNK_BYTES_MAX
-from rsltrace.mcap.records import (
+from rsltrace.trace.format import CHECKSUM_KEY
+from rsltrace.trace.mcap import chunk as mcap_chunk
+from rsltrace.trace.mcap import walk
+from rsltrace.trace.mcap.checksum import crc32
+from rsltrace.trace.mcap.limits import CHUNK_BYTES_MAX
+from rsltrace.trace.mcap.records import (
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
@@ -22,8 +23,7 @@ from rsltrace.mcap.records import (
     Span,
     records_in,
 )
-from rsltrace.mcap.source import ByteSource
-from rsltrace.trace.format import CHECKSUM_KEY
+from rsltrace.trace.mcap.source import ByteSource
 
 _CRC_BYTES = 4
 _MESSAGE_BODY_MIN = MESSAGE_HEAD.size - RECORD_HEAD.size

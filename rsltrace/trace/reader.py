@@ -19,16 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.limits import ENTITY_ID_MAX
-from rsltrace.mcap.place import open_source
-from rsltrace.mcap.records import Header
-from rsltrace.mcap.source import ByteSource
-from rsltrace.mcap.summary import has_end
-from rsltrace.model.code_line import CodeLine
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
-from rsltrace.model.finding import Finding, GuardCount, Mode
-from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.check import check_data_section, check_hashes, check_records
@@ -53,6 +43,16 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.guarded import parse_counts
 from rsltrace.trace.index import ChannelInfo, read_summary
+from rsltrace.trace.mcap.limits import ENTITY_ID_MAX
+from rsltrace.trace.mcap.place import open_source
+from rsltrace.trace.mcap.records import Header
+from rsltrace.trace.mcap.source import ByteSource
+from rsltrace.trace.mcap.summary import has_end
+from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.model.finding import Finding, GuardCount, Mode
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.pieces import read_attachment, read_metadata
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
@@ -470,7 +470,7 @@ class Trace:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it; of one that cannot be read, why."""
-        from rsltrace.model.html import Sheet
+        from rsltrace.trace.model.html import Sheet
 
         sheet = Sheet(f"trace {Path(self.name).name}")
         if not self.complete:

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rsltrace.model.code_line import CodeLine
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_SEQUENCE, OutputKind
-from rsltrace.model.finding import Finding
 from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
+from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.writer import TraceWriter
 
 _pack_event = EVENT_REST.pack

@@ -13,15 +13,15 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.records import RECORD_HEAD, Damaged, Span
-from rsltrace.mcap.source import ByteSource
-from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.format import (
     EVENT_DTYPE,
     EVENT_MESSAGE_DTYPE,
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
+from rsltrace.trace.mcap.records import RECORD_HEAD, Damaged, Span
+from rsltrace.trace.mcap.source import ByteSource
+from rsltrace.trace.model.event import Event, EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.pieces import damaged, read_chunk
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"

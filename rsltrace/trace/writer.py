@@ -18,15 +18,6 @@ import numpy.typing as npt
 
 from rsltrace._version import __version__
 from rsltrace.errors import OutputError
-from rsltrace.mcap.chunk_body import Waiting, messages_chunk
-from rsltrace.mcap.deferred import DeferredWriter
-from rsltrace.mcap.limits import MESSAGE_BYTES_MAX
-from rsltrace.mcap.records import MESSAGE_HEAD
-from rsltrace.mcap.writer import McapWriter
-from rsltrace.model.code_line import CodeLine
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_SEQUENCE
-from rsltrace.model.finding import Finding
 from rsltrace.trace import chunks
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
@@ -64,6 +55,15 @@ from rsltrace.trace.format import (
     TOPIC_STATES,
     TOPIC_TIMINGS,
 )
+from rsltrace.trace.mcap.chunk_body import Waiting, messages_chunk
+from rsltrace.trace.mcap.deferred import DeferredWriter
+from rsltrace.trace.mcap.limits import MESSAGE_BYTES_MAX
+from rsltrace.trace.mcap.records import MESSAGE_HEAD
+from rsltrace.trace.mcap.writer import McapWriter
+from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_SEQUENCE
+from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
 

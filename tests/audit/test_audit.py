@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.audit.audit import audit_job, audit_path
-from rsltrace.audit.model import Found
 from rsltrace.errors import JobError
+from rsltrace.guard.audit.audit import audit_job, audit_path
+from rsltrace.guard.audit.model import Found
 from rsltrace.job import load_job
 
 ROOT = Path(__file__).parents[2]

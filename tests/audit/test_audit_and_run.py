@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.audit.audit import audit_path
-from rsltrace.audit.model import Treatment
+from rsltrace.guard.audit.audit import audit_path
+from rsltrace.guard.audit.model import Treatment
 from rsltrace.job import Job, NodeSpec, StopSpec
-from rsltrace.model.finding import Mode
 from rsltrace.run import run
+from rsltrace.trace.model.finding import Mode
 
 pytestmark = pytest.mark.ros
 

@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
 
-from rsltrace.bag import open_bag
 from rsltrace.errors import BagError
+from rsltrace.trace.recordings import open_bag
 
 Maker = Callable[..., Path]
 Sample = tuple[int, str, bytes]

@@ -12,9 +12,9 @@ import pytest
 
 import rsltrace
 from rsltrace import Job, NodeSpec, RecordSpec, StopSpec, Trace
-from rsltrace.bag import open_bag
-from rsltrace.bag.export import check_bag_folder, export_bag
 from rsltrace.errors import OutputError, TraceError
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings.export import check_bag_folder, export_bag
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 pytestmark = pytest.mark.ros

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 import zstandard
 
-from rsltrace.bag import files as files_module
-from rsltrace.bag import metadata as metadata_module
-from rsltrace.bag import open_bag
-from rsltrace.bag import reader as reader_module
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import BagError
-from rsltrace.mcap.limits import CHUNK_BYTES_MAX
+from rsltrace.trace.mcap.limits import CHUNK_BYTES_MAX
+from rsltrace.trace.recordings import files as files_module
+from rsltrace.trace.recordings import metadata as metadata_module
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings import reader as reader_module
 
 Maker = Callable[..., Path]
 

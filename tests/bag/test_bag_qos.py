@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from rsltrace.bag import DURATION_INFINITE_NS, BagQos, BagTopic
-from rsltrace.bag.qos import parse_qos
+from rsltrace.trace.recordings import DURATION_INFINITE_NS, BagQos, BagTopic
+from rsltrace.trace.recordings.qos import parse_qos
 
 WORDS = """\
 - history: keep_all

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, IndexType
 
 import rsltrace.errors
-from rsltrace.bag import Bag, BagQos, open_bag
+from rsltrace.trace.recordings import Bag, BagQos, open_bag
 from tests.tiers import cases
 
 Maker = Callable[..., Path]
@@ -371,7 +371,7 @@ def test_reading_imports_no_ros_and_no_numpy(
     root = Path(rsltrace.errors.__file__).parents[1]
     code = (
         f"import sys; sys.path.insert(0, {str(root)!r})\n"
-        "from rsltrace.bag import open_bag\n"
+        "from rsltrace.trace.recordings import open_bag\n"
         "print(len(list(open_bag('a.mcap').messages())))\n"
         "bad = {'rclpy', 'numpy', 'rosbags', 'pydantic'} & set(sys.modules)\n"
         "sys.exit(', '.join(sorted(bad)) or 0)"

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.bag import open_bag
 from rsltrace.errors import BagError
+from rsltrace.trace.recordings import open_bag
 
 
 def whole_and_cut(path: Path, cut: Path, steps: int) -> list[int]:

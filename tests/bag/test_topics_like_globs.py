@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.bag import open_bag
-from rsltrace.bag.export import export_bag
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings.export import export_bag
 from rsltrace.trace.writer import TraceWriter
 
 TEXT = "string data\n"

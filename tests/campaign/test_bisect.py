@@ -15,13 +15,13 @@ from typing import Any
 
 import pytest
 
-from rsltrace.campaign.bisect.repository import Repository
-from rsltrace.campaign.bisect.runs import python_folders
-from rsltrace.campaign.bisect.worktree import Worktree
 from rsltrace.cli.bisect import _same_everywhere
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
+from rsltrace.search.bisect.repository import Repository
+from rsltrace.search.bisect.runs import python_folders
+from rsltrace.search.bisect.worktree import Worktree
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

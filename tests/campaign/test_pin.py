@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import rsltrace.guard.pin as pin
-from rsltrace.campaign.perturb import can_fix_addresses
+from rsltrace.search.perturb import can_fix_addresses
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

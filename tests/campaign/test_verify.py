@@ -16,11 +16,11 @@ from typing import Any, cast
 
 import pytest
 
-from rsltrace.campaign import perturb
-from rsltrace.campaign.perturb import KINDS, recorded, surroundings
-from rsltrace.campaign.processes import Done
-from rsltrace.campaign.verify import Verified
+from rsltrace.child_processes import Done
 from rsltrace.cli.output import verify_text
+from rsltrace.search import perturb
+from rsltrace.search.perturb import KINDS, recorded, surroundings
+from rsltrace.search.verify import Verified
 
 pytestmark = pytest.mark.ros
 

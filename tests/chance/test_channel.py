@@ -11,7 +11,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.chance.channel import (
+from rsltrace.simulation.chance.channel import (
     LOST_BURST,
     LOST_DROP,
     LOST_OUTAGE,
@@ -20,8 +20,8 @@ from rsltrace.chance.channel import (
     Model,
     Outage,
 )
-from rsltrace.chance.distribution import Constant, Distribution, Gamma, Normal, Uniform
-from rsltrace.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
+from rsltrace.simulation.chance.distribution import Constant, Distribution, Gamma, Normal, Uniform
+from rsltrace.simulation.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
 from tests.tiers import cases
 
 N = 100_000

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.chance.distribution import (
+from rsltrace.simulation.chance.distribution import (
     Constant,
     Distribution,
     Empirical,
@@ -25,9 +25,9 @@ from rsltrace.chance.distribution import (
     Series,
     Uniform,
 )
-from rsltrace.chance.exact import exp, log
-from rsltrace.chance.normal import quantile
-from rsltrace.chance.stream import Stream
+from rsltrace.simulation.chance.exact import exp, log
+from rsltrace.simulation.chance.normal import quantile
+from rsltrace.simulation.chance.stream import Stream
 
 N = 100_000
 MS = 1_000_000

@@ -328,7 +328,7 @@ def test_a_large_sequence_is_paid_for() -> None:
 @pytest.mark.parametrize("pattern", ["(a+)+$", "(a|a)+$", "a*a*a*a*a*a*a*a*a*b"])
 def test_no_pattern_of_logs_keeps_a_check_busy(pattern: str) -> None:
     from rsltrace.conditions.view import Sent
-    from rsltrace.model.event import OutputKind
+    from rsltrace.trace.model.event import OutputKind
 
     @dataclass
     class Logs(View):

@@ -28,11 +28,11 @@ from trace_maker import (
 )
 
 from rsltrace.cli.main import cli
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
-from rsltrace.model.printable import printable
 from rsltrace.trace.cdr import log_content
-from rsltrace.words.table import table
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.words.table import table
 from tests.golden_files import check_golden
 
 GOLDEN = Path(__file__).parent / "golden"

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.words.silent_topics import silent_topics, without_server
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.words.silent_topics import silent_topics, without_server
 
 
 def entities(*ends: tuple[str, EntityKind, str]) -> list[Entity]:

@@ -21,7 +21,7 @@ from rsltrace.conditions.names import Names
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import Sent
 from rsltrace.errors import ConditionError
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 NODES = ("/ekf", "/robot/scanner", "/left/wheel", "/right/wheel")
 TOPICS = ("/odom", "/scan", "/robot/plan")

@@ -17,8 +17,8 @@ from rsltrace_viewer.model.timeline.events import node_of
 from rsltrace import DebugSession
 from rsltrace.debug.positions import Stopped
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.run import record
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

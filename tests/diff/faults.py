@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, Logged, NodePlan, Plan, Simulation, Storag
 
 from rsltrace.diff.facts.causes import Root, Verdict
 from rsltrace.diff.result import Diff, Divergence
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 EVENTS_MAX = 1500
 

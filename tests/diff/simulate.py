@@ -15,8 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from unittest import mock
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import (
@@ -26,6 +24,8 @@ from rsltrace.trace.format import (
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
 )
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 

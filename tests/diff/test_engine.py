@@ -24,7 +24,7 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.writer import TraceWriter
 
 # /source ticks every 10 ms; /left and /right hear it, /sum hears both, /odd has nothing to do with
@@ -540,7 +540,7 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:
     from rsltrace.diff.sentences.divergence import phrase
-    from rsltrace.words.phrases import at_time as at
+    from rsltrace.trace.words.phrases import at_time as at
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)))
     view = diff.divergences[0].a

@@ -16,7 +16,7 @@ from rsltrace.diff.facts.evidence import (
     Presence,
 )
 from rsltrace.diff.sentences import sentence
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.words.entities import EntityKey
 
 PLACE = "picker.py:24 in Picker.pick"
 

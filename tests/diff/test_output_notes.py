@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow
 from rsltrace.diff.sentences.values import durations
-from rsltrace.model.event import OutputKind
-from rsltrace.model.printable import printable, told_apart
-from rsltrace.model.stamp import durations_apart, format_duration
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.printable import printable, told_apart
+from rsltrace.trace.model.stamp import durations_apart, format_duration
+from rsltrace.trace.words.entities import EntityKey
 
 MESSAGE = int(OutputKind.MESSAGE)
 KEYS = [EntityKey("/node", "publisher", f"/t{number}", "a/msg/B") for number in range(4)]

@@ -26,7 +26,7 @@ from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 

@@ -61,9 +61,9 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import FORMATS, render
 from rsltrace.diff.result import BagDiff, Diff, Divergence, EntityCount, Side
 from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.words.entities import EntityKey
-from rsltrace.words.phrases import as_sentence
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.words.entities import EntityKey
+from rsltrace.trace.words.phrases import as_sentence
 from tests.golden_files import check_golden
 from tests.tiers import cases
 

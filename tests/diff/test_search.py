@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.errors import TraceError
-from rsltrace.mcap.source import FileSource
+from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
 
 CHAIN = Plan(

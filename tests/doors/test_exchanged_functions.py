@@ -14,7 +14,7 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
-from rsltrace.doors.rclpy.executors import user_executors
+from rsltrace.adapters.rclpy.executors import user_executors
 from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros

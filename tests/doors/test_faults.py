@@ -20,7 +20,7 @@ from std_srvs.srv import Trigger
 
 from rsltrace import Job, NodeSpec, StopSpec, diff, record
 from rsltrace.errors import DeadlockError, JobError
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 MS = 1_000_000
 PERIOD_MS = 100

@@ -19,8 +19,8 @@ from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci, NestedMessage
 from test_msgs.msg import BoundedSequences, Strings
 
-from rsltrace.doors.rclpy.wire import interface_files, interface_schema
-from rsltrace.doors.rclpy.wire.interfaces import (
+from rsltrace.adapters.rclpy.wire import interface_files, interface_schema
+from rsltrace.adapters.rclpy.wire.interfaces import (
     get_message_class,
     get_service_class,
     schema_text,
@@ -186,7 +186,7 @@ def test_a_class_that_rosidl_did_not_make_has_no_name() -> None:
 
 def test_importing_the_module_imports_nothing_of_ros() -> None:
     code = (
-        "import sys, rsltrace.doors.rclpy.wire.interfaces, rsltrace.doors.rclpy.wire.codec; "
+        "import sys, rsltrace.adapters.rclpy.wire.interfaces, rsltrace.adapters.rclpy.wire.codec; "
         "print([m for m in sys.modules if m.split('.')[0] in "
         "('rclpy', 'rosidl_parser', 'std_msgs', 'builtin_interfaces')])"
     )

@@ -103,8 +103,8 @@ def test_the_work_of_a_job_file_grows_with_its_entries(
 _SHARED = """
 import gc, sys
 from rsltrace import Job, NodeSpec, Simulation, StopSpec
-from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
-from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rclpy.node import Node
 from std_msgs.msg import UInt64
 

@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
 from rsltrace.errors import DeadlockError, NodeError
-from rsltrace.model.event import OutputKind
+from rsltrace.trace.model.event import OutputKind
 
 pytestmark = pytest.mark.ros
 
@@ -568,7 +568,7 @@ def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
 
 @pytest.mark.long
 def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
-    from rsltrace.doors.rclpy.stacks.program import _FAILURES_MAX, Program
+    from rsltrace.adapters.rclpy.stacks.program import _FAILURES_MAX, Program
 
     kept: list[int] = []
 

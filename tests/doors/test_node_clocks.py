@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.chance.clock import ClockModel, WrongClock
-from rsltrace.chance.stream import Stream
+from rsltrace.simulation.chance.clock import ClockModel, WrongClock
+from rsltrace.simulation.chance.stream import Stream
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rclpy.node import Node
 
 from rsltrace import NodeSpec
-from rsltrace.doors.rclpy.entry import ros_arguments
+from rsltrace.adapters.rclpy.entry import ros_arguments
 from tests.tiers import cases
 
 pytestmark = pytest.mark.ros

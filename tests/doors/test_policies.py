@@ -14,7 +14,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from rsltrace.errors import JobError, RunError
-from rsltrace.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, Moment
 
 pytestmark = pytest.mark.ros
 

@@ -13,7 +13,7 @@ from std_msgs.msg import Float32, String, UInt64
 
 from rsltrace import Trace
 from rsltrace.errors import RunError
-from rsltrace.model.event import OutputKind
+from rsltrace.trace.model.event import OutputKind
 
 pytestmark = pytest.mark.ros
 

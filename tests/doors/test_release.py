@@ -7,11 +7,11 @@ from types import SimpleNamespace
 
 import pytest
 
-import rsltrace.doors.rclpy.boundary.installation as installing
-from rsltrace.doors.rclpy.boundary.boundary import Boundary
-from rsltrace.doors.rclpy.boundary.installation import boundary
-from rsltrace.doors.rclpy.boundary.release import missing_parts
-from rsltrace.doors.rclpy.handles.timers import TimerHandle
+import rsltrace.adapters.rclpy.boundary.installation as installing
+from rsltrace.adapters.rclpy.boundary.boundary import Boundary
+from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.boundary.release import missing_parts
+from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.errors import SetupError
 
 pytestmark = pytest.mark.ros

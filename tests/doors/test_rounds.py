@@ -13,9 +13,9 @@ import pytest
 pytest.importorskip("rclpy")
 
 from rsltrace import NodeSpec
-from rsltrace.doors.rclpy.stacks.coroutines import _run_oldest_first
-from rsltrace.loop.policy import Candidate, Moment
-from rsltrace.loop.wait_set import RclpyWaitSet
+from rsltrace.adapters.rclpy.stacks.coroutines import _run_oldest_first
+from rsltrace.simulation.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from tests.doors.rounds_program import Busy, Shared, nodes_of
 
 pytestmark = pytest.mark.ros

@@ -20,8 +20,8 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
-from rsltrace.doors.rclpy.executors import pump
-from rsltrace.doors.rclpy.executors.standby import Standby
+from rsltrace.adapters.rclpy.executors import pump
+from rsltrace.adapters.rclpy.executors.standby import Standby
 from rsltrace.errors import LivelockError
 
 pytestmark = pytest.mark.ros

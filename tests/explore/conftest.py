@@ -103,8 +103,8 @@ def write_job(searched: Path) -> Callable[[str, str], Path]:
 @pytest.fixture(scope="module")
 def worker(searched: Path) -> Iterator[object]:
     """A worker for ``job.yaml``."""
-    from rsltrace.explore.trial import JobSource
-    from rsltrace.explore.workers import Worker
+    from rsltrace.search.explore.trial import JobSource
+    from rsltrace.search.explore.workers import Worker
 
     with Worker(JobSource(str(searched / "job.yaml"))) as one:
         yield one

@@ -15,16 +15,16 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Image, LaserScan  # noqa: E402
 
 from campaigns.explore.suite import BUGS  # noqa: E402
-from rsltrace.doors.rclpy.wire.codec import codec_for  # noqa: E402
+from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
 from rsltrace.errors import BagError  # noqa: E402
-from rsltrace.explore.outcome import Wants  # noqa: E402
-from rsltrace.explore.strategies.faults import FaultWalk  # noqa: E402
-from rsltrace.explore.trial import JobSource, Trial, TrialResult  # noqa: E402
-from rsltrace.explore.workers import Worker  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
 from rsltrace.run.plans.bag_faults import check_changes  # noqa: E402
 from rsltrace.run.plans.changed_fields import UnfitError, changer  # noqa: E402
+from rsltrace.search.explore.outcome import Wants  # noqa: E402
+from rsltrace.search.explore.strategies.faults import FaultWalk  # noqa: E402
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult  # noqa: E402
+from rsltrace.search.explore.workers import Worker  # noqa: E402
 
 STATUS = [DiagnosticStatus(values=[KeyValue(key="a")]), DiagnosticStatus(level=b"\2")]
 MESSAGES: dict[str, Any] = {

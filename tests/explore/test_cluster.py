@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from rsltrace.errors import ExploreError
-from rsltrace.explore.bundle import bundle_of
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.trial import JobSource, Trial, TrialResult
+from rsltrace.search.explore.bundle import bundle_of
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'rsltrace[explore]'")
 
@@ -93,7 +93,7 @@ def test_the_hash_of_a_bundle_is_that_of_its_content(job: Path) -> None:
 
 
 def test_a_large_file_must_be_there(job: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsltrace.explore.bundle.SHIPPED_MAX", 100)
+    monkeypatch.setattr("rsltrace.search.explore.bundle.SHIPPED_MAX", 100)
     bundle = bundle_of(JobSource(str(job)))
     assert list(bundle.large) == ["robot/src/robot.py"]
     bundle.unpack(job.parents[2] / "a")
@@ -167,8 +167,8 @@ def test_workers_that_die_lose_nothing_and_runs_are_those_of_this_machine(
     job: Path, dask: Dask, tmp_path: Path
 ) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
-    from rsltrace.explore.cluster import Cluster
-    from rsltrace.explore.workers import Worker
+    from rsltrace.search.explore.cluster import Cluster
+    from rsltrace.search.explore.workers import Worker
 
     source = JobSource(str(job))
     asked = trials(16)
@@ -205,7 +205,7 @@ def test_workers_that_die_lose_nothing_and_runs_are_those_of_this_machine(
 def test_a_cluster_that_is_not_there(
     job: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from rsltrace.explore import cluster
+    from rsltrace.search.explore import cluster
 
     monkeypatch.setattr(cluster, "_CONNECT_S", 1)
     monkeypatch.delenv("DASK_SCHEDULER_ADDRESS", raising=False)

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.explore.table import rows
+from rsltrace.search.explore.table import rows
 
 CHECKED = """\
 nodes:

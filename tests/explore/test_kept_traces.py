@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
-from rsltrace.explore.kept_traces import KeptTraces
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.search import Budget, Search
-from rsltrace.explore.small.causes import make_small
-from rsltrace.explore.strategies.walks import RandomWalk
-from rsltrace.explore.table import Table, rows
-from rsltrace.explore.trial import CHECK, Failure, JobSource, Trial, TrialResult
+from rsltrace.search.explore.kept_traces import KeptTraces
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.search import Budget, Search
+from rsltrace.search.explore.small.causes import make_small
+from rsltrace.search.explore.strategies.walks import RandomWalk
+from rsltrace.search.explore.table import Table, rows
+from rsltrace.search.explore.trial import CHECK, Failure, JobSource, Trial, TrialResult
 
 _TRIALS = 8
 
@@ -104,7 +104,7 @@ def test_a_cluster_fetches_what_may_be_kept_when_later_runs_come_first(
     write_job: Callable[[str, str], Path], tmp_path: Path
 ) -> None:
     pytest.importorskip("distributed", reason="needs Dask: pip install 'rsltrace[explore]'")
-    from rsltrace.explore.cluster import Cluster
+    from rsltrace.search.explore.cluster import Cluster
 
     job = write_job("fetched", "nodes: [{node: nodes_under_search:Last}]\nstop: {time: 1s}\n")
 

@@ -13,13 +13,13 @@ import pytest
 
 from campaigns.explore.suite import all_bugs
 from rsltrace.errors import ExploreError
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.strategies.faults import FaultWalk
-from rsltrace.explore.strategies.named import strategy_named
-from rsltrace.explore.strategies.strategy import choices_left
-from rsltrace.explore.trial import JobSource, Trial, TrialResult
-from rsltrace.explore.workers import Worker
 from rsltrace.job import job_from_text
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.strategies.faults import FaultWalk
+from rsltrace.search.explore.strategies.named import strategy_named
+from rsltrace.search.explore.strategies.strategy import choices_left
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
+from rsltrace.search.explore.workers import Worker
 
 ALIKE_NS = 450_000_000
 JOB = """\

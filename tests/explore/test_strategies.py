@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import ExploreError
-from rsltrace.explore.strategies.feedback import Feedback
-from rsltrace.explore.strategies.named import NAMES, strategy_named
-from rsltrace.explore.trial import Trial, TrialResult
 from rsltrace.job import Job, NodeSpec
+from rsltrace.search.explore.strategies.feedback import Feedback
+from rsltrace.search.explore.strategies.named import NAMES, strategy_named
+from rsltrace.search.explore.trial import Trial, TrialResult
 
 JOB = Job(nodes=[NodeSpec(node="m:N")])
 

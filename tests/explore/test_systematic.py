@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.strategies.systematic import Systematic
-from rsltrace.explore.trial import JobSource, Trial, TrialResult
-from rsltrace.explore.workers import Worker
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.strategies.systematic import Systematic
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
+from rsltrace.search.explore.workers import Worker
 
 RUNS_MAX = 500
 SENDER = "{{node: nodes_under_search:Sender, name: {0}, parameters: {{value: {1}, topic: {2}}}}}"

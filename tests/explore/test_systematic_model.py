@@ -7,8 +7,8 @@ from typing import Any
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from rsltrace.explore.strategies.systematic import Systematic
-from rsltrace.explore.trial import Step, Trial, TrialResult
+from rsltrace.search.explore.strategies.systematic import Systematic
+from rsltrace.search.explore.trial import Step, Trial, TrialResult
 from tests.tiers import cases
 
 NODES = 3

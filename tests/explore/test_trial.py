@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import ExploreError
-from rsltrace.explore.outcome import Wants
-from rsltrace.explore.trial import JobSource, Trial, overrides_of, result_of
-from rsltrace.explore.workers import Worker
 from rsltrace.job import load_job
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.trial import JobSource, Trial, overrides_of, result_of
+from rsltrace.search.explore.workers import Worker
 
 OVERLAYS: list[dict[str, Any]] = [
     {},

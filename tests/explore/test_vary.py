@@ -13,11 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.errors import ExploreError, JobError
-from rsltrace.explore.strategies.faults import FaultWalk
-from rsltrace.explore.strategies.vary import VaryWalk
-from rsltrace.explore.trial import JobSource, Trial, TrialResult
-from rsltrace.explore.vary import Variations, check_vary
 from rsltrace.job import Job, NodeSpec, VarySpec, load_job
+from rsltrace.search.explore.strategies.faults import FaultWalk
+from rsltrace.search.explore.strategies.vary import VaryWalk
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
+from rsltrace.search.explore.vary import Variations, check_vary
 from tests.tiers import cases
 
 A = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback" / "a.mcap"

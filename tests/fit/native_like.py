@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 
-from rsltrace.model.draw import Draw, encode_draw
-from rsltrace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_NATIVE, TIMING
+from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.chance.distribution import Empirical, Gamma, Lognormal, Normal, Uniform
-from rsltrace.chance.stream import Stream
-from rsltrace.fit.comparison import compared
-from rsltrace.fit.measured import clock_steps
-from rsltrace.fit.models import ks_distance, model_of, table_of
+from rsltrace.native.fit.comparison import compared
+from rsltrace.native.fit.measured import clock_steps
+from rsltrace.native.fit.models import ks_distance, model_of, table_of
+from rsltrace.simulation.chance.distribution import Empirical, Gamma, Lognormal, Normal, Uniform
+from rsltrace.simulation.chance.stream import Stream
 from tests.tiers import cases
 
 MS = 1_000_000

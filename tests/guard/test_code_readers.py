@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 import rsltrace.guard.virtual.original_code as original_code
-from rsltrace.doors.rclpy.hints import hint_for
+from rsltrace.adapters.rclpy.hints import hint_for
 from rsltrace.guard.virtual.user_modules import rewritten
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros

@@ -15,8 +15,8 @@ from hypothesis.strategies import none
 
 from rsltrace.errors import GuardError, JobError
 from rsltrace.job import load_job
-from rsltrace.model.finding import Mode, Source
 from rsltrace.run import run
+from rsltrace.trace.model.finding import Mode, Source
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 

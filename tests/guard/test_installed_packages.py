@@ -15,7 +15,7 @@ import pytest
 
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.object_numbers import ObjectNumbers
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros

@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.campaign.perturb import (
+from rsltrace.search.perturb import (
     KERNEL,
     LOCALE,
     THREAD_COUNT,
@@ -164,8 +164,8 @@ def test_what_is_deterministic_by_itself_has_no_findings(runs: Runs) -> None:
 
 def test_another_kernel_of_the_numerical_library_is_in_the_environment(tmp_path: Path) -> None:
     """Which code OpenBLAS runs depends on the processor: not made equal, but told."""
-    from rsltrace.campaign.perturb import core_types
     from rsltrace.diff import diff_files
+    from rsltrace.search.perturb import core_types
 
     kernels = core_types()
     if len(kernels) < 2:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 

@@ -14,8 +14,8 @@ import pytest
 
 from rsltrace.errors import GuardError, JobError, TraceError
 from rsltrace.job import load_job
-from rsltrace.model.finding import Mode
 from rsltrace.run import run
+from rsltrace.trace.model.finding import Mode
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -401,11 +401,11 @@ def test_state_hashes_are_off_by_default_and_listed_in_info(tmp_path: Path) -> N
         assert len(set(hashes)) > 10
         assert (
             trace.metadata("rsltrace:guard")["left_out"]
-            == '{"/planted": {"lock": "rsltrace.doors.rclpy.stacks.locks.SimLock"}}'
+            == '{"/planted": {"lock": "rsltrace.adapters.rclpy.stacks.locks.SimLock"}}'
         )
     shown = CliRunner().invoke(info, [str(on)]).output
     assert (
-        'state hashes leave out: {"/planted": {"lock": "rsltrace.doors.rclpy.stacks.locks.SimLock"}}'  # noqa: E501
+        'state hashes leave out: {"/planted": {"lock": "rsltrace.adapters.rclpy.stacks.locks.SimLock"}}'  # noqa: E501
         in shown
     )
 
@@ -427,7 +427,7 @@ def test_an_attribute_that_is_set_again_removed_and_added_is_seen(tmp_path: Path
     pytest.importorskip("rclpy")
     from rclpy.node import Node
 
-    from rsltrace.model.event import EventKind
+    from rsltrace.trace.model.event import EventKind
     from rsltrace.trace.reader import Trace
 
     class Changing(Node):  # type: ignore[misc]

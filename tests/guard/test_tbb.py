@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from rsltrace.job import load_job
-from rsltrace.model.finding import Source
 from rsltrace.run import record
+from rsltrace.trace.model.finding import Source
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 

@@ -24,7 +24,7 @@ from rsltrace.guard import frames
 from rsltrace.guard.callers import STANDARD, USER
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard
-from rsltrace.model.finding import Policy
+from rsltrace.trace.model.finding import Policy
 from tests.guard.conftest import node_code
 
 pytestmark = pytest.mark.ros

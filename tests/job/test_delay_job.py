@@ -7,8 +7,11 @@ from textwrap import dedent
 
 import pytest
 
-from rsltrace.chance.channel import Burst, Model, Outage
-from rsltrace.chance.distribution import (
+from rsltrace.errors import JobError
+from rsltrace.job import Job, load_job
+from rsltrace.run.plans.network import network_plan
+from rsltrace.simulation.chance.channel import Burst, Model, Outage
+from rsltrace.simulation.chance.distribution import (
     Constant,
     Empirical,
     Gamma,
@@ -18,9 +21,6 @@ from rsltrace.chance.distribution import (
     Series,
     Uniform,
 )
-from rsltrace.errors import JobError
-from rsltrace.job import Job, load_job
-from rsltrace.run.plans.network import network_plan
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.audit.audit import audit_path
+from rsltrace.adapters.launch.expand import expand
+from rsltrace.adapters.launch.parameter_files import parameters_for
 from rsltrace.errors import JobError
+from rsltrace.guard.audit.audit import audit_path
 from rsltrace.job import job_from_text, load_job
-from rsltrace.launch.expand import expand
-from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.run.plans.entries import node_entries
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")

@@ -20,9 +20,9 @@ from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
 from rsltrace import Job, NodeSpec, StopSpec, Trace, record
+from rsltrace.checks.latency.measure import ChainLatency, measure_latencies
 from rsltrace.cli.main import cli
-from rsltrace.latency.measure import ChainLatency, measure_latencies
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 pytestmark = pytest.mark.ros
 MS = 1_000_000

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.launch.model import Launched
-from rsltrace.launch.reader import read_launch_file
+from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.reader import read_launch_file
 
 
 @pytest.fixture

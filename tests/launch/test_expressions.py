@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.launch.expression import evaluate
-from rsltrace.launch.scope import Scope
-from rsltrace.launch.substitution import Substitutions
-from rsltrace.launch.template import Call, parse_template
+from rsltrace.adapters.launch.expression import evaluate
+from rsltrace.adapters.launch.scope import Scope
+from rsltrace.adapters.launch.substitution import Substitutions
+from rsltrace.adapters.launch.template import Call, parse_template
 
 
 def text(written: str) -> str:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rsltrace.adapters.launch.reader import read_launch_file
+from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
-from rsltrace.launch.reader import read_launch_file
-from rsltrace.launch.specs import node_specs
 from tests.tiers import cases
 
 FILES = Path(__file__).parent / "files"

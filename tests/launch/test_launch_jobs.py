@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from rsltrace import Job, Trace
+from rsltrace.adapters.launch.find import launch_file
 from rsltrace.errors import JobError
 from rsltrace.job import LaunchSpec, load_job
-from rsltrace.launch.find import launch_file
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
+from rsltrace.adapters.launch.apart import read_apart
+from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.job import NodeSpec
 from rsltrace.job.parts.process import RespawnSpec
-from rsltrace.launch.apart import read_apart
-from rsltrace.launch.model import Launched
-from rsltrace.launch.specs import node_specs
 
 XML = """<launch>
   <set_env name="SHARED" value="1"/>

@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from rsltrace.adapters.launch.model import Launched, LaunchedNode
+from rsltrace.adapters.launch.specs import node_specs as specs_of
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
 from rsltrace.job.parts.start_after import StartAfterSpec
-from rsltrace.launch.model import Launched, LaunchedNode
-from rsltrace.launch.specs import node_specs as specs_of
 from rsltrace.run.plans.executables import why_not
 
 
@@ -412,9 +412,9 @@ def test_a_bad_name_is_told_at_its_node(read: Any, prefix: Path) -> None:
 
 
 def test_the_document_names_all_that_is_read() -> None:
-    from rsltrace.launch.reader import ActionReader
-    from rsltrace.launch.scope import Scope
-    from rsltrace.launch.substitution import Substitutions
+    from rsltrace.adapters.launch.reader import ActionReader
+    from rsltrace.adapters.launch.scope import Scope
+    from rsltrace.adapters.launch.substitution import Substitutions
 
     text = (Path(__file__).parents[2] / "docs" / "launch.md").read_text(encoding="utf-8")
     silent = {"push-ros-namespace", "reset_env", "set_use_sim_time", "set_ros_log_dir", "log",

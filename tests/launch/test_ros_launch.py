@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from rsltrace.adapters.launch import ros_launch
+from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.reader import read_launch_file
+from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
 from rsltrace.job.parts.start_after import StartAfterSpec
-from rsltrace.launch import ros_launch
-from rsltrace.launch.model import Launched
-from rsltrace.launch.reader import read_launch_file
-from rsltrace.launch.specs import node_specs
 
 pytest.importorskip("launch_ros", reason="needs ROS's launch and launch_ros")
 

@@ -9,12 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.errors import LivelockError
-from rsltrace.loop.loop import ORDER_BAG, EventLoop
-from rsltrace.loop.ordered import OrderedLoop, Place
-from rsltrace.loop.policy import Candidate
-from rsltrace.loop.stop import Progress, Stop, stop_after_events, stop_at
-from rsltrace.loop.timer import TimerState
-from rsltrace.loop.timer_queue import CreationOrderQueue
+from rsltrace.simulation.loop.loop import ORDER_BAG, EventLoop
+from rsltrace.simulation.loop.ordered import OrderedLoop, Place
+from rsltrace.simulation.loop.policy import Candidate
+from rsltrace.simulation.loop.stop import Progress, Stop, stop_after_events, stop_at
+from rsltrace.simulation.loop.timer import TimerState
+from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from tests.tiers import cases
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from rsltrace.chance.stream import Stream
 from rsltrace.errors import RunError
-from rsltrace.loop.policy import Candidate, Moment
-from rsltrace.loop.search_policies import Departure, Departures, Pct, pct_bound
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.search_policies import Departure, Departures, Pct, pct_bound
 
 THREADS, EVENTS = 4, 3
 

@@ -14,8 +14,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
-from rsltrace.model.draw import draw_text
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.draw import draw_text
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 pytestmark = pytest.mark.ros
 
@@ -316,7 +316,7 @@ def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
 
 @pytest.mark.long
 def test_what_chance_decided_is_said_in_words(run: Run) -> None:
-    from rsltrace.words.events import EventWords
+    from rsltrace.trace.words.events import EventWords
 
     recorded = run(Talker, Listener, delay={"default": "5ms"}, duration=0.1)
     with recorded.trace() as trace:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.interface import MessageType, ServiceType
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 
 UINT64 = MessageType("std_msgs/msg/UInt64", lambda: ("uint64 data\n", "RIHS01_" + 64 * "a"))
 TRIGGER = ServiceType(
@@ -72,8 +72,8 @@ def run(
     from std_srvs.srv import Trigger
 
     from rsltrace import Job, NodeSpec, StopSpec
-    from rsltrace.model.event import EventKind
     from rsltrace.run.session import Session
+    from rsltrace.trace.model.event import EventKind
 
     class Counter(Node):  # type: ignore[misc]
         def __init__(self) -> None:
@@ -211,17 +211,17 @@ def test_what_it_raises_ends_the_run_and_is_in_the_trace(tmp_path: Path) -> None
     )
     assert (error.node, error.entity) == ("/stranger", "/stranger: subscription /count")
     assert "in on_count" in error.traceback_text
-    assert "rsltrace/middleware" not in error.traceback_text
+    assert "rsltrace/simulation/middleware" not in error.traceback_text
 
 
 ALONE = """
 import struct, sys
-from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.stop import Stop
-from rsltrace.loop.timer_queue import timer_queue
-from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.interface import MessageType
-from rsltrace.middleware.qos.policies import DEFAULT_QOS, Durability
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.loop.timer_queue import timer_queue
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Durability
 from dataclasses import replace
 
 loop = EventLoop(start_ns=0, timers=timer_queue("creation"))

@@ -21,7 +21,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import UInt64
 
 from rsltrace import NodeSpec
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 pytestmark = pytest.mark.ros
 

@@ -13,7 +13,7 @@ from collections import Counter, defaultdict
 from pathlib import Path
 from typing import Any
 
-from rsltrace.model.event import NO_EVENT
+from rsltrace.trace.model.event import NO_EVENT
 from rsltrace.trace.reader import Trace
 from tests.native.running import record
 

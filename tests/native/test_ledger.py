@@ -5,12 +5,12 @@ from __future__ import annotations
 import random
 import threading
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.native.boundary import channel_of
 from rsltrace.native.causes import Causes
 from rsltrace.native.ledger import Failed, Ledger, Scheduled, Sent, Span, Taken
 from rsltrace.native.things import Thing
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 
 TIMER, RESUME, OUTSIDE = map(int, (EventKind.TIMER, EventKind.RESUME, EventKind.OUTSIDE))
 THING = Thing(1, 1, EntityKind.TIMER, "on_timer")

@@ -11,15 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.middleware.interface import MessageType
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.native.apart import merge as merging
 from rsltrace.native.apart.link import Link, LinkError
 from rsltrace.native.apart.merge import Merge
 from rsltrace.native.apart.wire import SpanReader, SpanWriter
 from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span, Taken, now_ns
 from rsltrace.native.things import Things
+from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 from tests.tiers import cases
 
 TIMER, TASK = int(EventKind.TIMER), int(EventKind.TASK)

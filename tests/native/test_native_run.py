@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from rsltrace.diff.traces.native import said_of_parameters
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.contents import check_contents
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.native import callback_figures, is_native, timings
 from rsltrace.trace.reader import Trace
 from tests.native.running import COMMAND, environment, events_of, job, record

@@ -13,8 +13,8 @@ import pytest
 from click import UsageError
 
 from rsltrace.cli.record import record
-from rsltrace.model.event import EventKind
 from rsltrace.native.priorities import LEVEL_MAX, LEVEL_MIN, level_of_period
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from tests.native.running import record as run_natively
 

@@ -16,9 +16,9 @@ from typing import Any
 
 import pytest
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.contents import check_contents
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
 from tests.native.running import COMMAND, environment, events_of, job, record

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.reader import Trace
 from tests.native.running import events_of, record
 

@@ -6,8 +6,8 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import rsltrace
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.html import Sheet
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.html import Sheet
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace.doors.processes.build import find_compiler, find_ros
+from rsltrace.adapters.processes.build import find_compiler, find_ros
 from rsltrace.errors import SetupError
 
 SOURCES = Path(__file__).parent

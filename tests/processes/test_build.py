@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace.doors.processes import build
+from rsltrace.adapters.processes import build
 from rsltrace.errors import SetupError
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rsltrace.job import load_job
-from rsltrace.model.event import OutputKind
 from rsltrace.run.recording import run
+from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

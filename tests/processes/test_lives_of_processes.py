@@ -11,9 +11,9 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.run.recording import RunResult, run
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.run.recording import run
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

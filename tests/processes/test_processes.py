@@ -17,13 +17,13 @@ import std_msgs.msg
 from rosidl_parser.definition import BasicType
 
 import rsltrace
-from rsltrace.doors.processes.build import find_ros
-from rsltrace.doors.rclpy.wire.interface_classes import forget_interfaces
+from rsltrace.adapters.processes.build import find_ros
+from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.run import watchdog
 from rsltrace.run.recording import run
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.doors.processes import build
-from rsltrace.doors.processes.child import Child
-from rsltrace.doors.processes.programs import interpreter, why_not_run
+from rsltrace.adapters.processes import build
+from rsltrace.adapters.processes.child import Child
+from rsltrace.adapters.processes.programs import interpreter, why_not_run
+from rsltrace.adapters.workspace import cache
 from rsltrace.errors import SetupError
-from rsltrace.workspace import cache
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_no_compiler_outlives_an_interrupted_build(tmp_path: Path) -> None:
     script = tmp_path / "compiler"
     script.write_text(f"#!/bin/sh\necho $$ >> {tmp_path}/pids\nsleep 600 & wait\n")
     script.chmod(0o755)
-    code = f"from rsltrace.doors.processes import build; build._run([[{str(script)!r}]] * 3)"
+    code = f"from rsltrace.adapters.processes import build; build._run([[{str(script)!r}]] * 3)"
     with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as building:
         pids = tmp_path / "pids"
         deadline = time.monotonic() + 100

@@ -12,8 +12,8 @@ import pytest
 
 from rsltrace import Job, NodeSpec, StopSpec, Trace
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.run.recording import run
+from rsltrace.trace.model.event import EventKind
 
 pytestmark = pytest.mark.ros
 

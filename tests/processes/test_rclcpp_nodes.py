@@ -14,11 +14,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace.doors.processes.build import find_compiler, find_ros
+from rsltrace.adapters.processes.build import find_compiler, find_ros
 from rsltrace.job import load_job
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.run.recording import RunResult, run
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
 SOURCES = Path(__file__).parent / "rclcpp_nodes"

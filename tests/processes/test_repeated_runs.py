@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.doors.processes import child
+from rsltrace.adapters.processes import child
 from rsltrace.job import load_job
 from rsltrace.run.recording import run
 from rsltrace.trace.reader import Trace

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.campaign.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings
-from rsltrace.doors.processes.child import Child
-from rsltrace.doors.processes.life import Life, has_memory
+from rsltrace.adapters.processes.child import Child
+from rsltrace.adapters.processes.life import Life, has_memory
 from rsltrace.job import load_job
 from rsltrace.run.recording import run
+from rsltrace.search.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings
 from rsltrace.trace.reader import Trace
 
 JOB = """

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 
 import rsltrace
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import Defer, Drop, parse_edit
 from rsltrace.run import run
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

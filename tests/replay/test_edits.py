@@ -13,14 +13,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import rsltrace
-from rsltrace.bag.export import export_bag
 from rsltrace.cli.main import cli
 from rsltrace.errors import EditError
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import parse_edit
 from rsltrace.run import run
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings.export import export_bag
 from tests.replay.conftest import JOB, NODES
 from tests.run.conftest import TALKER
 from tests.run.test_recorded_order import ALL, MIXED

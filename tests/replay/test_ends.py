@@ -13,8 +13,8 @@ import pytest
 
 import rsltrace
 from rsltrace.job import load_job
-from rsltrace.loop.stop import Stop
 from rsltrace.run import Observer, run
+from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.reader import Trace
 from tests.replay.conftest import JOB
 from tests.run.conftest import TALKER

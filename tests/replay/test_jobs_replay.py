@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 import rsltrace
-from rsltrace.bag.export import export_bag
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
 from rsltrace.run import run
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings.export import export_bag
 from tests.guard.conftest import node_code
 from tests.run.conftest import TALKER
 from tests.run.test_recorded_order import ALL, MIXED

@@ -11,9 +11,9 @@ import pytest
 
 import rsltrace
 from rsltrace.job import load_job
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.run import run
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from tests.replay.test_jobs_replay import EXAMPLES, FEATURES
 from tests.run.conftest import TALKER

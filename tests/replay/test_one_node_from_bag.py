@@ -13,10 +13,10 @@ import pytest
 from click.testing import CliRunner
 
 import rsltrace
-from rsltrace.bag.export import export_bag
 from rsltrace.cli.main import cli
 from rsltrace.testing import NodeChanged, assert_node_unchanged
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings.export import export_bag
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]

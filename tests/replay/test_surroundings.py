@@ -14,10 +14,10 @@ from typing import Any
 
 import pytest
 
-from rsltrace.campaign import perturb
-from rsltrace.campaign.perturb import surroundings
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.search import perturb
+from rsltrace.search.perturb import surroundings
 from rsltrace.trace.reader import Trace
 from sample_traces.make_samples import PAIRS
 from tests.replay.test_jobs_replay import EXAMPLES, ROOT

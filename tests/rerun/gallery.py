@@ -15,9 +15,9 @@ import numpy as np
 import trace_maker
 from rosbags.typesys import Stores, get_typestore
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 MS = 1_000_000

@@ -16,7 +16,7 @@ from mcap.records import Chunk, Schema
 
 from campaigns.attack import mcap_parts
 from rsltrace.errors import OutputError, TraceError
-from rsltrace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, OutputKind
 
 pytest.importorskip("rerun")
 

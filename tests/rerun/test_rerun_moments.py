@@ -10,8 +10,8 @@ import trace_maker
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 pytest.importorskip("rerun")

@@ -9,9 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from rsltrace.cli.main import cli
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place, output_places
+from rsltrace.trace.words.code import code_place, output_places
 
 pytestmark = pytest.mark.ros
 

@@ -18,7 +18,7 @@ import demo_packages as demos
 import pytest
 
 import rsltrace
-from rsltrace.campaign.perturb import LOAD, Surroundings, record_in, surroundings
+from rsltrace.search.perturb import LOAD, Surroundings, record_in, surroundings
 from tests.tiers import cases
 
 pytestmark = [

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.campaign.perturb import LOAD, Recorded, Surroundings, record_in, surroundings
+from rsltrace.search.perturb import LOAD, Recorded, Surroundings, record_in, surroundings
 from tests.tiers import cases
 
 pytestmark = [pytest.mark.ros, pytest.mark.repeated]

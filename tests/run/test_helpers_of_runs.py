@@ -11,10 +11,10 @@ import pytest
 
 import rsltrace
 from rsltrace import BagSpec, Job, NodeSpec, StopSpec, Trace
-from rsltrace.bag import open_bag
-from rsltrace.bag.export import export_bag
 from rsltrace.errors import JobError, NodeError
 from rsltrace.job import HooksSpec
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings.export import export_bag
 
 pytestmark = pytest.mark.ros
 

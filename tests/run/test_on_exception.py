@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import NodeError
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 FLAKY = """

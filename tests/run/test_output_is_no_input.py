@@ -28,7 +28,7 @@ TALK = "nodes: [{node: nodes_under_test:Talker}]\nstop: {duration: 2s}\n"
 def test_what_a_job_reads_is_not_overwritten(
     job_file: Callable[..., Path], tmp_path: Path, more: str, output: str, what: str
 ) -> None:
-    from rsltrace.bag.export import export_bag
+    from rsltrace.trace.recordings.export import export_bag
 
     first = tmp_path / "first.mcap"
     record(load_job(job_file(TALK)), first)

@@ -21,8 +21,8 @@ import pytest
 
 from rsltrace import Trace
 from rsltrace.job import load_job
-from rsltrace.loop.stop import Stop
 from rsltrace.run import Observer, run
+from rsltrace.simulation.loop.stop import Stop
 
 pytestmark = pytest.mark.ros
 
@@ -157,7 +157,7 @@ def test_an_exception_shows_the_users_traceback_and_exits_3(
     assert done.returncode == 3
     assert "raise KeyError('wheel')" in done.stderr
     assert "/talker: timer Faulty.tick" in done.stderr
-    assert "rsltrace/doors" not in done.stderr
+    assert "rsltrace/adapters" not in done.stderr
     assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
 
 

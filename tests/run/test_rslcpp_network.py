@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from rsltrace import Trace, load_job
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 pytestmark = pytest.mark.ros
 

@@ -169,7 +169,7 @@ def test_an_exception_names_node_entity_and_time_and_the_trace_is_complete(
     assert "three is too many" in str(error)
     assert "raise ValueError('three is too many')" in error.traceback_text
     assert str(tmp_path / "nodes_under_test.py") in error.traceback_text
-    assert "rsltrace/doors" not in error.traceback_text
+    assert "rsltrace/adapters" not in error.traceback_text
     assert result.exit_code == 3
     with Trace.open(result.path) as trace:
         assert trace.complete

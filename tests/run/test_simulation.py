@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import rsltrace
 from rsltrace import Job, NodeSpec, RunResult, Simulation, StopSpec, Trace
 from rsltrace.errors import DeadlockError, NodeError, OutputError, RunError, UnsupportedError
-from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind
 
 pytestmark = pytest.mark.ros
 

@@ -32,7 +32,12 @@ assert get_plugins.__module__ == "pydantic.plugin._loader"
 """
 _NOT_NEEDED = (
     *("lark", "em", "rosidl_pycommon", "importlib.metadata", "xml.etree.ElementTree"),
-    *("rosbags", "rich", "rsltrace.launch.expand", "rsltrace.workspace.interfaces"),
+    *(
+        "rosbags",
+        "rich",
+        "rsltrace.adapters.launch.expand",
+        "rsltrace.adapters.workspace.interfaces",
+    ),
 )
 
 

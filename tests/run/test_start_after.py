@@ -11,8 +11,8 @@ import pytest
 import rsltrace
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
-from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.run.checking import check_job
+from rsltrace.trace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

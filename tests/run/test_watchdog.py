@@ -22,8 +22,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rclpy.node import Node
 
 import rsltrace
-from rsltrace.loop.stop import Stop
 from rsltrace.run import Observer, run, watchdog
+from rsltrace.simulation.loop.stop import Stop
 from tests.guard.conftest import list_as_wheel
 
 pytestmark = pytest.mark.ros

@@ -7,9 +7,9 @@ from itertools import accumulate
 
 import pytest
 
-from rsltrace.timing.bounds import bounds
-from rsltrace.timing.curves import PROCESSOR, Arrivals, Supply
-from rsltrace.timing.system import Callback, Executor, Order, System, Task
+from rsltrace.native.timing.bounds import bounds
+from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
+from rsltrace.native.timing.system import Callback, Executor, Order, System, Task
 
 
 def task(

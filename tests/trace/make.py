@@ -13,16 +13,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import (
-    NO_EVENT,
-    NO_SEQUENCE,
-    Event,
-    EventFlag,
-    EventKind,
-    Output,
-    OutputKind,
-)
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64, output_hash
 from rsltrace.trace.format import (
@@ -35,6 +25,16 @@ from rsltrace.trace.format import (
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
     TOPIC_ROSOUT,
+)
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    Event,
+    EventFlag,
+    EventKind,
+    Output,
+    OutputKind,
 )
 from rsltrace.trace.writer import TraceWriter
 

@@ -13,9 +13,9 @@ import xxhash
 import zstandard
 from trace_maker import write_run
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace import format as layout
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "trace-format.md"
 

@@ -17,12 +17,12 @@ from mcap.opcode import Opcode
 from trace_maker import Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import OutputError, TraceError
-from rsltrace.mcap import limits
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import EventKind
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.decode import Decoder, Decoders
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.mcap import limits
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.states import state_after
 from rsltrace.trace.writer import TraceWriter

@@ -13,12 +13,12 @@ from mcap.writer import Writer
 from trace_maker import Feeder, Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import TraceError, TraceFormatError
-from rsltrace.mcap.records import Span
-from rsltrace.mcap.source import FileSource
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace import index as index_module
 from rsltrace.trace.format import EVENT_DTYPE, EVENTS_PER_SEGMENT, OUTPUT_DTYPE
+from rsltrace.trace.mcap.records import Span
+from rsltrace.trace.mcap.source import FileSource
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.pieces import read_chunk
 from rsltrace.trace.reader import RUN, Trace
 

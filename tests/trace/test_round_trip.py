@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from trace_maker import Opened
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace import writer as writer_module
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from rsltrace.errors import OutputError
-from rsltrace.mcap.sink import Sink, unfinished
+from rsltrace.trace.mcap.sink import Sink, unfinished
 
 MAGIC = b"\x89MCAP0\r\n"
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="traces are recorded on Linux")
@@ -89,7 +89,7 @@ def test_a_file_that_is_not_what_was_written_is_never_finished(
 def test_a_large_file_is_read_back_if_its_time_says_that_it_was_touched(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rsltrace.mcap.sink._READ_BACK_BYTES", 0)
+    monkeypatch.setattr("rsltrace.trace.mcap.sink._READ_BACK_BYTES", 0)
     sink = begun(path)
     rewrite(path)
     os.utime(path, ns=(1, 1))  # a clock's tick later, as it were

@@ -13,9 +13,9 @@ from rosbags.typesys import Stores, get_typestore
 from trace_maker import START_NS, Opened, write_run
 
 from rsltrace.errors import SetupError, TraceError
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.decode import to_plain
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 pa = pytest.importorskip("pyarrow")

@@ -11,9 +11,9 @@ from rosbags.typesys import get_types_from_msg
 from rosbags.typesys.store import Typestore
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.trace.cdr import pack_detail, pack_entity, unpack_detail, unpack_entity
 from rsltrace.trace.format import SCHEMA_DETAIL, SCHEMA_ENTITY, SCHEMA_TEXT
+from rsltrace.trace.model.entity import Entity, EntityKind
 
 TEXT = st.text(st.characters(exclude_categories=("Cs",)), max_size=20)
 U32 = st.integers(0, 2**32 - 1)

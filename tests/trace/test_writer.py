@@ -16,9 +16,6 @@ from ruamel.yaml import YAML
 from trace_maker import MS, QOS_YAML, START_NS, UINT64_HASH, Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import OutputError
-from rsltrace.mcap.checksum import crc_of, joined_crc
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.format import (
     EVENT_REST,
@@ -27,6 +24,9 @@ from rsltrace.trace.format import (
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
 )
+from rsltrace.trace.mcap.checksum import crc_of, joined_crc
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -231,7 +231,7 @@ def test_equal_schemas_are_written_once_and_a_topic_has_one_channel(tmp_path: Pa
 def test_too_many_topics_is_an_output_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rsltrace.mcap.writer.CHANNELS_MAX", 6)
+    monkeypatch.setattr("rsltrace.trace.mcap.writer.CHANNELS_MAX", 6)
     with Opened(tmp_path / "run.mcap") as feeder:
         feeder.writer.add_channel("/a", "x/msg/T", "")
         feeder.writer.add_channel("/b", "x/msg/T", "")
@@ -374,7 +374,7 @@ sys.path.insert(0, {tests!r})
 resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
 import make
 from rsltrace.errors import OutputError
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 import random
 try:
     with make.Opened(Path(sys.argv[1])) as feeder:

@@ -189,8 +189,8 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with wide characters and with what steers terminals, a payload that was not kept, a warning."""
     from trace_maker import CDR, LOG_SCHEMA, Opened, cdr_string, log_message
 
-    from rsltrace.model.entity import EntityKind
-    from rsltrace.model.event import EventFlag, EventKind, OutputKind
+    from rsltrace.trace.model.entity import EntityKind
+    from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 
     path = tmp_path_factory.mktemp("viewer") / "odd.mcap"
     with Opened(path) as feeder:

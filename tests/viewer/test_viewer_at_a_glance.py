@@ -27,10 +27,10 @@ from rsltrace_viewer.terminal.screens.logs import LogScreen
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.source import SourceView
 
-from rsltrace.model.draw import Draw, encode_draw
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.trace.counts import count
+from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 Drive = Callable[..., None]
 SAMPLES = Path(__file__).parents[2] / "sample_traces"

@@ -12,7 +12,7 @@ from rsltrace_viewer.terminal import follow
 from rsltrace_viewer.terminal.screens.pick import PickScreen
 from trace_maker import Opened, boundaries, write_run
 
-from rsltrace.model.event import EventKind
+from rsltrace.trace.model.event import EventKind
 
 Drive = Callable[..., None]
 

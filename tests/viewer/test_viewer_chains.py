@@ -16,9 +16,9 @@ from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from trace_maker import MS, START_NS, Opened
 
 from rsltrace import measure_latencies
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.format import ATTACHMENT_JOB
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 
 Drive = Callable[..., None]
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback" / "a.mcap"

@@ -19,7 +19,7 @@ from rsltrace_viewer.model.steady import ends_of, spread
 from rsltrace_viewer.model.view import OneRun
 from rsltrace_viewer.model.windows import Window, step_below, step_from
 
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.stamp import format_seconds
 
 _S = 1_000_000_000
 
@@ -154,8 +154,8 @@ def steady(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Run]:
     """Forty thousand events of a camera of 30 Hz and a lidar of 10 Hz that calls back twice."""
     from trace_maker import Opened
 
-    from rsltrace.model.entity import EntityKind
-    from rsltrace.model.event import EventKind
+    from rsltrace.trace.model.entity import EntityKind
+    from rsltrace.trace.model.event import EventKind
 
     path: Path = tmp_path_factory.mktemp("steady") / "steady.mcap"
     with Opened(path) as feeder:

@@ -25,8 +25,8 @@ from rsltrace_viewer.model.view import OneRun
 from rsltrace_viewer.model.windows import Window
 from rsltrace_viewer.terminal.screens.help import help_text
 
-from rsltrace.model.event import NO_EVENT
-from rsltrace.words.times import parse_stamp
+from rsltrace.trace.model.event import NO_EVENT
+from rsltrace.trace.words.times import parse_stamp
 
 
 def test_the_model_loads_no_terminal_library() -> None:

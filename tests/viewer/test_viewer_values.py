@@ -15,8 +15,8 @@ from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
 from rsltrace.diff.row_sign import Sign
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 

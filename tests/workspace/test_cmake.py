@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.adapters.workspace.cmake import commands
+from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.adapters.workspace.installs import compiled_executables, executables, modules
 from rsltrace.errors import JobError
 from rsltrace.run.plans.executables import find_executable
 from rsltrace.source_packages import SourcePackage
-from rsltrace.workspace.cmake import commands
-from rsltrace.workspace.imports import unbuilt_packages
-from rsltrace.workspace.installs import compiled_executables, executables, modules
 
 _FILES = (
     "examples/ex_a.py",
@@ -158,7 +158,7 @@ def test_any_text_is_read(text: str) -> None:
     folder = Path(__file__).parent
     package = SourcePackage("robot", folder / "nowhere")
     assert commands(package) == []
-    from rsltrace.workspace import cmake
+    from rsltrace.adapters.workspace import cmake
 
     evaluation = cmake._Evaluation(package)
     words, end = cmake._arguments(text, 0)

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from rsltrace import Trace
+from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.adapters.workspace.installs import executables, modules
 from rsltrace.errors import JobError
 from rsltrace.run.plans.executables import find_executable, why_not
 from rsltrace.source_packages import SourcePackage, workspace_of
-from rsltrace.workspace.imports import unbuilt_packages
-from rsltrace.workspace.installs import executables, modules
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -15,16 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.adapters.workspace import cache
+from rsltrace.adapters.workspace.build_files import entry_points, name_and_version
+from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.adapters.workspace.interfaces import interface_makers, module_name
+from rsltrace.adapters.workspace.share import share_prefix
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.source_packages import SourcePackage, source_packages
 from rsltrace.trace.reader import Trace
-from rsltrace.workspace import cache
-from rsltrace.workspace.build_files import entry_points, name_and_version
-from rsltrace.workspace.imports import unbuilt_packages
-from rsltrace.workspace.interfaces import interface_makers, module_name
-from rsltrace.workspace.share import share_prefix
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 pytest.importorskip("rosidl_adapter", reason="needs ROS's rosidl")
@@ -170,7 +170,9 @@ def test_the_run_that_makes_the_classes_is_like_the_next(runs: tuple[Path, list[
 
 def test_nothing_of_it_is_left_behind(runs: tuple[Path, list[Any]]) -> None:
     assert not [name for name in sys.modules if name.partition(".")[0] in ("arm", "arm_interfaces")]
-    assert not [f for f in sys.meta_path if type(f).__module__.startswith("rsltrace.workspace")]
+    assert not [
+        f for f in sys.meta_path if type(f).__module__.startswith("rsltrace.adapters.workspace")
+    ]
 
 
 def test_natively_they_are_refused_by_name(runs: tuple[Path, list[Any]]) -> None:
@@ -221,7 +223,7 @@ def test_classes_and_hashes_are_those_that_a_build_makes(
 def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
     from std_srvs.srv import SetBool
 
-    from rsltrace.doors.rclpy.wire.type_descriptions import _from_file, type_description
+    from rsltrace.adapters.rclpy.wire.type_descriptions import _from_file, type_description
 
     built, read = type_description(SetBool), _from_file("std_srvs/srv/SetBool")
     assert built is not None

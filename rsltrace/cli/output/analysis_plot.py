@@ -5,7 +5,7 @@ from __future__ import annotations
 from textwrap import fill
 from typing import Any
 
-from rsltrace.timing.analysis import Analysis
+from rsltrace.native.timing.analysis import Analysis
 
 _NS_PER_MS = 1e6
 

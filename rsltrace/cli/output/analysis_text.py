@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.model.stamp import format_duration
-from rsltrace.timing.analysis import Analysis, ChainResult, Seen
-from rsltrace.words.table import table
+from rsltrace.native.timing.analysis import Analysis, ChainResult, Seen
+from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.words.table import table
 
 _TIMES = {
     "job": "as the job says, at most",

@@ -12,9 +12,9 @@ from rsltrace.diff import diff_files
 from rsltrace.diff.report import render
 
 if TYPE_CHECKING:
-    from rsltrace.campaign.bisect.repository import Commit, Repository
-    from rsltrace.campaign.bisect.search import Found, Tried
     from rsltrace.diff.result import Diff
+    from rsltrace.search.bisect.repository import Commit, Repository
+    from rsltrace.search.bisect.search import Found, Tried
 
 _FILES_MAX = 12
 Kept = tuple[Path, Path] | None

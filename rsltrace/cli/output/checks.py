@@ -12,12 +12,12 @@ from rsltrace.checks.functions import load_function
 from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
 from rsltrace.run.process import search_path
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place
-from rsltrace.words.events import EventWords
+from rsltrace.trace.words.code import code_place
+from rsltrace.trace.words.events import EventWords
 
 _SHOWN_MAX = 3
 _WORDS = {UNDECIDED: "not decided before the end of the run"}

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.model.draw import draw_text, is_switch
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
-from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
+from rsltrace.trace.model.draw import draw_text, is_switch
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place, output_places
-from rsltrace.words.kinds import flag_names
-from rsltrace.words.logs import log_record
+from rsltrace.trace.words.code import code_place, output_places
+from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.logs import log_record
 
 _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
 _WITH_PLACE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.LOG)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from itertools import chain
 
-from rsltrace.model.event import Event, Output, OutputKind
-from rsltrace.model.finding import Finding
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.event import Event, Output, OutputKind
+from rsltrace.trace.model.finding import Finding
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_places, output_places, places_text
-from rsltrace.words.events import EventWords
-from rsltrace.words.kinds import flag_names
+from rsltrace.trace.words.code import code_places, output_places, places_text
+from rsltrace.trace.words.events import EventWords
+from rsltrace.trace.words.kinds import flag_names
 
 _VALUE_MAX = 200
 _COLUMN_MAX = 40

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.fit.checked import NEAR, Checked, CheckedChain, far
-from rsltrace.fit.comparison import Compared
-from rsltrace.fit.models import Model, as_job_has_it
-from rsltrace.fit.parts import Fit, time_text
-from rsltrace.latency.figures import Durations
-from rsltrace.model.stamp import format_duration
-from rsltrace.words.table import table
+from rsltrace.checks.latency.figures import Durations
+from rsltrace.native.fit.checked import NEAR, Checked, CheckedChain, far
+from rsltrace.native.fit.comparison import Compared
+from rsltrace.native.fit.models import Model, as_job_has_it
+from rsltrace.native.fit.parts import Fit, time_text
+from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.words.table import table
 
 _PERCENT = (50, 95, 99)
 _HEAD = ("count", "p50", "p95", "p99", "max")

@@ -14,8 +14,8 @@ from typing import Literal
 from xml.sax.saxutils import escape
 
 from rsltrace.errors import SetupError
-from rsltrace.middleware.overview import End, Link, Overview
-from rsltrace.model.printable import printable
+from rsltrace.simulation.middleware.overview import End, Link, Overview
+from rsltrace.trace.model.printable import printable
 
 _CHARACTER = 7.3
 _ROW = 54.0

@@ -8,12 +8,12 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.latency.figures import Figures, figures
-from rsltrace.latency.instances import Parts, Passage
-from rsltrace.latency.measure import MEASURES, ChainLatency, Latencies
-from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.table import table
+from rsltrace.checks.latency.figures import Figures, figures
+from rsltrace.checks.latency.instances import Parts, Passage
+from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.table import table
 
 _WORDS = {
     "latency": "latency",

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.cli.output.watching import interruptible, progress
 from rsltrace.errors import NodeError
-from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.stamp import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked
     from rsltrace.job import Job
-    from rsltrace.loop.stop import Stop
     from rsltrace.native.recording import NativeResult
+    from rsltrace.simulation.loop.stop import Stop
 
 
 def run_native(

@@ -6,12 +6,12 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import Any
 
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.format import METADATA_NATIVE
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.native import Spread, busy_threads, callback_figures
 from rsltrace.trace.reader import Trace
-from rsltrace.words.table import table
+from rsltrace.trace.words.table import table
 
 NO_DIGEST = "none: a native run is observed, and no other run has the same times"
 _CLOCKS = ("wall_ns", "steady_ns", "mode", "ignored")

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 
 
 @contextmanager

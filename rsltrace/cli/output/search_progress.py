@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from rsltrace.explore.search import Budget, Search
+    from rsltrace.search.explore.search import Budget, Search
 
 _LOOK_EVERY_S = 0.2
 

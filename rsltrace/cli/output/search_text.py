@@ -6,8 +6,8 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from rsltrace.explore.search import Search, Tally
-from rsltrace.explore.trial import JobSource, TrialResult, overrides_of
+from rsltrace.search.explore.search import Search, Tally
+from rsltrace.search.explore.trial import JobSource, TrialResult, overrides_of
 
 _CAUSES_MAX = 20
 _TEXT_MAX = 300

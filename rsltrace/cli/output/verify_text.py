@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rsltrace.campaign.perturb import CORE_TYPE, KERNEL
+from rsltrace.search.perturb import CORE_TYPE, KERNEL
 
 if TYPE_CHECKING:
-    from rsltrace.campaign.perturb import Recorded
-    from rsltrace.campaign.verify import Verified
+    from rsltrace.search.perturb import Recorded
+    from rsltrace.search.verify import Verified
 
 _LINES_MAX = 40
 _WAY_OUT = (

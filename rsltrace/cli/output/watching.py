@@ -9,17 +9,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.loop.stop import Stop
+    from rsltrace.simulation.loop.stop import Stop
 
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
     """Turn the first SIGINT, SIGTERM or SIGHUP into a proper end of the run; a second one
     interrupts whatever callback is stuck."""
-    from rsltrace.loop.stop import Stop
+    from rsltrace.simulation.loop.stop import Stop
 
     ends: list[Callable[[Stop], None]] = []
     old: dict[int, Any] = {}

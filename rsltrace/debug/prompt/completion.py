@@ -8,8 +8,8 @@ from rsltrace.conditions.names import short_name
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
 from rsltrace.debug.prompt.commands import Prompt
 from rsltrace.errors import DebugError
-from rsltrace.model.finding import Source
-from rsltrace.words.matching import LOG_LEVELS
+from rsltrace.trace.model.finding import Source
+from rsltrace.trace.words.matching import LOG_LEVELS
 
 _HEADS = "node topic entity output exception log finding watch when t=".split()
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.kinds import flag_names
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:
     from rsltrace.debug.positions import Breakpoint, Position, Stopped

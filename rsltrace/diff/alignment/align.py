@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rsltrace.diff.alignment.match import NO_CAUSE, UNKNOWN, EventSequence, match
 from rsltrace.diff.alignment.rows import Rows
-from rsltrace.model.event import NO_EVENT
+from rsltrace.trace.model.event import NO_EVENT
 
 
 @dataclass

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.words.entities import EntityKey
 
 _NODE = EntityKind.NODE.label
 

@@ -8,8 +8,8 @@ from dataclasses import astuple
 from difflib import SequenceMatcher
 
 from rsltrace.diff.alignment.rows import OutputRow
-from rsltrace.model.event import OutputKind
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.words.entities import EntityKey
 
 _ALIGNED_MAX = 1000
 _RECEIVED = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)

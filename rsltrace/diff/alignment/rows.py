@@ -12,9 +12,9 @@ from functools import cached_property
 import numpy as np
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
-from rsltrace.model.draw import Draw, encode_draw
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 CONSTRUCT = int(EventKind.CONSTRUCT)

@@ -13,11 +13,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.bag import open_bag
 from rsltrace.diff.file_kind import is_trace
 from rsltrace.errors import RsltraceError, TraceError
-from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE
+from rsltrace.trace.mcap.records import SCHEMA_ENCODING
+from rsltrace.trace.recordings import open_bag
 
 if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace

@@ -19,9 +19,9 @@ from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.facts.causes import UnrecordedAnswer
 from rsltrace.diff.facts.evidence import CallDifference, EventView
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.finding import Finding, Mode, Source
-from rsltrace.model.printable import printable, shortened, told_apart
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.finding import Finding, Mode, Source
+from rsltrace.trace.model.printable import printable, shortened, told_apart
 
 CALLS_MAX = 20
 EARLIER_MAX = 3

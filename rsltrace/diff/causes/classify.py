@@ -46,9 +46,9 @@ from rsltrace.diff.facts.evidence import (
     StateDifference,
     node_of,
 )
-from rsltrace.model.draw import is_switch
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.draw import is_switch
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 
 _DRAWN_FROM = ("delay", "faults", "execution", "seed", "clocks")
 """Keys of a job that decide whether something is drawn."""

@@ -13,7 +13,7 @@ from rsltrace.diff.causes.propagation import (
     Propagation,
     outputs_of_one,
 )
-from rsltrace.model.event import OutputKind
+from rsltrace.trace.model.event import OutputKind
 
 PARAMETER_EVENTS = "/parameter_events"
 

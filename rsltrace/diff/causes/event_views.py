@@ -10,11 +10,11 @@ import numpy.typing as npt
 
 from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
 from rsltrace.diff.facts.evidence import EventView
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.words.code import code_places, place_here, places_text
-from rsltrace.words.entities import EntityKey
-from rsltrace.words.outputs import output_text
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.words.code import code_places, place_here, places_text
+from rsltrace.trace.words.entities import EntityKey
+from rsltrace.trace.words.outputs import output_text
 
 COUNTED_MAX = 8192
 """Events up to here are told which of their entity's events they are. Counting takes reading."""

@@ -43,9 +43,9 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.facts.remarks import Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Divergence
-from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
-from rsltrace.words.phrases import seconds_text
+from rsltrace.trace.words.phrases import seconds_text
 
 ANCESTORS_MAX = 5
 """Events told that led to a root: both runs have them, they only say how it came to run."""

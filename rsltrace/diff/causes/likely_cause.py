@@ -28,9 +28,9 @@ from rsltrace.diff.facts.causes import (
 )
 from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, Moved
 from rsltrace.errors import JobError
-from rsltrace.model.finding import Source
 from rsltrace.trace.format import METADATA_SOURCES
-from rsltrace.words.code import code_file, code_place
+from rsltrace.trace.model.finding import Source
+from rsltrace.trace.words.code import code_file, code_place
 
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
 """What ``subprocess`` asks of the system about the program that it has started."""
@@ -143,7 +143,7 @@ def _is_as_recorded(run: Run, file: Path) -> bool:
 
 def _lines_with_sets(file: Path, line: int) -> list[tuple[int, str]]:
     """Return where a file goes through sets: in the function at a line, or else anywhere."""
-    from rsltrace.audit.audit import audit_path  # most diffs do not need it
+    from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
         found = [(o.line, o.call) for o in audit_path(file).found if o.kind == Source.ORDER.value]

@@ -27,7 +27,7 @@ from rsltrace.diff.alignment.rows import (
     counts,
 )
 from rsltrace.diff.causes.relevance import resolved_job
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 CAUSE = "cause"

@@ -16,9 +16,9 @@ from typing import Any
 from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.facts.evidence import Setting, SettingKind
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.finding import Mode, Source
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 _NEVER = frozenset(("record", "checks", "metrics", "vary", "livelock_limit", "stop", "vars"))

@@ -15,7 +15,7 @@ from rsltrace.diff.facts.remarks import Remark
 
 if TYPE_CHECKING:
     from rsltrace.trace.native import Spread
-    from rsltrace.words.entities import EntityKey
+    from rsltrace.trace.words.entities import EntityKey
 
 
 class BagVerdict(Enum):

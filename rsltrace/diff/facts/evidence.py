@@ -8,9 +8,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.words.entities import EntityKey
 
 
 @dataclass(frozen=True, slots=True)

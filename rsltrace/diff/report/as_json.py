@@ -28,10 +28,10 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.result import BagDiff, Diff, Divergence
 from rsltrace.diff.sentences.runs import moved_text
 from rsltrace.diff.sentences.values import fate_text, link_text, no_fields_text, notes_text
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.entities import EntityKey
-from rsltrace.words.kinds import flag_names
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.entities import EntityKey
+from rsltrace.trace.words.kinds import flag_names
 
 FORMAT = "rsltrace-diff"
 VERSION = 1

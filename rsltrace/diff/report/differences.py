@@ -12,9 +12,9 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
 from rsltrace.diff.sentences.values import fate_text, notes_text
-from rsltrace.model.event import OutputKind
-from rsltrace.model.printable import printable, shortened
-from rsltrace.words.code import places_text
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.words.code import places_text
 
 _INDENT = "    "
 _INLINE_MAX = 26

@@ -21,10 +21,10 @@ from rsltrace.diff.report.line import (
 )
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.sentences.values import link_text, no_fields_text
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.kinds import flag_names
-from rsltrace.words.phrases import event_title, seconds_text
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.kinds import flag_names
+from rsltrace.trace.words.phrases import event_title, seconds_text
 
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 
-from rsltrace.model.printable import printable, shortened
-from rsltrace.words.phrases import as_sentence
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.words.phrases import as_sentence
 
 
 class Style:

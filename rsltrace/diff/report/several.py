@@ -11,9 +11,9 @@ from rsltrace.diff.report.divergence import event_text
 from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.diff.sentences.runs import remark_text
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.phrases import as_sentence
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.phrases import as_sentence
 
 COLUMNS = ("run", "verdict", "event", "time", "where")
 

@@ -27,9 +27,9 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result import Diff, Side
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
-from rsltrace.model.printable import printable, told_apart
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.phrases import as_sentence, seconds_text
+from rsltrace.trace.model.printable import printable, told_apart
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.phrases import as_sentence, seconds_text
 
 if TYPE_CHECKING:
     from rsltrace.diff.result import Divergence

@@ -41,9 +41,9 @@ from rsltrace.diff.facts.remarks import (
     Told,
 )
 from rsltrace.diff.sentences import says, sentence
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.phrases import seconds_text
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.phrases import seconds_text
 
 _OPTIONS_MAX = 3
 _TEXT_MAX = 200

@@ -27,9 +27,9 @@ from rsltrace.diff.facts.evidence import (
     TimerPeriodSet,
 )
 from rsltrace.diff.sentences import says, sentence
-from rsltrace.model.event import OutputKind
-from rsltrace.model.printable import printable, shortened, told_apart
-from rsltrace.model.stamp import durations_apart, format_duration
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.printable import printable, shortened, told_apart
+from rsltrace.trace.model.stamp import durations_apart, format_duration
 
 NAMED_MAX = 3
 _VALUE_MAX = 40

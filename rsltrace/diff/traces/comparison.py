@@ -48,8 +48,8 @@ from rsltrace.diff.traces.ended_runs import (
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.errors import TraceError, did_you_mean
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10

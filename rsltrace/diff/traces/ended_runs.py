@@ -17,9 +17,9 @@ from rsltrace.diff.facts.causes import (
 from rsltrace.diff.facts.evidence import EventView, Setting
 from rsltrace.diff.facts.remarks import EndedByException, Remark
 from rsltrace.diff.traces.sides import stop_reason
-from rsltrace.model.event import Event, EventFlag, EventKind
-from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import REPLAY_DIVERGED
+from rsltrace.trace.model.event import Event, EventFlag, EventKind
+from rsltrace.trace.model.printable import printable, shortened
 from rsltrace.trace.reader import Trace
 
 _LOOKED_AT_MAX = 100

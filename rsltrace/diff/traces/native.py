@@ -30,11 +30,11 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.native import Spread, event_columns, is_native, spread
 from rsltrace.trace.reader import Trace
-from rsltrace.words.entities import EntityKey
+from rsltrace.trace.words.entities import EntityKey
 
 TIMES = ("stamp", "*.stamp")
 """Fields that are not compared: what they hold is real time, or was simulated."""

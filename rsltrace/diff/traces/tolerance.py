@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:

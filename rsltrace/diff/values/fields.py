@@ -26,9 +26,9 @@ from rsltrace.diff.values.numbers import (
     number_text,
     same_number,
 )
-from rsltrace.model.placeholders import PLACEHOLDERS
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import NS_PER_S, format_seconds
+from rsltrace.trace.model.placeholders import PLACEHOLDERS
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import NS_PER_S, format_seconds
 
 WHOLE = "(whole)"
 """The path of a difference that belongs to no field: of the types, or of two plain values."""

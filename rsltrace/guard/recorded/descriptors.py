@@ -23,7 +23,7 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _RECORD = Mode.RECORD
 _MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)

@@ -25,7 +25,7 @@ from rsltrace.guard.recorded.descriptors import (
     tracked,
 )
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _FILE = Source.FILE
 _RECORD, _ALLOW = Mode.RECORD, Mode.ALLOW

@@ -20,7 +20,7 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.recorded.descriptors import recording
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.waiting import NOT_YET, wait_recorded, wait_unrecorded, waiting_guard
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _RECORDED = (Source.SOCKET, Source.PROCESS, Source.FILE)
 _ALL_EVENTS = select.POLLIN | select.POLLPRI | select.POLLOUT

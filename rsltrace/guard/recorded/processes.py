@@ -29,7 +29,7 @@ from rsltrace.guard.waiting import (
     wait_unrecorded,
     waiting_guard,
 )
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _KEPT_OPEN = 3
 _LOOKED = "_rsltrace_looked"

@@ -21,7 +21,7 @@ from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded.descriptors import joining, recording
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _RECEIVING = ("recv", "recvfrom", "recvmsg")
 _RECEIVING_INTO = ("recv_into", "recvfrom_into")

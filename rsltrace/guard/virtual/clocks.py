@@ -23,7 +23,7 @@ from rsltrace.guard.extension_types import put_member
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_read
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
 _CLOCK, _VIRTUAL = Source.CLOCK, Mode.VIRTUAL

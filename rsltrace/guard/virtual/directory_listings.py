@@ -13,7 +13,7 @@ from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.redirect import redirect
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _NAMES_MAX = 20
 """Names of a listing that the trace keeps."""

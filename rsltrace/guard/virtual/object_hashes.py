@@ -15,7 +15,7 @@ from rsltrace.guard.addresses import hashed_by_address, is_by_address
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.model.finding import Source
+from rsltrace.trace.model.finding import Source
 
 _of_object = object.__hash__
 

@@ -17,7 +17,7 @@ from typing import Any
 from rsltrace.guard.extension_types import exchange_special
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)

@@ -13,7 +13,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 from rsltrace.guard.guard import engage, engaged
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _sources: dict[str, bytes] = {}
 """What was compiled, by file: a file may change while a run lasts."""

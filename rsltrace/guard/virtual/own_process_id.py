@@ -14,7 +14,7 @@ from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.process_ids import meant_id, meant_path, virtual_id
 from rsltrace.guard.redirect import redirect
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _CALL = "os.getpid()"
 _LOGGING = "logging"

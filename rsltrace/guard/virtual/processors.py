@@ -1,7 +1,7 @@
 """How many processors there are: four in every run, whatever the machine has.
 
 Pools get as many workers as that, and data as many parts, which a run would otherwise owe to the
-machine. Processes of the run (``rsltrace.doors.processes``) are told the same.
+machine. Processes of the run (``rsltrace.adapters.processes``) are told the same.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from weakref import WeakKeyDictionary
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.process_ids import meant_id
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 PROCESSORS = 4
 _OF_SYSCONF = frozenset(("SC_NPROCESSORS_CONF", "SC_NPROCESSORS_ONLN"))

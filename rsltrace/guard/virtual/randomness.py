@@ -32,7 +32,7 @@ from rsltrace.guard.redirect import (
     replace_attribute,
     takes_nothing,
 )
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _RANDOM = Source.RANDOM
 _NODE_ID = 0x02_00_00_00_00_01

@@ -32,7 +32,7 @@ from rsltrace.guard.extension_types import exchange, exchange_special
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
 _TYPES: tuple[type, ...] = (set, frozenset)

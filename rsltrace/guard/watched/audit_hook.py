@@ -17,7 +17,7 @@ from rsltrace.guard.asked_files import READERS_OF_CODE, asking_module, is_instal
 from rsltrace.guard.callers import user_frame
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engage, engaged
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _HASHED_BYTES_MAX = 64 << 20
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND

@@ -21,7 +21,7 @@ from rsltrace.guard.callers import is_of_python, module_of
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
-from rsltrace.model.finding import READ_BY, Mode, Source
+from rsltrace.trace.model.finding import READ_BY, Mode, Source
 
 _NOT_READ = ("PYTHON", "ROS_PYTHON_", "ROS_VERSION")
 """What Python looks at for itself, what every class of messages does when it is imported, and what

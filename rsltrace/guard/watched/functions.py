@@ -24,7 +24,7 @@ from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.watched.audit_hook import report_audit_events
 from rsltrace.guard.watched.environment import environment_watched
-from rsltrace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import Mode, Source
 
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"

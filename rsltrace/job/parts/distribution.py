@@ -7,12 +7,12 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.chance.distribution import LONGEST_NS
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
 from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Loc, Problem
 from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
+from rsltrace.simulation.chance.distribution import LONGEST_NS
 
 SAMPLE_UNITS = tuple(UNITS_NS)
 

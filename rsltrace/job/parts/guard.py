@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import attach, check, flag, items, text
 from rsltrace.job.values.problem import Problem, as_flag, describe
-from rsltrace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
+from rsltrace.trace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
 

@@ -10,7 +10,7 @@ from pydantic import Field, field_validator
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import Globs, check, flag, whole
 from rsltrace.job.values.problem import Problem
-from rsltrace.model.event import SEGMENT_EVENTS
+from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 
 class RecordSpec(Part):

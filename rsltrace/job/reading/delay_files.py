@@ -11,14 +11,14 @@ from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import TypeVar
 
-from rsltrace.chance.distribution import LONGEST_NS
 from rsltrace.errors import JobError
 from rsltrace.job.parts.delay import DelaySpec
 from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec, check_series, check_short
 from rsltrace.job.reading.yaml_source import Mark, YamlSource
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_measured
-from rsltrace.model.regular_file import read_regular
+from rsltrace.simulation.chance.distribution import LONGEST_NS
+from rsltrace.trace.model.regular_file import read_regular
 
 _MEASURED = (
     "MEASURED takes the delay from how long the callback ran on the wall clock, which is different "

@@ -20,7 +20,7 @@ from rsltrace.job.reading.tree import place_at, plain
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
 from rsltrace.job.values.checks import FROM_FILE
 from rsltrace.job.values.problem import Problem, format_loc, unknown_key
-from rsltrace.model.regular_file import read_regular
+from rsltrace.trace.model.regular_file import read_regular
 
 Overrides = Sequence["str | tuple[str, str]"]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job.values.names import check_node_name, check_target, check_topic
-from rsltrace.model.module_search import find_module
+from rsltrace.trace.model.module_search import find_module
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 
-from rsltrace.model.stamp import NS_PER_S, format_seconds
+from rsltrace.trace.model.stamp import NS_PER_S, format_seconds
 
 TimeLike = str | int | float
 """A time in Python as in YAML: seconds as a number, or text with a unit."""

@@ -9,9 +9,8 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from rsltrace.bag.playback import Playback
-from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.doors.rclpy.wire.interfaces import get_message_class
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 from rsltrace.job import Job
 from rsltrace.native.apart.plans import THE_BAGS
 from rsltrace.run.plans.bags import (
@@ -25,6 +24,7 @@ from rsltrace.run.plans.bags import (
     start_ns_of,
     with_progress,
 )
+from rsltrace.trace.recordings.playback import Playback
 
 _SETTLED_S = 0.5
 _SETTLED_WITHIN_S = 5.0

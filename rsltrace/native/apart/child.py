@@ -16,11 +16,10 @@ import threading
 from contextlib import ExitStack, suppress
 from typing import Any
 
-from rsltrace.doors.rclpy.boundary.installation import boundary
-from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.doors.rclpy.error_text import exit_status
+from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.error_text import exit_status
 from rsltrace.errors import JobError, RsltraceError
-from rsltrace.middleware.events.failure import text_of, user_traceback
 from rsltrace.native.apart.link import Link, LinkError
 from rsltrace.native.apart.mains import RunningMain
 from rsltrace.native.apart.observers import Observers, Sender
@@ -31,6 +30,7 @@ from rsltrace.native.recording import ENDS_WITHIN_S, rclpy_running
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
 from rsltrace.run.provenance import source_files
+from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
 
 _PR_SET_PDEATHSIG = 1
 

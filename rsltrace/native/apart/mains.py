@@ -11,13 +11,13 @@ from functools import wraps
 from types import ModuleType
 from typing import Any
 
-from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventKind
+from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.native.apart.observers import Observers
 from rsltrace.native.executors import failure_of
 from rsltrace.native.ledger import Callback
 from rsltrace.native.things import Thing
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
 
 
 class RunningMain:

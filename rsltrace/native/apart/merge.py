@@ -9,8 +9,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from rsltrace.model.stamp import NS_PER_S
 from rsltrace.native.ledger import Span, now_ns
+from rsltrace.trace.model.stamp import NS_PER_S
 
 STALLED_NS = 20 * NS_PER_S
 """A process that says nothing for so long (stopped, or in a call that keeps the interpreter) must

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rsltrace.job import Job
-from rsltrace.loop.policy import PriorityRule
+from rsltrace.simulation.loop.policy import PriorityRule
 
 
 @dataclass(frozen=True, slots=True)

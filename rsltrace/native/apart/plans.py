@@ -6,8 +6,8 @@ import os
 import sys
 from dataclasses import replace
 
-from rsltrace.doors.processes.programs import is_python
-from rsltrace.doors.rclpy.entry import StartRule
+from rsltrace.adapters.processes.programs import is_python
+from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.native.apart.children import Start
@@ -79,7 +79,7 @@ def _environment(spec: NodeSpec, processes: Processes, *, is_program: bool) -> d
         return around
     libraries = []
     try:
-        from rsltrace.doors.processes.build import find_ros
+        from rsltrace.adapters.processes.build import find_ros
 
         libraries = [str(path) for path in find_ros().libraries if path.is_relative_to(sys.prefix)]
     except SetupError:

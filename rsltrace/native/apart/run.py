@@ -12,12 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace import errors
-from rsltrace.doors.rclpy.boundary.installation import boundary
-from rsltrace.doors.rclpy.entry import StartRule
-from rsltrace.doors.rclpy.wire.interfaces import get_message_class
+from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.entry import StartRule
+from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 from rsltrace.errors import NodeError, RsltraceError, RunError
-from rsltrace.loop.stop import Stop
-from rsltrace.model.stamp import NS_PER_S, format_seconds
 from rsltrace.native.apart.children import Child, Start, how_ended
 from rsltrace.native.apart.link import Frame
 from rsltrace.native.apart.merge import STALLED_NS, Merge, Source
@@ -31,6 +29,8 @@ from rsltrace.native.ledger import Sent, Span
 from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording, Spent
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import has_stop
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.stamp import NS_PER_S, format_seconds
 
 _KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
 """A process that is stuck ends itself before; this is for one that cannot."""

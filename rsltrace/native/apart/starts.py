@@ -6,10 +6,10 @@ import threading
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from rsltrace.doors.rclpy.entry import StartRule
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import OutputKind
+from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.native.ledger import Sent, Span, now_ns
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import OutputKind
 
 if TYPE_CHECKING:
     from rsltrace.native.apart.children import Child

@@ -10,11 +10,11 @@ from dataclasses import astuple
 from itertools import count
 from typing import Any
 
-from rsltrace.doors.rclpy.wire.interfaces import message_type
-from rsltrace.middleware.interface import MessageType
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.adapters.rclpy.wire.interfaces import message_type
 from rsltrace.native.ledger import Failed, Logged, Scheduled, Sent, Span, Taken
 from rsltrace.native.things import Thing, Things
+from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.trace.model.entity import Entity, EntityKind
 
 _LOG = "rcl_interfaces/msg/Log"
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.replay.one_node.columns import Column, Columns
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 _BEGIN = (EventKind.SERVICE, EventKind.ACTION)
 

@@ -11,12 +11,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from rsltrace.bag import open_bag
-from rsltrace.bag.playback import header_stamp_ns
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.job import BagSpec, Job, StopSpec
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.replay.one_node.outputs import Key, Put, Side, changes, outputs_of_node
 from rsltrace.replay.one_node.probe import Ends, ends_of
 from rsltrace.replay.one_node.result import NodeReplayResult
@@ -26,7 +23,10 @@ from rsltrace.run import Observer
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.recording import run
 from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings.playback import header_stamp_ns
 
 _OF_ALL_NODES = ("/rosout", "/parameter_events")
 _NOT_OF_ROBOTS: dict[str, object] = {
@@ -162,7 +162,7 @@ def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSid
 
 
 def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]) -> None:
-    from rsltrace.doors.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.wire.codec import codec_for
 
     counts: dict[Key, int] = {}
     with open_bag(path, topics=topics, recover=True, skip=never_plays) as bag:

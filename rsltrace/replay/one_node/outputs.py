@@ -13,10 +13,10 @@ from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.values.fields import WHOLE, diff_messages, preview
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, Output, OutputKind
 from rsltrace.replay.one_node.result import Change, OutputChange
 from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, Output, OutputKind
 from rsltrace.trace.reader import Trace
 
 _COMPARED = (

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import Job
-from rsltrace.loop.stop import Stop
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
+from rsltrace.simulation.loop.stop import Stop
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
-from rsltrace.loop.stop import Stop
 from rsltrace.replay.one_node.columns import Columns
 from rsltrace.replay.one_node.outputs import Side, changes, outputs_of_node
 from rsltrace.replay.one_node.result import NodeReplayResult
@@ -21,6 +20,7 @@ from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
 from rsltrace.run.plans.scheduling import switches_at_lines
 from rsltrace.run.process import kept_process
+from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import METADATA_FED
 from rsltrace.trace.reader import Trace
 

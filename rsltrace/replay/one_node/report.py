@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_seconds
 from rsltrace.replay.one_node.result import NodeReplayResult, OutputChange
-from rsltrace.words.table import table
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.table import table
 
 _ROWS = 15
 _WIDTH = 40

@@ -7,7 +7,7 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.diff.facts.evidence import FieldDifference

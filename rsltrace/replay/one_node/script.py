@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from rsltrace.errors import ReplayError
-from rsltrace.loop.fed import NEVER, Step
-from rsltrace.model.draw import Draw, duration_of
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.replay.one_node.columns import SENT, Columns
 from rsltrace.replay.one_node.unit import Unit
+from rsltrace.simulation.loop.fed import NEVER, Step
+from rsltrace.trace.model.draw import Draw, duration_of
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
 
 _ENDPOINTS = (
     EntityKind.NODE,

@@ -10,14 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import ReplayError
-from rsltrace.loop.fed import FedLoop, FedOrderedLoop, end_of
-from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.policy import Fifo
-from rsltrace.middleware.events.dispatcher import Dispatcher
-from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
-from rsltrace.middleware.services import Client
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.replay.one_node.answers import Answers
 from rsltrace.replay.one_node.columns import Columns
 from rsltrace.replay.one_node.script import RecordedScript
@@ -28,7 +20,15 @@ from rsltrace.run import Observer, RunResult
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.session import Session
+from rsltrace.simulation.loop.fed import FedLoop, FedOrderedLoop, end_of
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.policy import Fifo
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
+from rsltrace.simulation.middleware.services import Client
 from rsltrace.trace.format import METADATA_FED
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import EventKind, OutputKind
 
 
 class FedSession(Session):
@@ -87,7 +87,7 @@ class FedSession(Session):
             loop.by_policy = policy is not None and policy.order != "fifo"
 
     def _import_what_is_named(self) -> None:
-        from rsltrace.doors.stand_ins import StandIns
+        from rsltrace.adapters.stand_ins import StandIns
 
         job, world = self.job, self.world
         self._stand_ins = StandIns(world.domain, self._definition)
@@ -167,7 +167,7 @@ class FedSession(Session):
         sent: list[tuple[int, Any]],
         busy_ns: int,
     ) -> None:
-        from rsltrace.doors.stand_ins import Sent
+        from rsltrace.adapters.stand_ins import Sent
 
         found = []
         for position, row in sent:

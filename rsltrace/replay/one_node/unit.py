@@ -14,9 +14,9 @@ import numpy as np
 
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import Job
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.replay.one_node.columns import SENT, Column, Columns
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 
 _OF_ALL = (EventKind.CLOCK_JUMP,)
 

@@ -6,16 +6,16 @@ from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rsltrace.loop.stop import Stop
-from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import OutputKind
 from rsltrace.replay.one_node.outputs import Put
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import OutputKind
 
 if TYPE_CHECKING:
-    from rsltrace.loop.loop import EventLoop
     from rsltrace.run.session import Session
+    from rsltrace.simulation.loop.loop import EventLoop
 
 _SENT = frozenset(
     map(int, (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG))

@@ -9,14 +9,14 @@ from collections import Counter, deque
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from rsltrace.doors.rclpy.wire.interface_classes import class_of
+from rsltrace.adapters.rclpy.wire.interface_classes import class_of
 from rsltrace.errors import BagError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.run.plans.changed_fields import UnfitError, changer
 
 if TYPE_CHECKING:
-    from rsltrace.doors.player import BagPublisher, Message
+    from rsltrace.adapters.player import BagPublisher, Message
 
 
 def check_changes(job: Job, topic: str, message_class: type) -> None:

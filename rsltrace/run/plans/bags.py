@@ -14,20 +14,20 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.job.values.names import check_topic
-from rsltrace.loop.stop import Stop
-from rsltrace.model.event import EventKind
-from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
 from rsltrace.run.plans.stopping import end_ns_of, has_stop
+from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.stamp import NS_PER_S, format_duration, format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.bag import Bag
-    from rsltrace.bag.playback import Playback
-    from rsltrace.bag.storage import StoredTopic
-    from rsltrace.bag.topic import BagTopic
-    from rsltrace.doors.rclpy.handles.node import NodeHandle
-    from rsltrace.doors.rclpy.world import World
+    from rsltrace.adapters.rclpy.handles.node import NodeHandle
+    from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
+    from rsltrace.trace.recordings import Bag
+    from rsltrace.trace.recordings.playback import Playback
+    from rsltrace.trace.recordings.storage import StoredTopic
+    from rsltrace.trace.recordings.topic import BagTopic
 
 PLAYER = "rosbag2_player"
 """The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
@@ -53,8 +53,8 @@ class BagInput:
 @contextmanager
 def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
     """Open one bag of a job. Raises BagError."""
-    from rsltrace.bag import open_bag
-    from rsltrace.bag.playback import Playback
+    from rsltrace.trace.recordings import open_bag
+    from rsltrace.trace.recordings.playback import Playback
 
     spec = job.bags[index]
     try:
@@ -200,7 +200,7 @@ def check_type(bag: str, topic: BagTopic) -> type:
 
     :raises BagError: if its type is not installed.
     """
-    from rsltrace.doors.rclpy.wire.interfaces import get_message_class
+    from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 
     try:
         return get_message_class(topic.type_name)
@@ -229,9 +229,9 @@ def start_players(
         return None
     from rclpy.node import Node
 
-    from rsltrace.doors.player import Player, make_publisher
-    from rsltrace.doors.rclpy.wire.codec import codec_for
-    from rsltrace.doors.rclpy.wire.interfaces import get_message_class, message_type
+    from rsltrace.adapters.player import Player, make_publisher
+    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.wire.interfaces import get_message_class, message_type
     from rsltrace.run.plans.bag_faults import BagFaults
 
     domain = world.domain

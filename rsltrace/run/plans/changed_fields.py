@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.doors.rclpy.wire.message_spec import (
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.wire.message_spec import (
     Array,
     FieldType,
     Item,

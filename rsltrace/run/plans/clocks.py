@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.chance.clock import ClockModel
-from rsltrace.doors.rclpy.node_clocks import ClockRule
+from rsltrace.adapters.rclpy.node_clocks import ClockRule
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.model.stamp import format_duration
+from rsltrace.simulation.chance.clock import ClockModel
+from rsltrace.trace.model.stamp import format_duration
 
 
 def clocks_of(job: Job) -> tuple[ClockRule, ...]:

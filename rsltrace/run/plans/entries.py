@@ -10,20 +10,20 @@ from functools import partial
 from inspect import Parameter
 from typing import Any
 
-from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
-from rsltrace.doors.rclpy.components import Component, check_loadable, load_service
-from rsltrace.doors.rclpy.entry import Entry, StartRule, ros_arguments
-from rsltrace.doors.rclpy.hints import parameter_in
+from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.adapters.rclpy.components import Component, check_loadable, load_service
+from rsltrace.adapters.rclpy.entry import Entry, StartRule, ros_arguments
+from rsltrace.adapters.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
 from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
-from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.executables import Mains
 from rsltrace.run.plans.processes import Processes
 from rsltrace.run.plans.target import load_target
 from rsltrace.run.plans.typed import typed_at
+from rsltrace.trace.model.regular_file import not_regular
 
 _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 

@@ -17,20 +17,20 @@ from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 
-from rsltrace.doors.processes.programs import is_compiled, is_python, why_not_run
-from rsltrace.doors.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
-from rsltrace.doors.rclpy.boundary.installation import boundary
-from rsltrace.errors import JobError, nearest
-from rsltrace.job import Job, NodeSpec
-from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
-from rsltrace.run.plans.target import load_target
-from rsltrace.run.process import user_modules
-from rsltrace.workspace.imports import (
+from rsltrace.adapters.processes.programs import is_compiled, is_python, why_not_run
+from rsltrace.adapters.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
+from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.workspace.imports import (
     unbuilt_executables,
     unbuilt_fault,
     unbuilt_names,
     unbuilt_programs,
 )
+from rsltrace.errors import JobError, nearest
+from rsltrace.job import Job, NodeSpec
+from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
+from rsltrace.run.plans.target import load_target
+from rsltrace.run.process import user_modules
 
 
 class Mains:

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.middleware.faults import MessageFault, TopicFaults
+from rsltrace.simulation.middleware.faults import MessageFault, TopicFaults
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.faults import NodeFaults
-    from rsltrace.doors.rclpy.world import World
+    from rsltrace.adapters.rclpy.faults import NodeFaults
+    from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
 
 
@@ -31,7 +31,7 @@ def arm_nodes(job: Job, world: World, start_ns: int) -> NodeFaults | None:
     first one is made."""
     if not any(spec.of_node for spec in job.faults):
         return None
-    from rsltrace.doors.rclpy.faults import NodeFault, NodeFaults
+    from rsltrace.adapters.rclpy.faults import NodeFault, NodeFaults
 
     faults = [
         NodeFault(

@@ -28,18 +28,18 @@ from rsltrace.guard.virtual.torch_streams import TorchStreams, torch_streams
 from rsltrace.guard.virtual.user_modules import user_modules
 from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
 from rsltrace.job import Job, NodeSpec, policy_of
-from rsltrace.middleware.events.event import Event
-from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
-from rsltrace.model.finding import Finding, GuardCount, Mode, Source
+from rsltrace.simulation.middleware.events.event import Event
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
+from rsltrace.trace.model.finding import Finding, GuardCount, Mode, Source
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.world import World
+    from rsltrace.adapters.rclpy.world import World
 
 
 _ONE_PROCESSOR = "'taskset --cpu-list 0' before 'rsltrace record' gives it one processor"
@@ -80,7 +80,7 @@ class RunGuard:
 
     def begin(self, world: World, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
-        from rsltrace.doors.rclpy.guard_context import GuardContext
+        from rsltrace.adapters.rclpy.guard_context import GuardContext
 
         loop, dispatcher = world.domain.loop, world.domain.dispatcher
 

@@ -12,12 +12,12 @@ from importlib.machinery import ModuleSpec, SourceFileLoader
 from pathlib import Path
 from types import CodeType
 
-from rsltrace.doors.rclpy.hints import cannot_import, import_raised
+from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError
 from rsltrace.guard.virtual.user_modules import code_of_script
-from rsltrace.middleware.events.failure import text_of
-from rsltrace.model.regular_file import read_regular
 from rsltrace.run.process import run_as_main
+from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.trace.model.regular_file import read_regular
 
 
 @dataclass(frozen=True)

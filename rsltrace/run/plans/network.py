@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
-from rsltrace.chance.channel import Burst, Model, Outage
-from rsltrace.chance.distribution import (
+from rsltrace.job import Job
+from rsltrace.job.parts.delay import DelaySpec
+from rsltrace.job.parts.distribution import DistributionSpec
+from rsltrace.job.reading.delay_files import read_rslcpp, read_samples, read_series
+from rsltrace.simulation.chance.channel import Burst, Model, Outage
+from rsltrace.simulation.chance.distribution import (
     Constant,
     Distribution,
     Empirical,
@@ -14,11 +18,7 @@ from rsltrace.chance.distribution import (
     Series,
     Uniform,
 )
-from rsltrace.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
-from rsltrace.job import Job
-from rsltrace.job.parts.delay import DelaySpec
-from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.reading.delay_files import read_rslcpp, read_samples, read_series
+from rsltrace.simulation.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
 
 
 def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:

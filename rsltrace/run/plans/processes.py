@@ -11,32 +11,32 @@ from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from rsltrace.chance.clock import ClockModel
-from rsltrace.doors.processes.build import Library, library
-from rsltrace.doors.processes.door import Interfaces, ProcessDoor, Program
-from rsltrace.doors.processes.programs import (
+from rsltrace.adapters.processes.build import Library, library
+from rsltrace.adapters.processes.door import Interfaces, ProcessDoor, Program
+from rsltrace.adapters.processes.programs import (
     interpreter,
     is_compiled,
     is_python,
     program,
     why_not_run,
 )
-from rsltrace.doors.rclpy.arguments import RosArguments
-from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.doors.rclpy.wire.interfaces import (
+from rsltrace.adapters.rclpy.arguments import RosArguments
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.wire.interfaces import (
     get_message_class,
     message_type,
 )
-from rsltrace.doors.rclpy.world import World
+from rsltrace.adapters.rclpy.world import World
+from rsltrace.adapters.workspace.imports import unbuilt_names, unbuilt_prefix
 from rsltrace.errors import JobError, RunError, SetupError
 from rsltrace.guard.pin import pinned_variables
 from rsltrace.job import Job, NodeSpec
-from rsltrace.middleware.interface import MessageType, ServiceType
-from rsltrace.model.printable import printable
-from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
-from rsltrace.workspace.imports import unbuilt_names, unbuilt_prefix
+from rsltrace.simulation.chance.clock import ClockModel
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.regular_file import not_regular
 
 
 class Processes:
@@ -82,7 +82,9 @@ class Processes:
     def search_path(self) -> list[str]:
         """Where modules are: those of packages that nobody has built come first, since folders
         with sources (``src/my_robot/my_robot``) look like packages themselves."""
-        from rsltrace.workspace.installs import module_folders  # which loads a parser of XML
+        from rsltrace.adapters.workspace.installs import (
+            module_folders,  # which loads a parser of XML
+        )
 
         given = [self._job.resolve(path) for path in self._job.search_path]
         return [str(path) for path in dict.fromkeys([*module_folders(given), *given])]

@@ -8,30 +8,30 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.chance.stream import Stream
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
-from rsltrace.loop.choices import Choices, decoded
-from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.observed_order import CALLBACKS, ObservedCallback, ObservedOrder
-from rsltrace.loop.ordered import OrderedLoop
-from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
-from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
-from rsltrace.loop.search_policies import After, Departure, Departures, Pct
-from rsltrace.loop.wait_set import RclpyWaitSet
-from rsltrace.model.event import EventKind
 from rsltrace.run.plans.scheduling import of_order, own_policy
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.choices import Choices, decoded
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.observed_order import CALLBACKS, ObservedCallback, ObservedOrder
+from rsltrace.simulation.loop.ordered import OrderedLoop
+from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
+from rsltrace.simulation.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
+from rsltrace.simulation.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.simulation.loop.wait_set import RclpyWaitSet
+from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.domain import Domain
-    from rsltrace.middleware.events.observed_run import ObservedRun
-    from rsltrace.middleware.events.recorded_run import RecordedRun
+    from rsltrace.simulation.middleware.domain import Domain
+    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
+    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
-"""What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
+"""What the policy of the run has chosen; see ``rsltrace.simulation.loop.choices``."""
 ATTACHMENT_POLLS = "rsltrace/polls"
 """From when on executors had polling points, see ``OrderedLoop.polls``."""
 
@@ -42,8 +42,8 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
-    from rsltrace.middleware.events.observed_run import ObservedRun
-    from rsltrace.middleware.events.recorded_run import RecordedRun
+    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
+    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
         return None

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.chance.stream import Stream
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.scheduling import EVERY_LINE, PolicySpec
-from rsltrace.loop.policy import (
+from rsltrace.run.plans.network import distribution_of
+from rsltrace.run.plans.target import load_target
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.policy import (
     Fifo,
     Permutation,
     Policy,
@@ -17,13 +19,11 @@ from rsltrace.loop.policy import (
     PriorityRule,
     RateMonotonic,
 )
-from rsltrace.loop.search_policies import After, Departure, Departures, Pct
-from rsltrace.loop.wait_set import RclpyWaitSet, WaitSet
-from rsltrace.run.plans.network import distribution_of
-from rsltrace.run.plans.target import load_target
+from rsltrace.simulation.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.scheduling import SchedulingPlan
+    from rsltrace.simulation.middleware.scheduling import SchedulingPlan
 
 
 def is_ordered(job: Job) -> bool:
@@ -44,7 +44,11 @@ def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> Schedulin
 
     :raises JobError: if the policy's class cannot be made.
     """
-    from rsltrace.middleware.scheduling import ExecutionRule, ExecutorRule, SchedulingPlan
+    from rsltrace.simulation.middleware.scheduling import (
+        ExecutionRule,
+        ExecutorRule,
+        SchedulingPlan,
+    )
 
     rules = []
     if job.execution is not None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from rsltrace.doors.rclpy.components import load_service
+from rsltrace.adapters.rclpy.components import load_service
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.graph import Graph
-from rsltrace.model.stamp import format_duration
 from rsltrace.run.plans.entries import entry_keys
+from rsltrace.simulation.middleware.graph import Graph
+from rsltrace.trace.model.stamp import format_duration
 
 
 def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None) -> Iterator[str]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.values.sizes import format_size
-from rsltrace.loop.stop import (
+from rsltrace.run.plans.target import load_target
+from rsltrace.simulation.loop.stop import (
     Progress,
     Stop,
     StopCondition,
@@ -17,12 +18,11 @@ from rsltrace.loop.stop import (
     stop_when,
     stop_when_quiet,
 )
-from rsltrace.model.stamp import format_seconds
-from rsltrace.run.plans.target import load_target
+from rsltrace.trace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.entry import Entry
-    from rsltrace.doors.rclpy.world import World
+    from rsltrace.adapters.rclpy.entry import Entry
+    from rsltrace.adapters.rclpy.world import World
 
 _Context = Callable[[], AbstractContextManager[None]]
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from rsltrace.doors.rclpy.hints import cannot_import, import_raised
+from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError, RsltraceError, did_you_mean
-from rsltrace.middleware.events.failure import text_of
+from rsltrace.simulation.middleware.events.failure import text_of
 
 
 def load_target(target: str, *, where: str) -> Any:

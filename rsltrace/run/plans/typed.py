@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from rsltrace.doors.rclpy.entry import Typed
+from rsltrace.adapters.rclpy.entry import Typed
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate, showing_line
 

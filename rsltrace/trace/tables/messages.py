@@ -11,10 +11,10 @@ import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError, did_you_mean
-from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
-from rsltrace.model.placeholders import NO_FIELD
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
+from rsltrace.trace.model.placeholders import NO_FIELD
 from rsltrace.trace.tables.rows import Labels, Source, node_names, whole_numbers
 from rsltrace.trace.tables.table import Table
 from rsltrace.trace.wide_texts import STAND_IN_TYPE

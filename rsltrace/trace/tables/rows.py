@@ -15,8 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import (
+from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
     EventFlag,
@@ -24,7 +25,6 @@ from rsltrace.model.event import (
     Output,
     OutputKind,
 )
-from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.tables.table import Table
 
 _WHOLE_MAX = np.uint64(2**63 - 1)

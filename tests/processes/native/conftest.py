@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.doors.processes.build import SOURCES as LIBRARY
-from rsltrace.doors.processes.build import find_compiler
+from rsltrace.adapters.processes.build import SOURCES as LIBRARY
+from rsltrace.adapters.processes.build import find_compiler
 from rsltrace.errors import SetupError
 
 SOURCES = Path(__file__).parent

@@ -8,7 +8,7 @@ from textual.content import Content
 from textual.widgets import Static
 
 from rsltrace.debug.positions import Breakpoint
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 
 _SHOWN_MAX = 4
 

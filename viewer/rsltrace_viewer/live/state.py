@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.words.entities import RUN_NAME
+from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.live.execution import Executed
 from rsltrace_viewer.model.inspector.lines import Line, Role
 from rsltrace_viewer.session import Session

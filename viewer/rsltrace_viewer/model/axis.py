@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.model.lanes import Lanes
 
 _MARK = "≠"

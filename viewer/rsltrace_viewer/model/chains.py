@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.checks.latency.figures import Figures
+from rsltrace.checks.latency.measure import Latencies, measuring
+from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import RsltraceError, TraceError
-from rsltrace.latency.figures import Figures
-from rsltrace.latency.measure import Latencies, measuring
-from rsltrace.latency.paths import Hop
 from rsltrace_viewer.model.run import Run
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ ARROW, VIA = " → ", " via "
 @dataclass(frozen=True, slots=True)
 class Chain:
     """A chain of a run in a few numbers; ``slowest`` is the event of the output that took longest,
-    ``via`` names nodes that sample (see ``rsltrace.latency``)."""
+    ``via`` names nodes that sample (see ``rsltrace.checks.latency``)."""
 
     hops: tuple[Hop, ...]
     via: tuple[str, ...]

@@ -7,14 +7,14 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.bag import open_bag
-from rsltrace.bag.metadata import NAME as METADATA
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import RsltraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration
 from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recordings import open_bag
+from rsltrace.trace.recordings.metadata import NAME as METADATA
 
 _LOOKED_AT_MAX = 200
 _OPENED_BYTES_MAX = 64 << 20

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import EventFlag, EventKind
-from rsltrace.words.entities import RUN_NAME
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.model.lanes import KIND_LETTERS, Counted, Lettered
 from rsltrace_viewer.model.run import Run, Segment
 from rsltrace_viewer.model.steady import Floats, ends_of, spread

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from rsltrace.model.event import EventKind
-from rsltrace.words.entities import RUN_NAME
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.model.steady import Floats
 from rsltrace_viewer.model.windows import Window
 

@@ -16,15 +16,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, Event, EventKind, Output, OutputKind
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
+from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import NS_PER_S
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.events import EventWords
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.events import EventWords
 
 _EPOCH_NS = 1_000_000 * NS_PER_S
 _SEGMENTS_KEPT = 24

@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_file, code_places, output_places, places_text
+from rsltrace.trace.words.code import code_file, code_places, output_places, places_text
 from rsltrace_viewer.model.run import Run
 
 _LINES_MAX = 400

@@ -24,9 +24,9 @@ from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.markdown import code_block
 from rsltrace.diff.result import Diff, Divergence
 from rsltrace.diff.sentences.values import link_text
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.phrases import event_title
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.phrases import event_title
 from rsltrace_viewer.rerun_export.colours import lane
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lane_colours, make_chunk
 from rsltrace_viewer.rerun_export.paths import join

@@ -13,7 +13,7 @@ import rerun as rr
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
-from rsltrace.model.regular_file import in_the_way
+from rsltrace.trace.model.regular_file import in_the_way
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for

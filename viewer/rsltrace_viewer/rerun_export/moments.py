@@ -13,9 +13,9 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_DETAILS, TOPIC_ROSOUT
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.reader import Trace
 
 Senders = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]

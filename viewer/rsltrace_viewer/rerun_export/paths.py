@@ -17,9 +17,9 @@ from __future__ import annotations
 
 import rerun as rr
 
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.printable import printable
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 NO_NODE = "(run)"

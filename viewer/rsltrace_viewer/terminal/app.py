@@ -14,8 +14,8 @@ from textual.screen import Screen
 from textual.widget import Widget
 
 from rsltrace.errors import TraceError
-from rsltrace.model.printable import printable, shortened
-from rsltrace.words.times import TimeInRun, parse_time_in_run
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
 from rsltrace_viewer.model.history import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run

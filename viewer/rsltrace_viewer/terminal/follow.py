@@ -12,7 +12,7 @@ from typing import Any
 from textual.app import App
 
 from rsltrace.errors import RsltraceError
-from rsltrace.mcap.records import MAGIC
+from rsltrace.trace.mcap.records import MAGIC
 from rsltrace_viewer.model.run import Run
 
 _EVERY_S = 0.5

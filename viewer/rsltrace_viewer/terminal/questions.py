@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import chain
 
-from rsltrace.words.times import parse_time_in_run
+from rsltrace.trace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import completions
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.widgets.prompt import Question

@@ -13,10 +13,10 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.kinds import SHORT_KINDS
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import event_link, inspect

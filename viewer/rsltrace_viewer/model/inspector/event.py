@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import (
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
     Event,
@@ -18,11 +18,11 @@ from rsltrace.model.event import (
     Output,
     OutputKind,
 )
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.code import output_places, places_text
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.logs import LEVEL_WARN, log_record
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.code import output_places, places_text
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.inspector.message_tree import (

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.model.placeholders import PLACEHOLDERS
-from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.model.placeholders import PLACEHOLDERS
+from rsltrace.trace.model.printable import printable, shortened
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 
 _PREVIEW = 120

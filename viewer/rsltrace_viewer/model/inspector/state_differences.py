@@ -8,7 +8,7 @@ from rsltrace.diff.alignment.rows import Run as DiffRun
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.facts.evidence import CallDifference, EventView, StateDifference
 from rsltrace.diff.result import Divergence
-from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.model.printable import printable, shortened
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 
 _VALUE_MAX = 200

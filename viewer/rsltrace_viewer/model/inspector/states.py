@@ -10,10 +10,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import Event
-from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import TOPIC_STATES
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import Event
+from rsltrace.trace.model.printable import printable, shortened
 from rsltrace.trace.states import Leaf, state_after
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.run import Run

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rsltrace.checks.latency.measure import measuring
 from rsltrace.errors import TraceError
-from rsltrace.latency.measure import measuring
-from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, Output, OutputKind
-from rsltrace.model.placeholders import PLACEHOLDERS
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import NO_EVENT, Output, OutputKind
+from rsltrace.trace.model.placeholders import PLACEHOLDERS
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 

@@ -15,9 +15,9 @@ import numpy.typing as npt
 
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError
-from rsltrace.model.event import EventFlag, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.segments import event_of, output_of
-from rsltrace.words.logs import log_record
+from rsltrace.trace.words.logs import log_record
 from rsltrace_viewer.model.run import Run, Segment
 
 Mask = npt.NDArray[np.bool_]

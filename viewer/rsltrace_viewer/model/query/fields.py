@@ -10,11 +10,11 @@ import numpy as np
 
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError
-from rsltrace.model.entity import WITH_TOPIC
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
-from rsltrace.words.kinds import SHORT_KINDS
-from rsltrace.words.matching import LOG_LEVELS, is_named
-from rsltrace.words.times import parse_time_in_run
+from rsltrace.trace.model.entity import WITH_TOPIC
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.matching import LOG_LEVELS, is_named
+from rsltrace.trace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.message_text import MessageText

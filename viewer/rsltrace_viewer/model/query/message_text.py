@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.segments import output_of
 from rsltrace_viewer.model.query.conditions import Mask
 from rsltrace_viewer.model.run import Run, Segment

@@ -12,8 +12,8 @@ import xxhash
 
 from rsltrace.diff.bags.sequences import Keys
 from rsltrace.diff.bags.source import open_source
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import NS_PER_S
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import NS_PER_S
 
 _KEPT_BYTES = 256 << 20
 _PER_STEP = 1000

@@ -11,10 +11,10 @@ from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.result import BagDiff
 from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import RsltraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.decode import to_plain
-from rsltrace.words.times import START, TimeInRun
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.words.times import START, TimeInRun
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.inspector.message_tree import message_lines
 from rsltrace_viewer.model.recordings.filter import read_filter

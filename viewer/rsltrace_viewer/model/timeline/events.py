@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from rsltrace.errors import TraceError
-from rsltrace.model.draw import Draw, duration_of
-from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_seconds
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.kinds import SHORT_KINDS
-from rsltrace.words.logs import LEVEL_WARN, log_record
+from rsltrace.trace.model.draw import Draw, duration_of
+from rsltrace.trace.model.event import Event, EventFlag, EventKind, Output, OutputKind
+from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.run import Run
 
 _ROWS_KEPT = 2048

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.model.placeholders import PLACEHOLDERS
-from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.model.placeholders import PLACEHOLDERS
+from rsltrace.trace.model.printable import printable, shortened
 
 _NOT_SHOWN = PLACEHOLDERS | {"header", "stamp"}
 _VALUES_MAX = 5

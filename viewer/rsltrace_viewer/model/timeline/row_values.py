@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import EventText, outputs_text
 from rsltrace_viewer.model.timeline.message_values import message_values

@@ -11,11 +11,11 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.model.event import NO_EVENT, EventFlag
-from rsltrace.model.printable import printable
 from rsltrace.trace.format import OUTPUT_DTYPE
+from rsltrace.trace.model.event import NO_EVENT, EventFlag
+from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import entity_places, places_text
+from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace_viewer.rerun_export.colours import lane
 from rsltrace_viewer.rerun_export.columns import (
     EVENT,

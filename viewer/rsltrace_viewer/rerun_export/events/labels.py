@@ -13,12 +13,12 @@ import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
-from rsltrace.words.entities import RUN_NAME
-from rsltrace.words.kinds import flag_names, kind_label
-from rsltrace.words.outputs import counted, output_text
+from rsltrace.trace.words.entities import RUN_NAME
+from rsltrace.trace.words.kinds import flag_names, kind_label
+from rsltrace.trace.words.outputs import counted, output_text
 from rsltrace_viewer.rerun_export.paths import Paths
 
 _NAMES_MAX = 6

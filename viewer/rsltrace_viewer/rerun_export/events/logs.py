@@ -15,8 +15,8 @@ import rerun as rr
 from rerun.chunk import Chunk, McapReader
 
 from rsltrace.errors import TraceError
-from rsltrace.model.event import OutputKind
 from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import output_of
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_chunk

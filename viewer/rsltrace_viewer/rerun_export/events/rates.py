@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.model.stamp import NS_PER_S
+from rsltrace.trace.model.stamp import NS_PER_S
 
 _STEPS, _STEPS_OF_SHORT = 120, 20
 """About so many points per curve: enough to see a rate change, few enough to be one glance. A step

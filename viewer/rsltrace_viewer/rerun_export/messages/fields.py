@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
-from rsltrace.model.placeholders import NO_FIELD
+from rsltrace.trace.model.placeholders import NO_FIELD
 from rsltrace_viewer.rerun_export.columns import lists
 from rsltrace_viewer.rerun_export.messages.values import items, numbers
 

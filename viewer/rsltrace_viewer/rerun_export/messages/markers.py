@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.rerun_export.messages.values import rotated
 
 _DELETE, _DELETE_ALL = 2, 3

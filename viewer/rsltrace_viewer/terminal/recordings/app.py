@@ -9,8 +9,8 @@ from textual import events
 from textual.binding import Binding
 from textual.widget import Widget
 
-from rsltrace.model.printable import printable
-from rsltrace.words.times import TimeInRun, parse_time_in_run
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
 from rsltrace_viewer.model.inspector.lines import Line
 from rsltrace_viewer.model.recordings.filter import FIELDS
 from rsltrace_viewer.model.recordings.plots import RecordingPlots

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.words.times import parse_time_in_run
+from rsltrace.trace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import complete
 from rsltrace_viewer.model.recordings.filter import choices, read_filter
 from rsltrace_viewer.model.recordings.session import RecordingSession

@@ -11,8 +11,8 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_seconds
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.history import Event
 from rsltrace_viewer.model.logs import LogLine, event_of

@@ -13,8 +13,8 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_duration
 from rsltrace.trace.native import is_native
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.chains import Chain

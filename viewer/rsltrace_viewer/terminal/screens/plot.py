@@ -17,7 +17,7 @@ from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from rsltrace.errors import RsltraceError
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.plots.braille import Plot, plot
 from rsltrace_viewer.model.plots.data import PlotData, difference

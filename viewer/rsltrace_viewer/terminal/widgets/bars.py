@@ -6,7 +6,7 @@ from textual import events
 from textual.content import Content
 from textual.widgets import Static
 
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 

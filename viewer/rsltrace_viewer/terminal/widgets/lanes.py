@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
 
-from rsltrace.model.printable import printable
+from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.model.axis import axis_text
 from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.lanes import Lane, Lanes

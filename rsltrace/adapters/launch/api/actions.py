@@ -1,0 +1,142 @@
+"""Actions that bring others: includes, functions, timers."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions, visit_all
+from rsltrace.adapters.launch.api.packages import missing_package
+from rsltrace.adapters.launch.api.sources import LaunchDescriptionSource
+from rsltrace.errors import JobError
+from rsltrace.job.values.times import parse_time
+
+
+class IncludeLaunchDescription(Action):
+    """Does what another launch file says."""
+
+    def __init__(
+        self,
+        launch_description_source: Any,
+        *,
+        launch_arguments: Iterable[tuple[Any, Any]] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        source = launch_description_source
+        if not isinstance(source, LaunchDescriptionSource):
+            source = LaunchDescriptionSource(location=source)
+        self.launch_description_source = source
+        given = launch_arguments or ()
+        self.launch_arguments = list(given.items() if isinstance(given, Mapping) else given)
+
+    def execute(self, context: LaunchContext) -> Any:
+        """Set the arguments, and read the file."""
+        for name, value in self.launch_arguments:
+            context.launch_configurations[context.text(name)] = context.text(value)
+        source = self.launch_description_source
+        if source.description is not None:
+            return [source.description]
+        path = Path(context.text(source.place))
+        if not path.is_absolute():
+            path = Path(os.path.abspath(path))
+        package = missing_package(path)
+        if package is not None:
+            why = f"there is no package {package!r}: it is neither installed nor among the sources"
+            context.refuse(self.where, f"include of {path.name}", f"{why} here")
+            return None
+        if not path.is_file():
+            raise JobError(f"there is no launch file {path}", where=self.where)
+        if context.include is None:
+            raise JobError("nothing can be included here", where=self.where)
+        try:
+            context.include(path)
+        except MissingModuleError as error:
+            context.refuse(self.where, f"include of {path.name}", str(error))
+        return None
+
+
+class MissingModuleError(JobError):
+    """A launch file imports a Python module that is not installed."""
+
+
+class OpaqueFunction(Action):
+    """Does what a function returns."""
+
+    def __init__(
+        self,
+        *,
+        function: Callable[..., Any],
+        args: Iterable[Any] | None = None,
+        kwargs: Mapping[str, Any] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self._function, self._args = function, list(args or ())
+        self._kwargs = dict(kwargs or {})
+
+    def execute(self, context: LaunchContext) -> Any:
+        """Call the function."""
+        return self._function(context, *self._args, **self._kwargs)
+
+
+class OpaqueCoroutine(Action):
+    """Awaits a coroutine beside the processes."""
+
+    def __init__(self, *, coroutine: Any = None, **options: Any) -> None:
+        super().__init__(condition=options.get("condition"))
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note that it cannot be simulated."""
+        why = "it runs beside processes, which there are none of"
+        context.refuse(self.where, "OpaqueCoroutine", why)
+
+
+class TimerAction(Action):
+    """Does actions some time later."""
+
+    def __init__(self, *, period: Any, actions: Iterable[Any], **options: Any) -> None:
+        options.pop("cancel_on_shutdown", None)
+        super().__init__(**options)
+        self._period = str(period) if isinstance(period, (int, float)) else period
+        self._actions = list(actions)
+
+    def execute(self, context: LaunchContext) -> None:
+        """Do the actions; their nodes start that much later."""
+        text = context.text(as_substitutions(self._period))
+        try:
+            period_ns = parse_time(float(text))
+        except ValueError:
+            raise ValueError(
+                f"the period of a timer is a number of seconds, not {text!r}"
+            ) from None
+        evaluation = context.evaluation
+        evaluation.delay_ns += period_ns
+        try:
+            with evaluation.within(scope=evaluation.scope.copy()):
+                visit_all(context, self._actions)
+        finally:
+            evaluation.delay_ns -= period_ns
+
+
+class LogInfo(Action):
+    """Says something to whoever launches; that is nobody here."""
+
+    def __init__(self, *, msg: Any, **options: Any) -> None:
+        super().__init__(condition=options.get("condition"))
+        self.msg = msg
+
+    def execute(self, context: LaunchContext) -> None:
+        """Do nothing."""
+
+
+__all__ = [
+    "IncludeLaunchDescription",
+    "LogInfo",
+    "MissingModuleError",
+    "OpaqueCoroutine",
+    "OpaqueFunction",
+    "TimerAction",
+]

@@ -1,0 +1,335 @@
+"""Actions that start nodes and other programs: ``launch_ros.actions`` and ``ExecuteProcess``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from rsltrace.adapters.launch.api.basics import (
+    Action,
+    Condition,
+    LaunchContext,
+    as_job_error,
+    as_substitutions,
+    calling_line,
+)
+from rsltrace.adapters.launch.api.events import later
+from rsltrace.adapters.launch.api.packages import names_missing_package
+from rsltrace.adapters.launch.api.parameters import evaluated_parameters
+from rsltrace.adapters.launch.model import LaunchedNode, Surroundings, respawning
+from rsltrace.adapters.launch.scope import absolute_namespace, full_name
+from rsltrace.adapters.launch.substitution import truth
+
+_WITHOUT_MEANING = frozenset(
+    "output output_format emulate_tty exec_name log_cmd sigterm_timeout sigkill_timeout "
+    "cached_output".split()
+)
+"""How a process is run: nothing that a node could tell in a simulation."""
+
+_OF_PROCESSES = ("cwd", "env", "additional_env", "respawn", "respawn_delay", "respawn_max_retries")
+_WITHOUT = ("prefix", "shell")
+"""What processes are not given here: said, then left out."""
+
+_RENAMED = {"node_executable": "executable", "node_name": "name", "node_namespace": "namespace"}
+
+
+class ExecuteLocal(Action):
+    """Starts another program: nothing that can be simulated."""
+
+    def __init__(
+        self, *, condition: Condition | None = None, on_exit: Any = None, **options: Any
+    ) -> None:
+        super().__init__(condition=condition)
+        for name in options:
+            if name not in _WITHOUT_MEANING and name not in (*_OF_PROCESSES, *_WITHOUT):
+                now = f"; it is {_RENAMED[name]!r} since Galactic" if name in _RENAMED else ""
+                raise TypeError(f"{type(self).__name__} has no argument {name!r}{now}")
+        self._on_exit = on_exit
+        self._options = {name: value for name, value in options.items() if value}
+
+    def _surroundings(self, context: LaunchContext) -> Surroundings:
+        """Return what is said of the process."""
+        options = self._options
+        own = {
+            context.text(name): context.text(value)
+            for key in ("env", "additional_env")
+            for name, value in dict(options.get(key, {})).items()
+        }
+        respawn = None
+        if _flag(context, options.get("respawn", False)):
+            times = int(_number(context, options.get("respawn_max_retries", -1)))
+            respawn = respawning(_number(context, options.get("respawn_delay", 0.0)), times)
+        return Surroundings(
+            tuple({**context.evaluation.changed_environment(), **own}.items()),
+            folder=context.optional(options.get("cwd")) or "",
+            respawn=respawn,
+            own=tuple(name for name in ("cwd", "env", "additional_env") if name in options),
+            without=tuple(name for name in _WITHOUT if name in options),
+        )
+
+    def _started(self, context: LaunchContext) -> None:
+        """Note what follows when it ends."""
+        if self._on_exit is not None:
+            later(context, self.where, "ended", self, self._on_exit)
+
+
+class ExecuteProcess(ExecuteLocal):
+    """Starts another program."""
+
+    def __init__(self, *, cmd: Iterable[Any], name: Any = None, **options: Any) -> None:
+        super().__init__(**options)
+        self.cmd = [as_substitutions(word) for word in cmd]
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note that it cannot be simulated."""
+        why = "other programs do not run in a simulation"
+        try:
+            words = " ".join(context.text(word) for word in self.cmd)
+        except Exception as error:  # whatever a substitution of the user's own raises
+            words = " ".join("".join(part.describe() for part in word) for word in self.cmd)
+            why += f" (nor can its command be read: {as_job_error(error, '')})"
+        context.refuse(self.where, f"process {words!r:.200}", why)
+        self._started(context)
+
+
+class Node(ExecuteLocal):
+    """Starts an executable of a package."""
+
+    def __init__(
+        self,
+        *,
+        executable: Any,
+        package: Any = None,
+        name: Any = None,
+        namespace: Any = None,
+        parameters: Iterable[Any] | None = None,
+        remappings: Iterable[tuple[Any, Any]] | None = None,
+        ros_arguments: Iterable[Any] | None = None,
+        arguments: Iterable[Any] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self._executable = as_substitutions(executable)
+        self._package = None if package is None else as_substitutions(package)
+        self._description = _Description(name, namespace, parameters, remappings)
+        self._ros_arguments = list(ros_arguments or ())
+        self._arguments = list(arguments or ())
+        self._values: dict[str, Any] = {}
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note the node."""
+        self._note(context)
+
+    def _note(self, context: LaunchContext, *, is_container: bool = False) -> None:
+        executable = context.text(self._executable)
+        package = context.optional(self._package)
+        if package is None:
+            context.refuse(self.where, f"process {executable!r}", "it belongs to no package")
+            return
+        values = self._values or self._description.values(context, self.where)
+        if not self._values and not values.get("fault"):
+            try:
+                values["arguments"] = tuple(context.text(word) for word in self._arguments)
+                values["ros_arguments"] = tuple(context.text(w) for w in self._ros_arguments)
+                values["surroundings"] = self._surroundings(context)
+                _check_paths([*values["arguments"], *values["ros_arguments"]])
+            except Exception as error:
+                values["fault"] = str(as_job_error(error, self.where))
+        self._values = values  # should it be started again
+        note(
+            context,
+            self,
+            package=package,
+            executable=executable,
+            is_container=is_container,
+            **values,
+        )
+        self._started(context)
+
+
+class LifecycleNode(Node):
+    """Starts a lifecycle node."""
+
+    def __init__(
+        self, *, name: Any, namespace: Any, autostart: Any = False, **options: Any
+    ) -> None:
+        super().__init__(name=name, namespace=namespace, **options)
+        self._autostart = autostart
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note the node."""
+        super().execute(context)
+        if self._autostart and str(self._autostart).lower() != "false":
+            context.refuse(
+                self.where,
+                f"autostart of {context.optional(self._package)}/{context.text(self._executable)}",
+                "nobody changes the states of lifecycle nodes here: let a node of the job do it",
+            )
+
+
+class _Description:
+    """What nodes and components have in common."""
+
+    def __init__(
+        self,
+        name: Any,
+        namespace: Any,
+        parameters: Iterable[Any] | None,
+        remappings: Iterable[tuple[Any, Any]] | None,
+    ) -> None:
+        self.name, self.namespace = name, namespace
+        self.parameters: Any = () if parameters is None else parameters
+        self.remappings = [(src, dst) for src, dst in remappings or ()]
+
+    def values(self, context: LaunchContext, where: str) -> dict[str, Any]:
+        """Return the fields of a ``LaunchedNode``.
+
+        What cannot be evaluated is a fault of the node only: it may be one that is left out.
+        """
+        scope = context.evaluation.scope
+        name = context.optional(self.name) or None
+        namespace = absolute_namespace(scope.namespace, context.optional(self.namespace))
+        whole = None if name is None else full_name(namespace, name)
+        values: dict[str, Any] = {"name": name, "namespace": namespace}
+        try:
+            given = tuple(evaluated_parameters(context, self.parameters, whole))
+            values["parameters"] = scope.parameters + given
+            for item in given:
+                _check_paths(item.values() if isinstance(item, dict) else ())
+            pairs = tuple((context.text(src), context.text(dst)) for src, dst in self.remappings)
+            values["remappings"] = scope.remappings + pairs
+        except Exception as error:
+            values["fault"] = str(as_job_error(error, where))
+        return values
+
+
+def _check_paths(values: Iterable[object]) -> None:
+    """Raise ``ValueError`` if a node would be given a path in a package that is not there."""
+    for value in values:
+        package = names_missing_package(value)
+        if package is not None:
+            raise ValueError(f"there is no package {package!r}, which it needs a file of: {value}")
+
+
+def note(context: LaunchContext, action: object, **values: Any) -> None:
+    """Note a node that ``action`` starts."""
+    evaluation = context.evaluation
+    values.setdefault("where", getattr(action, "where", ""))
+    evaluation.launched.nodes.append(
+        LaunchedNode(
+            **values, delay_ns=evaluation.delay_ns, after=evaluation.after, number=id(action)
+        )
+    )
+    evaluation.kept.append(action)  # so that no other gets its id
+
+
+class ComposableNode:
+    """A component."""
+
+    def __init__(
+        self,
+        *,
+        package: Any,
+        plugin: Any,
+        name: Any = None,
+        namespace: Any = None,
+        parameters: Iterable[Any] | None = None,
+        remappings: Iterable[tuple[Any, Any]] | None = None,
+        extra_arguments: Iterable[Any] | None = None,
+        condition: Condition | None = None,
+    ) -> None:
+        self.where = calling_line()
+        self._package, self._plugin = as_substitutions(package), as_substitutions(plugin)
+        self._condition = condition
+        self._description = _Description(name, namespace, parameters, remappings)
+        self._extra_arguments = list(extra_arguments or ())
+
+    def note(self, context: LaunchContext, container: str) -> None:
+        """Note it, if its condition holds; ``container`` is the full name of the one it is for."""
+        if self._condition is not None and not self._condition.evaluate(context):
+            return
+        values = self._description.values(context, self.where)
+        try:
+            extra = tuple(evaluated_parameters(context, self._extra_arguments, None))
+        except Exception as error:
+            extra = ()
+            values["fault"] = str(as_job_error(error, self.where))
+        note(
+            context,
+            self,
+            package=context.text(self._package),
+            plugin=context.text(self._plugin),
+            container=container,
+            extra_arguments=extra,
+            **values,
+        )
+
+
+class ComposableNodeContainer(Node):
+    """Starts a container, and has it load components."""
+
+    def __init__(
+        self,
+        *,
+        name: Any,
+        namespace: Any,
+        composable_node_descriptions: Sequence[ComposableNode] | None = None,
+        **options: Any,
+    ) -> None:
+        super().__init__(name=name, namespace=namespace, **options)
+        self._components = list(composable_node_descriptions or ())
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note it and its components."""
+        self._note(context, is_container=True)
+        for component in self._components:
+            component.note(context, self.full_name(context))
+
+    def full_name(self, context: LaunchContext) -> str:
+        """Return its name with its namespace."""
+        values = self._values or self._description.values(context, self.where)
+        return full_name(values["namespace"], values["name"] or "")
+
+
+class LoadComposableNodes(Action):
+    """Has a container load components."""
+
+    def __init__(
+        self,
+        *,
+        composable_node_descriptions: Sequence[ComposableNode],
+        target_container: Any,
+        **options: Any,
+    ) -> None:
+        super().__init__(**options)
+        self._components = list(composable_node_descriptions)
+        self._target = target_container
+
+    def execute(self, context: LaunchContext) -> None:
+        """Note the components."""
+        target = self._target
+        if isinstance(target, ComposableNodeContainer):
+            container = target.full_name(context)
+        else:
+            container = full_name(None, context.text(target))
+        for component in self._components:
+            component.note(context, container)
+
+
+def _flag(context: LaunchContext, value: Any) -> bool:
+    return value if isinstance(value, bool) else truth(context.text(value))
+
+
+def _number(context: LaunchContext, value: Any) -> float:
+    return float(value if isinstance(value, (int, float)) else context.text(value))
+
+
+__all__ = [
+    "ComposableNode",
+    "ComposableNodeContainer",
+    "ExecuteLocal",
+    "ExecuteProcess",
+    "LifecycleNode",
+    "LoadComposableNodes",
+    "Node",
+]

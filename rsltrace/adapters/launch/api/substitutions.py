@@ -1,0 +1,403 @@
+"""``launch.substitutions`` and ``launch_ros.substitutions``."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from rsltrace.adapters.launch.api.basics import (
+    LaunchContext,
+    Substitution,
+    SubstitutionFailure,
+    TextSubstitution,
+    as_substitutions,
+)
+from rsltrace.adapters.launch.api.packages import prefix_of, share_of
+from rsltrace.adapters.launch.substitution import equal_texts, truth
+
+
+def _word(value: bool) -> str:
+    return str(value).lower()
+
+
+def _operand(given: Any) -> Any:
+    """Return what a comparison compares as text or substitutions."""
+    if given is None:
+        return ""
+    if isinstance(given, bool):
+        return _word(given)
+    return str(given) if isinstance(given, (int, float)) else given
+
+
+class LaunchConfiguration(Substitution):
+    """The value of a launch argument."""
+
+    def __init__(self, variable_name: Any, *, default: Any = None) -> None:
+        self.variable_name = as_substitutions(variable_name)
+        self._default = None if default is None else _default(default)
+
+    def describe(self) -> str:
+        """Return how XML would have it."""
+        return f"$(var {''.join(part.describe() for part in self.variable_name)})"
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the value, or the default."""
+        name = context.text(self.variable_name)
+        value = context.launch_configurations.get(name)
+        if value is not None:
+            return value
+        if self._default is None:
+            raise SubstitutionFailure(f"launch configuration '{name}' does not exist")
+        return context.text(self._default)
+
+
+def _default(given: Any) -> Any:
+    """Return a default as text or substitutions: it may also be a number, or some of them."""
+    if isinstance(given, (str, Substitution, os.PathLike)):
+        return given
+    if isinstance(given, Iterable):
+        return [part if isinstance(part, (str, Substitution)) else str(part) for part in given]
+    return str(given)
+
+
+class EnvironmentVariable(Substitution):
+    """The value of an environment variable, as the launch file has it."""
+
+    def __init__(self, name: Any, *, default_value: Any = None) -> None:
+        self.name = as_substitutions(name)
+        self._default = default_value
+
+    def describe(self) -> str:
+        """Return how XML would have it."""
+        return f"$(env {''.join(part.describe() for part in self.name)})"
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the value, or the default."""
+        name = context.text(self.name)
+        value = context.environment.get(name)
+        if value is not None:
+            return value
+        if self._default is None:
+            raise SubstitutionFailure(f"environment variable '{name}' does not exist")
+        return context.text(self._default)
+
+
+class PathJoinSubstitution(Substitution):
+    """A path of parts."""
+
+    def __init__(self, substitutions: Iterable[Any]) -> None:
+        self.substitutions = [as_substitutions(part) for part in substitutions]
+
+    def describe(self) -> str:
+        """Return the parts as they are written."""
+        return "/".join("".join(p.describe() for p in part) for part in self.substitutions)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the path."""
+        return os.path.join(*(context.text(part) for part in self.substitutions))
+
+    def __truediv__(self, other: Any) -> PathJoinSubstitution:
+        return PathJoinSubstitution([*self.substitutions, other])
+
+
+class PathSubstitution(PathJoinSubstitution):
+    """A path that ``/`` makes longer."""
+
+    def __init__(self, path: Any) -> None:
+        super().__init__([path])
+
+
+class StringJoinSubstitution(Substitution):
+    """Texts with a delimiter between them."""
+
+    def __init__(self, substitutions: Iterable[Any], delimiter: Any = "") -> None:
+        self.substitutions = [as_substitutions(part) for part in substitutions]
+        self.delimiter = as_substitutions(delimiter)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the joined text."""
+        return context.text(self.delimiter).join(map(context.text, self.substitutions))
+
+
+class PythonExpression(Substitution):
+    """The value of a Python expression."""
+
+    def __init__(self, expression: Any, python_modules: Any = ("math",)) -> None:
+        self.expression = as_substitutions(expression)
+        self.python_modules = as_substitutions(python_modules)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the value as text; a launch file is a program, so this runs as it is."""
+        text = context.text(self.expression)
+        seen: dict[str, Any] = {}
+        for part in self.python_modules:
+            module = importlib.import_module(part.perform(context))
+            if module is math:
+                seen.update(vars(math))
+            seen[module.__name__] = module
+        try:
+            return str(eval(text, {}, seen))
+        except Exception as error:
+            raise SubstitutionFailure(
+                f"PythonExpression {text!r} raises {type(error).__name__}: {error}"
+            ) from error
+
+
+class Command(Substitution):
+    """What a command prints."""
+
+    def __init__(self, command: Any, *, on_stderr: Any = "fail") -> None:
+        self.command = as_substitutions(command)
+        self.on_stderr = as_substitutions(on_stderr)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Run the command and return its output."""
+        text = context.text(self.command)
+        words = shlex.split(text)
+        if not words:
+            raise SubstitutionFailure("Command: there is no command")
+        program = find_program(words[0])
+        if program is None:
+            hint = ": pip install xacro" if os.path.basename(words[0]) == "xacro" else ""
+            raise SubstitutionFailure(f"Command: there is no program {words[0]!r} in PATH{hint}")
+        on_stderr = context.text(self.on_stderr)
+        merged = subprocess.STDOUT if on_stderr == "capture" else subprocess.PIPE
+        done = subprocess.run(
+            [program, *words[1:]],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=merged,
+            text=True,
+            check=False,
+        )
+        said = (done.stderr or "").strip()
+        if done.returncode or (said and on_stderr == "fail"):
+            what = f"exit status {done.returncode}" if done.returncode else "it wrote to stderr"
+            raise SubstitutionFailure(f"Command {text!r}: {what}{': ' + said if said else ''}")
+        return done.stdout
+
+
+def find_program(name: str) -> str | None:
+    """Return the path of a program in PATH, or next to this Python."""
+    return shutil.which(name) or shutil.which(name, path=os.path.dirname(sys.executable))
+
+
+class FindExecutable(Substitution):
+    """The path of a program."""
+
+    def __init__(self, *, name: Any) -> None:
+        self.name = as_substitutions(name)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the path."""
+        name = context.text(self.name)
+        path = find_program(name)
+        if path is None:
+            hint = ": pip install xacro" if name == "xacro" else ""
+            raise SubstitutionFailure(f"executable '{name}' not found on the PATH{hint}")
+        return os.path.abspath(path)
+
+
+class FileContent(Substitution):
+    """What is in a file."""
+
+    def __init__(self, path: Any) -> None:
+        self.path = as_substitutions(path)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the text."""
+        path = context.text(self.path)
+        try:
+            return Path(path).read_text(encoding="utf-8")
+        except OSError as error:
+            raise SubstitutionFailure(f"cannot read {path}: {error.strerror}") from error
+
+
+class ThisLaunchFile(Substitution):
+    """The path of the launch file being read."""
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the path."""
+        return str(context.evaluation.file)
+
+
+class ThisLaunchFileDir(Substitution):
+    """The folder of the launch file being read."""
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the folder."""
+        return str(context.evaluation.file.parent)
+
+    def __truediv__(self, other: Any) -> PathJoinSubstitution:
+        return PathJoinSubstitution([self, other])
+
+
+class AnonName(Substitution):
+    """A name that no other node has."""
+
+    def __init__(self, name: Any) -> None:
+        self.name = as_substitutions(name)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the name and a number: ROS draws one at random, and runs must not differ."""
+        return context.evaluation.anonymous(context.text(self.name))
+
+
+class EqualsSubstitution(Substitution):
+    """``true`` if two texts, numbers or truth values are equal."""
+
+    def __init__(self, left: Any, right: Any) -> None:
+        self.left, self.right = as_substitutions(_operand(left)), as_substitutions(_operand(right))
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return ``true`` or ``false``."""
+        return _word(equal_texts(context.text(self.left), context.text(self.right)))
+
+
+class NotEqualsSubstitution(EqualsSubstitution):
+    """``true`` if two texts are not equal."""
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return ``true`` or ``false``."""
+        return _word(not equal_texts(context.text(self.left), context.text(self.right)))
+
+
+class NotSubstitution(Substitution):
+    """``true`` for ``false``."""
+
+    def __init__(self, value: Any) -> None:
+        self.value = as_substitutions(value)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return ``true`` or ``false``."""
+        return _word(not truth(context.text(self.value)))
+
+
+class AllSubstitution(Substitution):
+    """``true`` if all values are."""
+
+    def __init__(self, *values: Any) -> None:
+        self.values = [as_substitutions(value) for value in values]
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return ``true`` or ``false``."""
+        return _word(all(truth(context.text(value)) for value in self.values))
+
+
+class AnySubstitution(AllSubstitution):
+    """``true`` if one of the values is."""
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return ``true`` or ``false``."""
+        return _word(any(truth(context.text(value)) for value in self.values))
+
+
+class AndSubstitution(AllSubstitution):
+    """``true`` if both values are."""
+
+    def __init__(self, left: Any, right: Any) -> None:
+        super().__init__(left, right)
+
+
+class OrSubstitution(AnySubstitution):
+    """``true`` if one of two values is."""
+
+    def __init__(self, left: Any, right: Any) -> None:
+        super().__init__(left, right)
+
+
+class IfElseSubstitution(Substitution):
+    """One of two values, as a condition holds or not."""
+
+    def __init__(self, condition: Any, if_value: Any = "", else_value: Any = "") -> None:
+        self.condition = as_substitutions(condition)
+        self.if_value, self.else_value = as_substitutions(if_value), as_substitutions(else_value)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the value."""
+        return context.text(
+            self.if_value if truth(context.text(self.condition)) else self.else_value
+        )
+
+
+class FindPackagePrefix(Substitution):
+    """The prefix that a package is installed in."""
+
+    def __init__(self, package: Any) -> None:
+        self.package = as_substitutions(package)
+
+    def describe(self) -> str:
+        """Return how XML would have it."""
+        return f"$(find-pkg-prefix {''.join(part.describe() for part in self.package)})"
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the prefix."""
+        return self.find(context.text(self.package))
+
+    def find(self, package_name: str) -> str:
+        """Return the prefix of any package."""
+        return prefix_of(package_name)
+
+    def __truediv__(self, other: Any) -> PathJoinSubstitution:
+        return PathJoinSubstitution([self, other])
+
+
+class FindPackageShare(FindPackagePrefix):
+    """The ``share`` folder of a package."""
+
+    def describe(self) -> str:
+        """Return how XML would have it."""
+        return f"$(find-pkg-share {''.join(part.describe() for part in self.package)})"
+
+    def find(self, package_name: str) -> str:
+        """Return the folder of any package."""
+        return share_of(package_name)
+
+
+class ExecutableInPackage(FindExecutable):
+    """The path of an executable of a package."""
+
+    def __init__(self, executable: Any, package: Any) -> None:
+        super().__init__(name=executable)
+        self.package = as_substitutions(package)
+
+    def perform(self, context: LaunchContext) -> str:
+        """Return the path it has, or would have."""
+        package = context.text(self.package)
+        return os.path.join(prefix_of(package), "lib", package, context.text(self.name))
+
+
+__all__ = [
+    "AllSubstitution",
+    "AndSubstitution",
+    "AnonName",
+    "AnySubstitution",
+    "Command",
+    "EnvironmentVariable",
+    "EqualsSubstitution",
+    "ExecutableInPackage",
+    "FileContent",
+    "FindExecutable",
+    "FindPackagePrefix",
+    "FindPackageShare",
+    "IfElseSubstitution",
+    "LaunchConfiguration",
+    "NotEqualsSubstitution",
+    "NotSubstitution",
+    "OrSubstitution",
+    "PathJoinSubstitution",
+    "PathSubstitution",
+    "PythonExpression",
+    "StringJoinSubstitution",
+    "TextSubstitution",
+    "ThisLaunchFile",
+    "ThisLaunchFileDir",
+]

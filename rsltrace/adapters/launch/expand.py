@@ -1,0 +1,114 @@
+"""A job with launch files becomes a job without: their nodes, spelt out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from rsltrace.adapters.launch import ros_launch
+from rsltrace.adapters.launch.apart import read_apart
+from rsltrace.adapters.launch.expanded import Expanded
+from rsltrace.adapters.launch.model import Argument, Launched
+from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file
+from rsltrace.adapters.launch.specs import node_specs
+from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.errors import JobError, did_you_mean
+from rsltrace.job import Job, NodeSpec, locate, showing_line
+from rsltrace.source_packages import source_packages, workspace_of
+
+
+def expand(
+    job: Job,
+    *,
+    why_not: Callable[[str, str], str | None],
+    is_process: Callable[[str, str], bool],
+    programs: bool = True,
+) -> Expanded:
+    """Return a job whose launch files have become nodes.
+
+    A Python launch file is a program, and so is the ``setup.py`` of a package that nobody has
+    built: they are run to do so, or not used if ``programs`` is False.
+    ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot, and
+    ``is_process`` whether it runs as a process of its own.
+
+    :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
+    """
+    if not job.launch:
+        return Expanded(job)
+    if not programs:
+        return _expand(job, None, why_not, is_process)
+    folders = [job.resolve(folder) for folder in job.search_path]
+    around = [workspace_of(job.resolve(spec.file)) for spec in job.launch]
+    new = [f for f in dict.fromkeys(around) if f is not None and f not in folders]
+    with unbuilt_packages([*folders, *new]):
+        expanded = _expand(job, [*folders, *new], why_not, is_process)
+    job = expanded.job
+    named = {spec.executable.partition("/")[0] for spec in job.nodes if spec.executable}
+    if new and not named.isdisjoint(source_packages(new)):
+        more = [os.path.relpath(folder, job.base_dir) for folder in new]
+        job = job.replace(search_path=[*job.search_path, *more])
+    return Expanded(job, expanded.notes)
+
+
+def _expand(
+    job: Job,
+    folders: Sequence[Path] | None,
+    why_not: Callable[[str, str], str | None],
+    is_process: Callable[[str, str], bool],
+) -> Expanded:
+    """Do so; ``folders`` are those of packages and modules, None if no programs are to run."""
+    nodes: list[NodeSpec] = list(job.nodes)
+    notes: list[str] = []
+    for index, spec in enumerate(job.launch):
+        launched = _read(job, index, folders)
+        nodes += node_specs(
+            launched,
+            skip_unsupported=spec.skip_unsupported,
+            why_not=why_not,
+            is_process=is_process,
+            before=nodes,
+        )
+        notes += [f"left out: {item}" for item in launched.unsupported]
+        notes += launched.ignored
+    if not nodes and not job.bags:
+        where = locate(job, ("launch", 0, "file"))
+        in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
+        raise JobError(
+            "the launch file starts nothing that can be simulated",
+            where=where if in_file else job.launch[0].file,
+        )
+    return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
+
+
+def _read(job: Job, index: int, folders: Sequence[Path] | None) -> Launched:
+    spec = job.launch[index]
+    path = job.resolve(spec.file)
+    try:
+        read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
+        launched = read(path, spec.arguments)
+    except ProgramNeededError:
+        if folders is None:
+            raise JobError("a Python launch file is a program", where=spec.file) from None
+        launched = read_apart(path, spec.arguments, folders)
+    _check_known(job, index, launched.arguments)
+    return launched
+
+
+def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
+    """Raise ``JobError`` if an argument is given that no launch file declares."""
+    spec = job.launch[index]
+    for name in spec.arguments:
+        if name in known:
+            continue
+        listed = "".join(f"\n  {argument}" for argument in known.values()) or " none"
+        loc = ("launch", index, "arguments", name)
+        where = locate(job, loc)
+        in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
+        of = f" of {spec.file}" if in_file else ""
+        wrong = (
+            f"unknown launch argument {name!r}{of}{did_you_mean(name, known)}\nthere are:{listed}"
+        )
+        with showing_line(job, loc):
+            shown = where if in_file else os.path.relpath(job.resolve(spec.file))
+            raise JobError(wrong, where=shown)

@@ -1,0 +1,252 @@
+"""From what a launch file starts to entries of a job."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+from rsltrace.adapters.launch.model import Launched, LaunchedNode, Surroundings, Unsupported
+from rsltrace.adapters.launch.parameter_files import flat, parameters_for
+from rsltrace.adapters.launch.scope import ParameterFile, full_name
+from rsltrace.adapters.launch.values import inferred
+from rsltrace.adapters.workspace.cache import lasting
+from rsltrace.errors import JobError
+from rsltrace.job import NodeSpec
+from rsltrace.job.parts.process import RespawnSpec
+from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.values.ros_arguments import split_ros_arguments
+
+_LISTED_MAX = 30
+
+
+def node_specs(
+    launched: Launched,
+    *,
+    skip_unsupported: bool,
+    why_not: Callable[[str, str], str | None],
+    is_process: Callable[[str, str], bool] = lambda package, executable: False,
+    before: Sequence[NodeSpec] = (),
+) -> list[NodeSpec]:
+    """Return the nodes as entries of a job; ``launched.unsupported`` grows by what is left out.
+
+    ``why_not(package, executable)`` says why an executable cannot be simulated, ``is_process``
+    whether it runs as a process of its own. ``before`` are the entries that the job has already.
+
+    :raises JobError: with everything that cannot be simulated, unless that is to be skipped.
+    """
+    first = len(before)
+    containers = {full_name(spec.namespace, spec.name) for spec in before if spec.name}
+    runs: list[LaunchedNode] = []
+    for node in _without_idle_containers(launched.nodes, why_not):
+        why = _why_not(node, why_not, containers)
+        if why is not None:
+            launched.unsupported.append(Unsupported(node.where, node.title, why))
+        else:
+            runs.append(node)
+            containers |= {node.full_name} if node.is_container else set()
+    runs = _without_orphans(runs, launched)
+    _note_what_is_lost(runs, launched, is_process)
+    numbers: dict[int, int] = {}
+    for position, node in enumerate(runs, first):
+        numbers.setdefault(node.number, position)
+    required = launched.required
+    specs = [
+        _spec(node, numbers, is_process(node.package, node.executable), node.number in required)
+        for node in runs
+    ]
+    launched.unsupported.sort(key=_position)
+    if launched.unsupported and not skip_unsupported:
+        listed = launched.unsupported[:_LISTED_MAX]
+        more = len(launched.unsupported) - len(listed)
+        lines = "".join(f"\n  {item}" for item in listed) + (f"\n  and {more} more" if more else "")
+        raise JobError(
+            f"not all of the launch file can be simulated; --skip-unsupported (skip_unsupported: "
+            f"true in a job) leaves this out:{lines}"
+        )
+    return specs
+
+
+def _position(item: Unsupported) -> tuple[str, list[int]]:
+    file, *numbers = item.where.split(":")
+    return file, [int(number) for number in numbers if number.isdigit()]
+
+
+def _without_orphans(nodes: list[LaunchedNode], launched: Launched) -> list[LaunchedNode]:
+    """Return the nodes but those that wait for one that is left out, which are left out, too."""
+    while True:
+        there = {node.number for node in nodes}
+        kept = [node for node in nodes if node.after is None or node.after[1] in there]
+        if len(kept) == len(nodes):
+            return nodes
+        for node in nodes:
+            if node not in kept and node.after is not None:
+                why = f"it starts when something has {node.after[0]} that is left out itself"
+                launched.unsupported.append(Unsupported(node.where, node.title, why))
+        nodes = kept
+
+
+def _without_idle_containers(
+    nodes: Sequence[LaunchedNode], why_not: Callable[[str, str], str | None]
+) -> list[LaunchedNode]:
+    """Return the nodes but those containers of which nothing would come: Python components are
+    nodes of the run without one."""
+    busy = {node.container for node in nodes if "::" in node.plugin}
+    idle = {node.container for node in nodes if node.plugin} - busy
+    return [
+        node
+        for node in nodes
+        if not node.is_container
+        or node.full_name in busy
+        or (node.full_name not in idle and why_not(node.package, node.executable) is None)
+    ]
+
+
+def _note_what_is_lost(
+    nodes: Sequence[LaunchedNode], launched: Launched, is_process: Callable[[str, str], bool]
+) -> None:
+    for node in nodes:
+        said = node.surroundings
+        if is_process(node.package, node.executable):
+            if said.without:
+                why = "processes are started as they are"
+                launched.ignored.append(f"{node.where}: {', '.join(said.without)}: {why}")
+        elif lost := (*said.without, *said.own):
+            why = "it runs in the process of rsltrace"
+            launched.ignored.append(f"{node.where}: {', '.join(lost)}: {why}")
+
+
+def _why_not(
+    node: LaunchedNode,
+    of_executable: Callable[[str, str], str | None],
+    containers: Collection[str],
+) -> str | None:
+    if not node.plugin:
+        return of_executable(node.package, node.executable)
+    if "::" in node.plugin:
+        if node.container in containers:
+            return None
+        return f"it is a C++ component, and its container {node.container} is not there"
+    if "." not in node.plugin and ":" not in node.plugin:
+        return "a Python component is written module.Class, or module:Class"
+    return None
+
+
+def _spec(
+    node: LaunchedNode, numbers: Mapping[int, int], is_process: bool, is_required: bool
+) -> NodeSpec:
+    if node.fault:
+        raise JobError(node.fault)
+    words, ros_words = split_ros_arguments(node.arguments)
+    given = _RosWords([*node.ros_arguments, *ros_words], node.where)
+    name = given.name or node.name
+    namespace = given.namespace or node.namespace
+    whole = None if name is None else full_name(namespace, name)
+    files, parameters = _in_order([*node.parameters, *given.parameters], whole)
+    remappings = dict(reversed([*node.remappings, *given.remappings]))  # the first one counts
+    values: dict[str, Any] = {
+        "name": name,
+        "namespace": namespace,
+        "parameters": parameters,
+        "parameter_files": files,
+        "remappings": dict(reversed(remappings.items())),
+        "origin": node.where,
+    }
+    if node.after is not None:
+        moment, number = node.after
+        rule: dict[str, Any] = {"delay": f"{node.delay_ns}ns", moment: numbers[number]}
+        values["start_after"] = StartAfterSpec(**rule)
+    elif node.delay_ns:
+        values["start_after"] = StartAfterSpec.after(node.delay_ns)
+    try:
+        if "::" in node.plugin:
+            extra = [item for item in node.extra_arguments if isinstance(item, dict)]
+            return NodeSpec(
+                component=f"{node.package}/{node.plugin}",
+                container=node.container,
+                extra_arguments={name: v for item in extra for name, v in flat(item)},
+                **values,
+            )
+        if node.plugin:
+            module, _, attribute = node.plugin.replace(":", ".").rpartition(".")
+            return NodeSpec(node=f"{module}:{attribute}", **values)
+        target = f"{node.package}/{node.executable}"
+        if is_process:
+            values |= _surroundings(node.surroundings)
+        values["required"] = is_required
+        return NodeSpec(executable=target, arguments=words, **values)
+    except JobError as error:
+        raise JobError(str(error).removeprefix("NodeSpec: "), where=node.where) from None
+
+
+def _surroundings(said: Surroundings) -> dict[str, Any]:
+    values: dict[str, Any] = {"environment": dict(said.environment)}
+    if said.folder:
+        values["working_directory"] = said.folder
+    if said.respawn is not None:
+        delay_ns, times = said.respawn
+        values["respawn"] = RespawnSpec.after(delay_ns, times)
+    return values
+
+
+def _in_order(
+    parameters: Sequence[ParameterFile | dict[str, Any]], full_name: str | None
+) -> tuple[list[str], dict[str, Any]]:
+    """Return files and values such that each parameter has the value given last.
+
+    A job's values win over its files, so a value that a later file gives again is left out.
+    """
+    files: list[str] = []
+    values: dict[str, Any] = {}
+    for item in parameters:
+        if isinstance(item, ParameterFile):
+            files.append(lasting(item.path))
+            for name in parameters_for(item.path, full_name):
+                values.pop(name, None)
+        else:
+            values.update(flat(item))
+    return files, values
+
+
+class _RosWords:
+    """What ``--ros-args`` words say about one node."""
+
+    def __init__(self, words: Sequence[str], where: str) -> None:
+        self.name: str | None = None
+        self.namespace: str | None = None
+        self.parameters: list[ParameterFile | dict[str, Any]] = []
+        self.remappings: list[tuple[str, str]] = []
+        self._where = where
+        rest = list(words)
+        while rest:
+            option = rest.pop(0)
+            if option in ("--ros-args", "--"):
+                continue
+            if option in ("--enable-rosout-logs", "--disable-rosout-logs") or option.startswith(
+                ("--enable-", "--disable-")
+            ):
+                continue
+            if not rest:
+                raise JobError(f"the ROS argument {option} has no value", where=where)
+            self._add(option, rest.pop(0))
+
+    def _add(self, option: str, value: str) -> None:
+        if option in ("--log-level", "--log-file-name", "--log-config-file", "-e", "--enclave"):
+            return
+        if option == "--params-file":
+            path = os.path.abspath(value)
+            if not os.path.isfile(path):
+                raise JobError(f"there is no parameter file {value}", where=self._where)
+            self.parameters.append(ParameterFile(path))
+            return
+        name, assigned, to = value.partition(":=")
+        if option not in ("-r", "--remap", "-p", "--param") or not assigned:
+            raise JobError(f"unknown ROS argument {option} {value}", where=self._where)
+        if option in ("-p", "--param"):
+            self.parameters.append({name: inferred(to)})
+        elif name in ("__node", "__name"):
+            self.name = to
+        elif name == "__ns":
+            self.namespace = to
+        else:
+            self.remappings.append((name, to))

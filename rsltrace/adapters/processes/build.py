@@ -1,0 +1,230 @@
+"""The library that processes are started with: built on first use, against the ROS that is here.
+
+What is built lies in the user's cache, by the sources, the compiler and the versions of ROS.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.adapters.workspace.cache import cached_folder, key_of
+from rsltrace.errors import SetupError
+
+SOURCES = Path(__file__).parent / "native"
+_STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"
+_NAME = "librmw_rsltrace.so"
+_STUB = "librsltrace_python_symbols.so"
+_DIGEST = "digest"
+_HEADERS = ("rmw/rmw/rmw.h", "rcl/rcl/rcl.h", "fastcdr/Cdr.h")
+_LIBRARIES = ("rmw", "rcutils", "fastcdr", "rosidl_runtime_c")
+_PACKAGES = "rmw, rcl and rmw-fastrtps-cpp"
+_ERROR_LINES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Ros:
+    """A ROS installation to build against: its headers and libraries, and where else libraries
+    are that these need."""
+
+    prefix: Path
+    libraries: tuple[Path, ...]
+
+    @property
+    def include(self) -> tuple[Path, ...]:
+        """The folders that a compiler looks into."""
+        root = self.prefix / "include"
+        return (root, *sorted(path for path in root.iterdir() if path.is_dir()))
+
+
+def find_ros() -> Ros:
+    """Return the ROS that is sourced, or the one that is installed in this environment.
+
+    :raises SetupError: if there is none with headers.
+    """
+    listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    for prefix in (Path(folder) for folder in [*listed, sys.prefix] if folder):
+        include = prefix / "include"
+        if all(
+            (include / name).exists() or (include / "fastcdr" / name).exists() for name in _HEADERS
+        ):
+            more = sorted(Path(sys.prefix).glob("lib/python*/site-packages/ros_*.libs"))
+            return Ros(prefix, (prefix / "lib", *more))
+    raise SetupError(
+        f"processes need ROS 2 with its headers ({_HEADERS[0]}), which is neither sourced nor in "
+        f"{sys.prefix}: install it (pip install 'rsltrace[ros]', or apt install ros-jazzy-rcl "
+        "ros-jazzy-rmw-fastrtps-cpp, and source it)"
+    )
+
+
+def find_compiler() -> list[str]:
+    """Return the command of the C++ compiler.
+
+    :raises SetupError: if there is none, or not the one that is named in ``CXX``.
+    """
+    given = os.environ.get("CXX", "")
+    try:
+        named = shlex.split(given)
+    except ValueError as error:
+        raise SetupError(f"CXX={given!r} is no command: {error}") from error
+    for command in (named, ["g++"], ["clang++"]):
+        if command and shutil.which(command[0]):
+            return command
+        if command and command is named:
+            raise SetupError(f"CXX={given!r}: there is no program {command[0]!r}")
+    raise SetupError(
+        "processes need a C++ compiler, once, to build the library that they are started with: "
+        "install g++ (apt install g++), or name one in CXX"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """What is preloaded into processes. ``python_symbols`` stands in for what libraries of ROS
+    want from Python, in programs that have none."""
+
+    path: Path
+    python_symbols: Path
+    ros: Ros
+
+
+def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
+    """Return the library; it is built if it has not been, and ``told`` is given one line then.
+
+    :raises SetupError: if a compiler or headers are missing, or the compiler refuses the sources.
+    """
+    ros, compiler = find_ros(), find_compiler()
+    sources = sorted(SOURCES.glob("*.[ch]*"))
+    command = [*compiler, *_options(), *extra]
+    version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
+    name = key_of(
+        [
+            " ".join(command),
+            version.stdout,
+            str(ros.prefix),
+            platform.machine(),
+            *_stamps(ros),
+            *(part for path in (*sources, _STUB_SOURCE) for part in (path.name, path.read_bytes())),
+        ]
+    )
+
+    def make(folder: Path) -> None:
+        told(
+            f"building the library that processes run with (once; 10 to 30 seconds): "
+            f"{compiler[0]}, {ros.prefix}"
+        )
+        _build(command, ros, sources, folder)
+        (folder / _DIGEST).write_text(_digest(folder))
+
+    folder = cached_folder("processes", name, make)
+    if not _is_whole(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder = cached_folder("processes", name, make)
+    return Library(folder / _NAME, folder / _STUB, ros)
+
+
+def _digest(folder: Path) -> str:
+    return key_of((folder / name).read_bytes() for name in (_NAME, _STUB))
+
+
+def _is_whole(folder: Path) -> bool:
+    """Return whether a folder of the cache has what was built: the dynamic linker leaves out a
+    library that is cut off, and the process would run outside of the run."""
+    try:
+        return (folder / _DIGEST).read_text() == _digest(folder)
+    except OSError:
+        return False
+
+
+def _options() -> list[str]:
+    return ["-std=c++17", "-O2", "-g1", "-fPIC", "-fvisibility=hidden", "-pthread"]
+
+
+def _stamps(ros: Ros) -> list[str]:
+    """Return what changes when ROS is installed anew."""
+    files = [ros.prefix / "lib" / f"lib{name}.so" for name in (*_LIBRARIES, "rcl")]
+    return [f"{path.stat().st_size} {path.stat().st_mtime_ns}" for path in files if path.exists()]
+
+
+def _build(compiler: list[str], ros: Ros, sources: Sequence[Path], folder: Path) -> None:
+    """Build the library and the stub in a folder, as many sources at a time as there are cores."""
+    include = [f"-I{path}" for path in ros.include]
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        objects = {path: f"{scratch}/{path.stem}.o" for path in sources if path.suffix == ".cpp"}
+        _run([*compiler, "-c", str(path), "-o", made, *include] for path, made in objects.items())
+        where = ros.prefix / "lib"
+        link = [f"-L{where}", f"-Wl,-rpath,{where}", *(f"-l{name}" for name in _LIBRARIES), "-ldl"]
+        _run(
+            [
+                [*compiler, "-shared", *objects.values(), "-o", str(folder / _NAME), *link],
+                [*compiler, "-shared", str(_STUB_SOURCE), "-o", str(folder / _STUB)],
+            ]
+        )
+
+
+def _run(commands: Iterable[list[str]]) -> None:
+    """Run compilers beside each other. None of them outlives this, however it ends.
+
+    :raises SetupError: if one fails.
+    """
+    waiting = list(commands)
+    name = waiting[0][0]
+    running: list[subprocess.Popen[str]] = []
+    try:
+        while waiting or running:
+            while waiting and len(running) < len(os.sched_getaffinity(0)):
+                with _uninterrupted():
+                    running.append(_started(waiting.pop(0)))
+            said = running[0].communicate()[1]
+            _check(name, running.pop(0).returncode, said)
+    finally:
+        for one in running:
+            with suppress(ProcessLookupError):
+                os.killpg(one.pid, signal.SIGKILL)
+            one.communicate()
+
+
+@contextmanager
+def _uninterrupted() -> Iterator[None]:
+    """Let nothing come between the start of a process and the note of it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _started(command: list[str]) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def _check(name: str, status: int, said: str) -> None:
+    if not status:
+        return
+    lines = [line for line in said.splitlines() if "error" in line] or said.splitlines()
+    lines = lines or [f"exit status {status}"]
+    shown = "\n".join(f"  {line}" for line in lines[:_ERROR_LINES])
+    raise SetupError(
+        f"{name} cannot build the library that processes run with against the headers of "
+        f"{_PACKAGES}:\n{shown}"
+    )
+
+
+__all__ = ["Library", "Ros", "find_compiler", "find_ros", "library"]

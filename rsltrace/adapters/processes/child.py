@@ -1,0 +1,205 @@
+"""A child process and the socket to it: starting, talking, reaping, and leaving none behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.adapters.processes.life import Life, has_memory
+from rsltrace.adapters.processes.shared import Said, Shared
+from rsltrace.adapters.processes.wire import HEAD, RECORD, Told
+from rsltrace.errors import JobError
+from rsltrace.guard.pin import fix_addresses
+
+_LARGE = 1 << 14
+"""What is longer is not sent, but laid into memory that both see."""
+_HEAD_SIZE = HEAD.size
+_LOOK_S = 0.2
+_GRACE_S = 2.0
+_LOST_LINK = 120  # of native/link.cpp
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a process ended: its exit status (negative: the signal that killed it), in words.
+
+    ``broken_link`` says what it has done to the link, if that is why it was ended.
+    """
+
+    status: int
+    broken_link: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether that was no orderly end."""
+        return self.status != 0 or self.broken_link != ""
+
+    @property
+    def said(self) -> str:
+        """What happened, as the end of a sentence."""
+        if self.broken_link:
+            return f"{self.broken_link} the descriptor by which rsltrace runs it"
+        if self.status >= 0:
+            return f"ended with exit status {self.status}"
+        with suppress(ValueError):
+            return f"was killed by {signal.Signals(-self.status).name}"
+        return f"was killed by signal {-self.status}"
+
+
+class Child:
+    """A running executable with the library in it, in a process group of its own.
+
+    Its addresses are the same in every run if they are ``fixed``, where the system allows that; if
+    not, they are what those of whoever starts rsltrace would be.
+
+    :raises JobError: if it cannot be started.
+    """
+
+    def __init__(
+        self,
+        argv: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path | None,
+        name: str,
+        *,
+        fixed: bool = True,
+    ) -> None:
+        self._name = name
+        here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with there:
+            # A reader that looks up now and then sees the end of a child whose own children live.
+            here.setsockopt(
+                socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, int(_LOOK_S * 1e6))
+            )
+            self._said, self._told = Said("rsltrace-said"), Shared("rsltrace-told")
+            files = (there.fileno(), self._said.fd, self._told.fd)
+            # Of one length: the environment lies on the stack, and what comes after it moves.
+            link = ":".join(f"{number:010d}" for number in (files[0], os.getpid(), *files[1:]))
+            try:
+                with _fixed_addresses() if fixed else nullcontext():
+                    self._process = subprocess.Popen(
+                        list(argv),
+                        env={**environment, "RSLTRACE_LINK": link},
+                        cwd=folder,
+                        stdin=subprocess.DEVNULL,
+                        pass_fds=files,
+                        start_new_session=True,
+                    )
+            except OSError as error:
+                here.close()
+                self._close_files()
+                raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
+        self._socket = here
+        self._head = memoryview(bytearray(_HEAD_SIZE))
+        self._patience = 0
+        self._life: Life | None = None
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    def send(self, data: bytes) -> None:
+        """Send to the process; one that is gone is noticed by ``receive``."""
+        if len(data) > _LARGE:
+            self._told.grow(len(data))
+            self._told.data[: len(data)] = data
+            data = RECORD.pack(len(data), Told.SHARED)
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self._socket.sendall(data)
+
+    def receive(self) -> memoryview | None:
+        """Return the next batch, None if the process has ended; it holds until ``taken``.
+
+        :raises WireError: if the process has written something of its own to the link.
+        """
+        count = self._read_into(self._head)
+        while 0 < count < _HEAD_SIZE:
+            more = self._read_into(self._head[count:])
+            count = count + more if more else 0
+        return self._said.batch(HEAD.unpack(self._head)[0]) if count else None
+
+    def taken(self) -> None:
+        """Let go of a batch: the process writes the next one to the same place."""
+        self._said.taken()
+
+    def left(self) -> memoryview:
+        """Return what a process has said that has ended, after its last batch.
+
+        :raises WireError: if that is nothing that makes sense.
+        """
+        return self._said.left()
+
+    def give_up_after(self, seconds: float) -> None:
+        """Kill the process if it says nothing for so long, by its own time (``Life``)."""
+        self._patience, self._life = int(seconds / _LOOK_S), Life(self.pid)
+
+    def _read_into(self, room: memoryview) -> int:
+        """Read what there is, at least something; 0 if the process has ended."""
+        looks = 0
+        while True:
+            try:
+                return self._socket.recv_into(room)
+            except BlockingIOError:
+                if self._process.poll() is not None:
+                    with suppress(BlockingIOError):  # what it said before
+                        return self._socket.recv_into(room, 0, socket.MSG_DONTWAIT)
+                    return 0
+                looks += self._life is not None and self._life.goes_on()
+                if looks > self._patience:
+                    self.kill()
+                    return 0
+            except ConnectionResetError:
+                return 0
+
+    def reap(self) -> Ended:
+        """Wait for the end of a process that says no more; one that lives on is killed."""
+        while self._process.poll() is None:
+            if has_memory(self.pid):  # what ends has given its memory back before its descriptors
+                self.kill()
+                return Ended(self._process.returncode, "closed")
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_LOOK_S)
+        status = self._process.returncode
+        return Ended(status, "closed" if status == _LOST_LINK else "")
+
+    def dismiss(self) -> None:
+        """End the process: it is told to, and killed if it does not."""
+        self.send(RECORD.pack(0, Told.KILL))
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_GRACE_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """Kill the process with all that it has started."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._socket.close()
+
+    def close(self) -> None:
+        """Kill the process, and give back what belongs to it."""
+        self.kill()
+        self._close_files()
+
+    def _close_files(self) -> None:
+        self._said.close()
+        self._told.close()
+
+
+@contextmanager
+def _fixed_addresses() -> Iterator[None]:
+    """Let children have the same addresses in every run, where the system allows it."""
+    changed = fix_addresses(True)
+    try:
+        yield
+    finally:
+        if changed:
+            fix_addresses(False)

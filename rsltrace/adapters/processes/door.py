@@ -1,0 +1,139 @@
+"""All processes of a run: how they start, and that none is left behind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rsltrace.adapters.processes.child import Child
+from rsltrace.adapters.processes.process import Process
+from rsltrace.errors import RunError
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.loop import Dispatchable
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.events.failure import end_run, note_raised
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
+from rsltrace.trace.model.event import NO_EVENT, EventKind
+
+_EVERY_PROCESS_ENDED = "every process has ended"
+
+
+@dataclass(frozen=True, slots=True)
+class Program:
+    """What to start as a process: the whole command line, and what it finds around it.
+
+    It has the same addresses in every run if it is ``pinned``.
+    """
+
+    argv: Sequence[str]
+    environment: Mapping[str, str] = field(default_factory=dict)
+    folder: Path | None = None
+    pinned: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Interfaces:
+    """Where the door gets types from, which it knows by name only."""
+
+    message: Callable[[str], MessageType]
+    service: Callable[[str], ServiceType]
+
+
+Log = Callable[[int, str, str], None]
+"""Shows a log record: severity, name of the logger, text."""
+
+
+class ProcessDoor:
+    """The processes of one run. ``on_end`` is called with the key of each that has ended;
+    ``follows_clock`` says of a node whether /clock drives its ROS time. ``clock`` is there if nodes
+    have clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it
+    says what is shown, and whether that stays so throughout the event."""
+
+    def __init__(self, domain: Domain, interfaces: Interfaces, *, seed: int, log: Log) -> None:
+        self.domain = domain
+        self.log = log
+        self.message_type = interfaces.message
+        self.service_type = interfaces.service
+        self.processes: list[Process] = []
+        self.follows_clock: Callable[[str], bool] = lambda node: False
+        self.clock: Callable[[str | None, bool], tuple[int, bool]] | None = None
+        self.on_end: Callable[[str], None] = lambda key: None
+        self._seed = seed
+
+    def seed_of(self, key: str) -> int:
+        """Return the number from which a process draws what others take for entropy."""
+        return Stream(self._seed, f"process\0{key}").below(1 << 53)
+
+    def start(
+        self,
+        program: Program,
+        *,
+        name: str,
+        key: str,
+        log_failure: bool,
+        cause: tuple[int, int] = (NO_EVENT, 0),
+        on_start: Callable[[], None] = lambda: None,
+    ) -> None:
+        """Start a process and let it run up to its first wait, as one event."""
+        domain = self.domain
+        process = Process(self, name, key, log_failure=log_failure)
+        process.begun_ns = domain.loop.now_ns
+        process.entity_id = domain.entities.new_id()
+        domain.entities.pending.append(process)
+        self.processes.append(process)
+
+        def begin() -> None:
+            on_start()
+            argv, environment, folder = program.argv, program.environment, program.folder
+            process.begin(lambda: Child(argv, environment, folder, name, fixed=program.pinned))
+
+        domain.dispatcher.run_outside(
+            OutsideEvent(process.describe),
+            EventKind.CONSTRUCT,
+            process.entity_id,
+            None,
+            begin,
+            cause,
+        )
+
+    def has_ended(self, process: Process) -> None:
+        """Take note that a process has ended, in the event under way."""
+        self.on_end(process.key)
+
+    @property
+    def exit_code(self) -> int:
+        """1 if a process has failed that may, else 0."""
+        return int(any(one.has_failed for one in self.processes))
+
+    def end(self) -> None:
+        """End all that still run, in the order of their start, each as one event."""
+        for process in self.processes:
+            if process.ended is not None or self.domain.outcome.error is not None:
+                continue
+
+            self.domain.dispatcher.run_outside(
+                OutsideEvent(process.describe),
+                EventKind.SHUTDOWN,
+                process.entity_id,
+                None,
+                process.stop,
+            )
+
+    def close(self) -> None:
+        """Kill what is left, however the run has ended."""
+        for process in self.processes:
+            with suppress(AttributeError):  # could not be started
+                process.child.close()
+
+    def raised(self, error: BaseException, handle: Dispatchable) -> None:
+        """End the run because of what an event of a process has raised."""
+        dispatcher = self.domain.dispatcher
+        if isinstance(error, KeyboardInterrupt):
+            dispatcher.loop.stop(Stop("interrupted", 130))
+            return
+        raised = note_raised(dispatcher, error, handle)
+        end_run(dispatcher, raised, error if isinstance(error, RunError) else raised.as_error())

@@ -1,0 +1,298 @@
+"""Endpoints and timers of processes: what arrives is handed over when the process waits for it."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from rsltrace.adapters.processes.wire import Ready, gid_of, packed_item
+from rsltrace.simulation.middleware.entity import DomainEntity
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
+from rsltrace.simulation.middleware.participant import Participant
+from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.qos.policies import Qos
+from rsltrace.simulation.middleware.services import (
+    CLIENT,
+    SERVICE,
+    Client,
+    Exchange,
+    RequestId,
+    Service,
+)
+from rsltrace.simulation.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
+from rsltrace.simulation.middleware.timer import TIMER, Timer
+from rsltrace.simulation.middleware.transport import Transport
+from rsltrace.trace.cdr import log_content
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import NO_EVENT, OutputKind
+
+_NO_GID = bytes(16)
+
+
+class Thing(Protocol):
+    """What a process has made and may wait for. ``number`` is what the process calls it."""
+
+    number: int
+    destroyed: bool
+
+    def dispatch(self) -> None:
+        """Hand over what is ready."""
+
+    def may_run(self) -> bool:
+        """Return whether there is something to hand over now."""
+
+    def describe(self) -> str:
+        """Name it for people."""
+
+
+class Host(Protocol):
+    """The process that endpoints and timers are in, as they see it."""
+
+    name: str
+    dispatcher: Dispatcher
+
+    def wants(self, thing: Thing) -> bool:
+        """Return whether one of its threads waits for a thing now."""
+
+    def hold(self, thing: Thing) -> None:
+        """Keep what is ready until the process waits for it."""
+
+    def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
+        """Let the thread that waits for a thing go on, until the process waits again."""
+
+    def was_no_callback(self) -> None:
+        """Say that the event under way is no callback's."""
+
+    def own(self, timer: ProcessTimer) -> None:
+        """Give a timer whose callback has run to a node."""
+
+
+class RosoutPublisher(Publisher):
+    """A publisher of /rosout: what it sends are log records."""
+
+    output_kind = int(OutputKind.LOG)
+
+    def send(self, data: bytes, content_hash: int | None = None) -> None:
+        super().send(data, hash64(log_content(data)))
+
+
+class _Named(DomainEntity):
+    """An endpoint whose callback has a name, if the process says it."""
+
+    callback_name = ""
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self.callback_name = name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**super().trace_detail(), "callback": self.callback_name}
+
+
+class ProcessSubscription(_Named, Subscription):
+    """A subscription of a process. ``number`` is what the process calls it."""
+
+    def __init__(
+        self,
+        process: Host,
+        number: int,
+        node: Participant,
+        topic: str,
+        type: MessageType,
+        qos: Qos,
+    ) -> None:
+        super().__init__(process.dispatcher, node, topic, type, qos)
+        self.process = process
+        self.number = number
+        self._received = 0
+
+    def dispatch(self) -> None:
+        if not self.may_run():
+            return
+        if not self.process.wants(self):
+            self.process.hold(self)
+            return
+        delivery: Delivery = self.queue.popleft()
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            SUBSCRIPTION,
+            self.process.go_on_with,
+            (self.number, Ready.ENTITY, self._packed(delivery)),
+            *delivery[5:8],
+        )
+
+    def take(self) -> bytes | None:
+        """Return the oldest message for who asks without having waited, None if there is none."""
+        return self._packed(self.queue.popleft()) if self.queue else None
+
+    def _packed(self, delivery: Delivery) -> bytes:
+        self._received += 1
+        received_ns = delivery[0] or delivery[8]
+        return packed_item(
+            delivery[8], received_ns, delivery[9], self._received, _NO_GID, delivery[4]
+        )
+
+
+class ProcessService(_Named, Service):
+    """A server of a process."""
+
+    def __init__(
+        self,
+        process: Host,
+        number: int,
+        transport: Transport,
+        node: Participant,
+        name: str,
+        type: ServiceType,
+        qos: Qos,
+    ) -> None:
+        super().__init__(transport, node, name, type, qos)
+        self.process = process
+        self.number = number
+        self._asked: dict[tuple[bytes, int], RequestId] = {}
+
+    def dispatch(self) -> None:
+        if not self.may_run():
+            return
+        if not self.process.wants(self):
+            self.process.hold(self)
+            return
+        exchange: Exchange = self.queue.popleft()
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            SERVICE,
+            self.process.go_on_with,
+            (self.number, Ready.ENTITY, self._packed(exchange)),
+            *exchange[1:4],
+        )
+
+    def take(self) -> bytes | None:
+        """Return the oldest request, None if there is none."""
+        return self._packed(self.queue.popleft()) if self.queue else None
+
+    def _packed(self, exchange: Exchange) -> bytes:
+        request_id = exchange[4].request_id
+        gid = gid_of(request_id.client.entity_id)
+        self._asked[gid, request_id.sequence_number] = request_id
+        return _packed_exchange(exchange, gid)
+
+    def answer(self, gid: bytes, number: int, data: bytes) -> None:
+        """Send a response; one to nobody's request is lost, as in DDS."""
+        request_id = self._asked.pop((gid, number), None)
+        if request_id is not None:
+            self.respond(data, request_id)
+
+
+class ProcessClient(Client):
+    """A client of a process."""
+
+    def __init__(
+        self,
+        process: Host,
+        number: int,
+        transport: Transport,
+        node: Participant,
+        name: str,
+        type: ServiceType,
+        qos: Qos,
+    ) -> None:
+        super().__init__(transport, node, name, type, qos)
+        self.process = process
+        self.number = number
+
+    def dispatch(self) -> None:
+        if not self.may_run():
+            return
+        if not self.process.wants(self):
+            self.process.hold(self)
+            return
+        exchange: Exchange = self.queue.popleft()
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            CLIENT,
+            self.process.go_on_with,
+            (self.number, Ready.ENTITY, self._packed(exchange)),
+            *exchange[1:4],
+        )
+
+    def take(self) -> bytes | None:
+        """Return the oldest response, None if there is none."""
+        return self._packed(self.queue.popleft()) if self.queue else None
+
+    def _packed(self, exchange: Exchange) -> bytes:
+        return _packed_exchange(exchange, gid_of(self.entity_id))
+
+
+def _packed_exchange(exchange: Exchange, gid: bytes) -> bytes:
+    info = exchange[4]
+    number = info.request_id.sequence_number
+    return packed_item(info.source_timestamp, info.received_timestamp, number, 0, gid, exchange[0])
+
+
+class ProcessTimer(Timer):
+    """A timer of a process: rcl's, of which the loop knows when it is due.
+
+    rcl does not say whose it is, and what executors make for themselves (a wait with a time) looks
+    like any other. So it is nobody's until its callback has been called.
+    """
+
+    begins_active = False
+
+    def __init__(self, dispatcher: Dispatcher, process: Host, number: int, period_ns: int) -> None:
+        super().__init__(dispatcher, None, period_ns)
+        self.process = process
+        self.number = number
+        self.name = ""
+        self.is_callback = True
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self.name = name
+
+    def due_at(self, deadline_ns: int) -> None:
+        """Take note of when it is due, by what rcl says."""
+        state, timers = self.state, self.dispatcher.loop.timers
+        if deadline_ns != state.deadline_ns or state.canceled or state.ticket is None:
+            state.deadline_ns, state.canceled = deadline_ns, False
+            timers.add(state)
+
+    def cancel(self) -> None:
+        self.state.canceled = True
+        self.dispatcher.loop.timers.remove(self.state)
+
+    def may_run(self) -> bool:
+        """Return whether it is due."""
+        return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
+
+    def dispatch(self) -> None:
+        loop, state, process = self.dispatcher.loop, self.state, self.process
+        if not process.wants(self):
+            loop.timers.remove(state)
+            process.hold(self)
+            return
+        digest = self.deadline_hash()
+        state.call(loop.now_ns)
+        loop.timers.ran(state)
+        self.is_callback = True
+        self.dispatcher.execute(
+            self, self.entity_id, self.node, TIMER, self._run, (), NO_EVENT, 0, digest
+        )
+
+    def _run(self) -> None:
+        self.process.go_on_with(self.number, Ready.TIMER, b"")
+        if not self.is_callback:
+            self.process.was_no_callback()
+        elif self.node is None and not self.destroyed:
+            self.process.own(self)
+
+    def trace_name(self) -> str:
+        return self.name
+
+    def describe(self) -> str:
+        return super().describe() if self.node is not None else f"{self.process.name}: a timer"

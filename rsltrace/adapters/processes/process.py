@@ -1,0 +1,431 @@
+"""One process of a run: what it says becomes outputs, and it goes on when the loop lets it."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Protocol
+
+from rsltrace.adapters.processes import graph_answers
+from rsltrace.adapters.processes.child import Child, Ended
+from rsltrace.adapters.processes.endpoints import (
+    ProcessClient,
+    ProcessService,
+    ProcessTimer,
+    Thing,
+)
+from rsltrace.adapters.processes.things import Interfaces, Things
+from rsltrace.adapters.processes.waking import GraphChange, WakingTimer
+from rsltrace.adapters.processes.wire import (
+    GO,
+    GRAPH_ID,
+    HEAD,
+    NEVER_NS,
+    RECORD,
+    Fields,
+    Ready,
+    Say,
+    Told,
+    WireError,
+    gid_of,
+    packed_qos,
+)
+from rsltrace.errors import NodeError
+from rsltrace.simulation.middleware.participant import Participant
+from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.model.stamp import format_seconds
+
+_RESUME = int(EventKind.RESUME)
+_SUSPENDED = int(EventFlag.SUSPENDED)
+_GRACE_S = 5.0
+"""How long a process may take (in real time) to end when it is told to."""
+_WAITER = struct.Struct("<IIqI")
+_DEADLINE = struct.Struct("<Iq")
+_REQUEST_ID = struct.Struct("<I16sq")
+_HELLO = struct.Struct("<qQI")
+_SHOWN = struct.Struct("<qI")
+_RECORD_SIZE = RECORD.size
+_PUBLISH, _WAIT = int(Say.PUBLISH), int(Say.WAIT)
+_number = HEAD.unpack_from
+_NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
+"""What reading raises if something else than the library has written to the link."""
+
+Question = Callable[[Fields], bytes]
+
+
+class Surroundings(Interfaces, Protocol):
+    """What a process finds in its run."""
+
+    log: Callable[[int, str, str], None]
+    follows_clock: Callable[[str], bool]
+    clock: Callable[[str | None, bool], tuple[int, bool]] | None
+
+    def seed_of(self, key: str) -> int:
+        """Return the number from which a process draws what others take for entropy."""
+
+    def has_ended(self, process: Process) -> None:
+        """Take note that a process has ended, in the event under way."""
+
+
+class Process:
+    """An executable that runs beside rsltrace; in the trace, a main.
+
+    ``things`` are its nodes, endpoints and timers.
+    """
+
+    def __init__(self, door: Surroundings, name: str, key: str, *, log_failure: bool) -> None:
+        self.door = door
+        self.dispatcher = door.domain.dispatcher
+        self.name = name
+        self.key = key
+        self.log_failure = log_failure
+        self.entity_id = 0
+        self.announced = True
+        self.begun_ns = 0
+        self.child: Child
+        self.ended: Ended | None = None
+        self.things = Things(door, self)
+        self._wanted: dict[int, int] = {}
+        """Which thread waits for a thing."""
+        self._waits: tuple[tuple[int, int], ...] = ()
+        self._sets: dict[int, tuple[int, ...]] = {}
+        self._waking: dict[int, WakingTimer] = {}
+        self._held: list[Thing] = []
+        self._running_thread = 0
+        self._same_wait = b""
+        """What it waited for last, if that has no end."""
+        self._waking_soon = False
+        self._last: Thing | None = None
+        self._is_stopping = False
+        self._graph = GraphChange(self)
+        door.domain.graph.changed.append(self._graph.note)
+        self._questions: dict[int, Question] = {
+            Say.HELLO: self._hello,
+            Say.TAKE: self._take,
+            Say.READY: self._ready,
+            Say.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
+            Say.QOS: self._qos,
+            Say.MATCHED: self._matched,
+            Say.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_name)),
+            Say.CLOCK: self._clock,
+            Say.CLOCK_OWNER: self._owner_of_new_clock,
+            Say.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
+        }
+        self._records: dict[int, Callable[[Fields], None]] = {
+            **self.things.records,
+            Say.GONE: self._gone,
+            Say.REQUEST: self._request,
+            Say.RESPONSE: self._response,
+            Say.LOG: self._log,
+            Say.REPORT: self._report,
+            Say.TIMER_PASSED: self._timer_passed,
+            Say.TIMER_NEXT: self._timer_next,
+            Say.WAIT_SET: self._wait_set,
+            Say.ALIVE: self._alive,
+            Say.DROPPED: lambda fields: self.things[fields.number()].drop(),
+        }
+
+    # -- as the trace has it ---------------------------------------------------------------------
+
+    def describe(self) -> str:
+        """Name the process for people."""
+        return self.name
+
+    def settle(self) -> bool:
+        """Return whether its owner is known: it has none."""
+        return True
+
+    def entity(self) -> Entity:
+        """Return the process as the trace describes it."""
+        return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns, {})
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it has ended as it should not, while the run went on."""
+        return self.ended is not None and self.ended.failed and not self._is_stopping
+
+    # -- going on --------------------------------------------------------------------------------
+
+    def begin(self, child: Callable[[], Child]) -> None:
+        """Start it, and let it run up to its first wait, within the event under way."""
+        self.child = child()
+        self._converse()
+
+    @property
+    def waits_for_graph(self) -> bool:
+        """Whether one of its threads waits for a change of the graph now."""
+        return GRAPH_ID in self._wanted
+
+    def wants(self, thing: Thing) -> bool:
+        """Return whether one of its threads waits for a thing now."""
+        return thing.number in self._wanted
+
+    def hold(self, thing: Thing) -> None:
+        """Keep what is ready until the process waits for it."""
+        self._held.append(thing)
+
+    def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
+        """Let the thread that waits for a thing go on, until the process waits again."""
+        thing = self.things[number]
+        self._last = thing
+        self._go(self._wanted[number], ready, number, item)
+
+    def wake(self, thread: int) -> None:
+        """Let a thread go on whose time has come."""
+        self._go(thread, Ready.TIMEOUT, 0, b"")
+
+    def see_graph(self) -> None:
+        """Let those threads go on that wait for a change of the graph."""
+        self._go(self._wanted[GRAPH_ID], Ready.GRAPH, GRAPH_ID, b"")
+
+    def own(self, timer: ProcessTimer) -> None:
+        """Give a timer whose callback has run to a node."""
+        self.things.own(timer)
+
+    def was_no_callback(self) -> None:
+        """Say that the event under way is no callback's: an executor's own timer was due."""
+        event = self.dispatcher.event
+        event.kind, event.entity, event.node, event.input_hash = _RESUME, self.entity_id, None, 0
+
+    def _go(self, thread: int, ready: Ready, number: int, item: bytes) -> None:
+        waking = self._waking.get(thread)
+        if waking is not None:
+            waking.off()
+        self._running_thread = thread
+        now_ns = self.dispatcher.loop.now_ns
+        head = GO.pack(GO.size - 8 + len(item), Told.GO, now_ns, thread, ready, number)
+        self.child.send(head + item)
+        self._converse()
+
+    def _converse(self) -> None:
+        """Take what the process says until it waits again, or has ended."""
+        while True:
+            try:
+                batch = self.child.receive()
+                answer = b"" if batch is None else self._take_batch(batch)
+            except _NOT_A_BATCH:
+                self.child.kill()
+                self._has_ended("wrote something of its own to")
+                return
+            if batch is None:
+                self._has_ended()
+                return
+            self.child.taken()
+            if answer is None:
+                return
+            if answer:
+                self.child.send(answer)
+
+    def _take_batch(self, batch: memoryview) -> bytes | None:
+        """Do what a batch says; return the answer to the question at its end, None if it waits."""
+        place, end = 0, len(batch)
+        while place < end:
+            kind, size = RECORD.unpack_from(batch, place)
+            place += _RECORD_SIZE
+            body = batch[place : place + size]
+            place += size
+            if kind == _PUBLISH:
+                self.things[_number(body)[0]].send(body[4:].tobytes())
+                continue
+            if kind == _WAIT:
+                if body != self._same_wait or self._held:
+                    self._wait(Fields(body))
+                    self._same_wait = b"" if self._waking_soon else body.tobytes()
+                return None
+            fields = Fields(body)
+            question = self._questions.get(kind)
+            if question is not None:
+                answer = question(fields)
+                return RECORD.pack(len(answer), Told.ANSWER) + answer
+            self._records[kind](fields)
+        return b""
+
+    # -- waiting ---------------------------------------------------------------------------------
+
+    def _wait_set(self, fields: Fields) -> None:
+        thread, number, count = fields.number(), fields.number(), fields.number()
+        ids = fields.unpack(struct.Struct(f"<{count}I"))
+        self._sets = {n: s for n, s in self._sets.items() if s[:1] != (thread,)}
+        self._sets[number] = (thread, *ids)
+
+    def _wait(self, fields: Fields) -> None:
+        """Take note of what its threads wait for."""
+        event = self.dispatcher.event
+        waits = []
+        self._waking_soon = False
+        timed = set()
+        for _ in range(fields.number()):
+            thread, number, deadline_ns, size = fields.unpack(_WAITER)
+            fields.unpack(struct.Struct(f"{size}s"))
+            waits.append((thread, number))
+            if number == 0 and thread == self._running_thread:
+                event.flags |= _SUSPENDED
+            if number == 0 or deadline_ns != NEVER_NS:
+                self._waking_soon = True
+            if deadline_ns != NEVER_NS:
+                self._wake_at(thread, deadline_ns, asleep=number == 0)
+                timed.add(thread)
+        for thread in self._waking.keys() - timed:  # another thread has woken it
+            self._waking[thread].off()
+        if self._waits != tuple(waits):
+            self._waits = tuple(waits)
+            self._wanted = {
+                thing: thread
+                for thread, number in waits
+                if number
+                for thing in self._sets[number][1:]
+            }
+        if self._held:
+            self._release()
+        self._graph.look()
+
+    def _wake_at(self, thread: int, deadline_ns: int, *, asleep: bool) -> None:
+        waking = self._waking.get(thread)
+        if waking is None:
+            waking = self._waking[thread] = WakingTimer(self, thread)
+        waking.at(deadline_ns, asleep=asleep)
+
+    def _release(self) -> None:
+        """Let go of what was held back and is waited for now."""
+        loop = self.dispatcher.loop
+        held, self._held = self._held, []
+        for thing in held:
+            if thing.destroyed:
+                continue
+            if thing.number not in self._wanted:
+                self._held.append(thing)
+            elif isinstance(thing, ProcessTimer):
+                if not thing.state.canceled:
+                    loop.timers.add(thing.state)
+            else:
+                loop.ready.append(thing)
+
+    # -- its end ---------------------------------------------------------------------------------
+
+    def _has_ended(self, broken_link: str = "") -> None:
+        """Take it out of the graph, within the event under way; ``broken_link`` as in ``Ended``.
+
+        :raises NodeError: if it has failed, and the job does not say to go on.
+        """
+        ended = self.child.reap()
+        with suppress(*_NOT_A_BATCH):
+            self._take_batch(self.child.left())
+        self.ended = Ended(ended.status, broken_link or ended.broken_link)
+        self.vanish()
+        self.door.has_ended(self)
+        if not self.ended.failed or self._is_stopping:
+            return
+        at = format_seconds(self.dispatcher.loop.now_ns)
+        last = "its start" if self._last is None else self._last.describe()
+        happened = f"process {self.name} {self.ended.said} at {at} s"
+        text = f"{happened}; the last that it ran was {last}"
+        if self.log_failure:
+            self.door.log(40, self.name, text)
+        else:
+            now_ns = self.dispatcher.loop.now_ns
+            raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
+
+    def stop(self) -> None:
+        """Tell it as whoever starts nodes does that the run is over (Ctrl-C), and end it once it
+        waits again."""
+        self._is_stopping = True
+        self.child.give_up_after(_GRACE_S)
+        self.child.send(RECORD.pack(0, Told.STOP))
+        self._converse()
+        if self.ended is None:
+            self.child.dismiss()
+            self.vanish()
+
+    def crash(self) -> None:
+        """Be gone at once, as after SIGKILL, within the event under way."""
+        self._is_stopping = True
+        self.child.kill()
+        self._has_ended()
+
+    def vanish(self) -> None:
+        """Destroy all that it has made."""
+        for waking in self._waking.values():
+            waking.off()
+        self.things.give_all_up()
+        self._wanted.clear()
+
+    # -- what it asks ----------------------------------------------------------------------------
+
+    def _hello(self, fields: Fields) -> bytes:
+        door, now_ns = self.door, self.dispatcher.loop.now_ns
+        return _HELLO.pack(now_ns, door.seed_of(self.key), door.clock is not None)
+
+    def _clock(self, fields: Fields) -> bytes:
+        """Say what a clock shows: that of a node, or of who runs."""
+        node = self.things.get(fields.number()) or self._running_node()
+        assert self.door.clock is not None, "it asks where there are such clocks"
+        name = None if node is None else node.fully_qualified_name
+        return _SHOWN.pack(*self.door.clock(name, bool(fields.number())))
+
+    def _running_node(self) -> Participant | None:
+        """Return the node whose callback runs, else the one that was made last."""
+        node = self.dispatcher.event.node
+        return node if isinstance(node, Participant) else self.things.last_node
+
+    def _owner_of_new_clock(self, fields: Fields) -> bytes:
+        return HEAD.pack(self.things.number_of(self.things.newest_node or self._running_node()))
+
+    def _take(self, fields: Fields) -> bytes:
+        item = self.things[fields.number()].take()
+        return HEAD.pack(0) if item is None else HEAD.pack(1) + item
+
+    def _ready(self, fields: Fields) -> bytes:
+        """Say which of some things are ready, in the order in which the loop would run them."""
+        asked = [self.things[fields.number()] for _ in range(fields.number())]
+        order = dict.fromkeys((*self._held, *self.dispatcher.loop.ready))
+        places = {thing: place for place, thing in enumerate(order)}
+        ready = [thing.number for thing in asked if thing.may_run()]
+        ready.sort(key=lambda number: (places.get(self.things[number], len(places)), number))
+        return struct.pack(f"<{1 + len(ready)}I", len(ready), *ready)
+
+    def _qos(self, fields: Fields) -> bytes:
+        end = self.things[fields.number()]
+        return packed_qos(
+            end.profile if isinstance(end, ProcessService | ProcessClient) else end.qos
+        )
+
+    def _matched(self, fields: Fields) -> bytes:
+        end = self.things[fields.number()]
+        others = end.subscriptions if isinstance(end, Publisher) else end.publishers
+        return HEAD.pack(len(others))
+
+    def _gone(self, fields: Fields) -> None:
+        self.things.give_up(fields.number())
+        self._waits, self._same_wait = (), b""
+
+    # -- what it does ----------------------------------------------------------------------------
+
+    def _request(self, fields: Fields) -> None:
+        self.things[fields.number()].request(fields.rest())
+
+    def _response(self, fields: Fields) -> None:
+        number, gid, sequence = fields.unpack(_REQUEST_ID)
+        self.things[number].answer(gid, sequence, fields.rest())
+
+    def _log(self, fields: Fields) -> None:
+        self.door.log(fields.number(), fields.text(), fields.text())
+
+    def _report(self, fields: Fields) -> None:
+        self.door.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
+
+    def _timer_passed(self, fields: Fields) -> None:
+        self.things[fields.number()].is_callback = False
+
+    def _timer_next(self, fields: Fields) -> None:
+        number, deadline_ns = fields.unpack(_DEADLINE)
+        timer = self.things[number]
+        if deadline_ns == NEVER_NS:
+            timer.cancel()
+        else:
+            timer.due_at(deadline_ns)
+
+    def _alive(self, fields: Fields) -> None:
+        self.things[fields.number()].assert_liveliness()

@@ -1,0 +1,179 @@
+"""What action servers and action clients have in common: an action is made of other entities.
+
+An action is three services and two topics under ``<name>/_action/``; each is an entity of its own
+here, so that the trace shows every request, response, feedback and status as it is. What arrives
+for any of them goes to rclpy's waitable, one at a time and in the order of arrival.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from rsltrace.adapters.rclpy.handles.destroyable import Handle
+from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.services import ClientHandle, ServiceHandle
+from rsltrace.adapters.rclpy.stacks.code_lines import Functions
+from rsltrace.adapters.rclpy.stacks.tasks import executor_of, start_coroutine
+from rsltrace.adapters.rclpy.stacks.wait_reasons import servers_text
+from rsltrace.adapters.rclpy.wire.interfaces import type_name
+from rsltrace.trace.model.event import EventKind
+
+ACTION = int(EventKind.ACTION)
+
+PartT = TypeVar("PartT", bound="Part")
+
+
+class Part(ReceiverHandle):
+    """One of an action's endpoints: its arrivals are handed to the action's waitable."""
+
+    owner: ActionHandle
+    in_waitable = True
+    in_wait_sets: str
+    """What it is to a wait set: ``service``, ``client`` or ``subscription``."""
+    purpose: str
+    """``goal``, ``cancel``, or what else it is for."""
+
+    def find_wrapper(self) -> Any:
+        """Return the action's waitable once its node is being run."""
+        if self.wrapper is None:
+            waitable = self.owner.find_waitable()
+            if waitable is not None:
+                self.begin(waitable, self.node)
+        return self.wrapper
+
+    def dispatch(self) -> None:
+        """Let rclpy take the oldest arrival and execute it, as one event."""
+        if not self.may_run():
+            return
+        origin = self.queue[0][self.origin]
+        start_coroutine(self.stacks, self, ACTION, self.owner.execute, (self,), *origin)
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"action": self.owner.name}
+
+    def user_callback(self) -> object:
+        """Return the server's callback for this kind of request; a client has none of its own."""
+        own = getattr(self.wrapper, f"_{self.purpose}_callback", None)
+        if getattr(own, "__module__", "").startswith("rclpy."):  # a goal that is simply accepted
+            own = None
+        return own or getattr(self.wrapper, "_execute_callback", None)
+
+
+class GoalService(Part, ServiceHandle):
+    """A server's end of one of the three services."""
+
+    in_wait_sets = "service"
+
+
+class GoalClient(Part, ClientHandle):
+    """A client's end of one of the three services."""
+
+    in_wait_sets = "client"
+
+
+class GoalSubscription(Part, SubscriptionHandle):
+    """A client's feedback or status subscription."""
+
+    in_wait_sets = "subscription"
+
+
+class ActionHandle(Handle):
+    """What servers and clients have in common: their parts, and the one that is ready."""
+
+    waitable_attribute: str
+    is_client: bool
+
+    def __init__(self, node: NodeHandle, action_type: Any, name: str) -> None:
+        super().__init__()
+        self.stacks = node.stacks
+        self._functions = Functions(node.dispatcher)
+        self.node = node
+        self.name = node.resolve(name, service=False)
+        self.parts: list[Part] = []
+        self.publishers: list[PublisherHandle] = []
+        self.action_type = action_type
+        node.actions.append(self)
+        self._ready: Part | None = None
+        self._places: dict[Part, int] = {}
+
+    @property
+    def type_name(self) -> str:
+        """The name of the action's type."""
+        return type_name(self.action_type)
+
+    def own(self, kind: type[PartT], interface: Any, name: str, qos: Any) -> PartT:
+        """Make a part at ``<name>/_action/``; it has its owner before its constructor runs."""
+        part = kind.__new__(kind)
+        part.owner = self
+        part.purpose = name.partition("_goal")[0].replace("send", "goal")
+        part.__init__(self.node, interface, self.path(name), qos)  # type: ignore[misc]
+        self.parts.append(part)
+        return part
+
+    def add_to_waitset(self, wait_set: Any) -> None:
+        """Let an executor that has wait sets of its own wait for the parts."""
+        for part in self.parts:
+            self._places[part] = getattr(wait_set, f"add_{part.in_wait_sets}")(part)
+
+    def is_part_ready(self, wait_set: Any, part: Part) -> bool:
+        """Return whether a part is the one that is executed, or was found ready by a wait set."""
+        if wait_set is None:
+            return part is self._ready
+        return bool(wait_set.is_ready(part.in_wait_sets, self._places[part]))
+
+    def path(self, name: str) -> str:
+        """Return the full name of a part."""
+        return f"{self.name}/_action/{name}"
+
+    def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
+        """Publish service events of its three services (ROS 2 Kilted and later)."""
+        for part in self.parts:
+            if isinstance(part, GoalService | GoalClient):
+                part.configure_introspection(clock, qos, state)
+
+    def find_waitable(self) -> Any:
+        """Return the rclpy object around this handle, or None if its node is not being run."""
+        if self.node.wrapper is not None:
+            for waitable in self.node.wrapper.waitables:
+                if getattr(waitable, self.waitable_attribute, None) is self:
+                    return waitable
+        return None
+
+    def waits_for(self, future: Any) -> str:
+        """Say what would complete a future, if it is a client's own."""
+        waitable = self.find_waitable()
+        for what in ("goal", "result", "cancel"):
+            pending = getattr(waitable, f"_pending_{what}_requests", {})
+            if future in pending.values():
+                graph = self.stacks.domain.graph
+                servers = servers_text(len(graph.services(self.path("send_goal"))))
+                answer = "the result of a goal" if what == "result" else f"the answer to a {what}"
+                return f"{answer}, of action {self.name} ({servers})"
+        return ""
+
+    async def execute(self, part: Part) -> None:
+        """Do what rclpy's executors do for a waitable of which ``part`` is ready."""
+        waitable = part.wrapper
+        self._ready = part
+        try:
+            waitable.is_ready(None)
+            data = waitable.take_data()
+        finally:
+            self._ready = None
+        if "feedback" in data:
+            self._tell_feedback_callback(part, data["feedback"])
+        for future in waitable._futures:
+            future._set_executor(executor_of(self.stacks, part))
+        await waitable.execute(data)
+
+    def _tell_feedback_callback(self, part: Part, message: Any) -> None:
+        callbacks = part.wrapper._feedback_callbacks
+        callback = callbacks.get(bytes(message.goal_id.uuid))
+        self._functions.run(part.entity_id, callback)
+
+    def _destroy(self) -> None:
+        self.node.actions.remove(self)
+        for handle in [*self.parts, *self.publishers]:
+            handle.destroy_when_not_in_use()

@@ -1,0 +1,235 @@
+"""Action servers: three services, two topics, and the goals that were accepted.
+
+Which goals a cancel request means and when results expire are rcl_action's rules (ROS 2 Jazzy).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rsltrace.adapters.rclpy.actions.goal_handle import GoalHandle
+from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, GoalService
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
+from rsltrace.adapters.rclpy.stacks.tasks import start_coroutine
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
+from rsltrace.simulation.middleware.services import RequestId
+from rsltrace.trace.model.event import NO_EVENT
+
+# Return codes of action_msgs/srv/CancelGoal.
+_ERROR_NONE, _ERROR_UNKNOWN_GOAL_ID, _ERROR_GOAL_TERMINATED = 0, 2, 3
+
+# In the CDR of action_msgs/msg/GoalStatusArray the number of goals comes after the header; each of
+# them is an id (octets), a stamp and a status (an octet). The stamp is at a multiple of 4, so there
+# is padding before it in all but the first.
+_NUMBER_AT = 4
+_ID, _STAMP_AT = 16, 19
+
+
+class ActionServerHandle(ActionHandle):
+    """Stands in for ``_rclpy.ActionServer``. ``result_timeout`` is in seconds, negative: none."""
+
+    waitable_attribute = "_handle"
+    is_client = False
+
+    def __init__(
+        self,
+        node: NodeHandle,
+        clock: Any,
+        action_type: Any,
+        name: str,
+        goal_qos: Any,
+        result_qos: Any,
+        cancel_qos: Any,
+        feedback_qos: Any,
+        status_qos: Any,
+        result_timeout: float,
+    ) -> None:
+        super().__init__(node, action_type, name)
+        self.real = node.real
+        self.goals: dict[bytes, GoalHandle] = {}
+        self._timeout_ns = int(result_timeout * 1_000_000_000) if result_timeout >= 0 else None
+        self._expired = False
+        impl = action_type.Impl
+        self._goal = self.own(GoalService, impl.SendGoalService, "send_goal", goal_qos)
+        self._cancel = self.own(GoalService, impl.CancelGoalService, "cancel_goal", cancel_qos)
+        self._result = self.own(GoalService, impl.GetResultService, "get_result", result_qos)
+        self._feedback = PublisherHandle(
+            node, impl.FeedbackMessage, self.path("feedback"), feedback_qos
+        )
+        self._status = PublisherHandle(
+            node, impl.GoalStatusMessage, self.path("status"), status_qos
+        )
+        self._status_type = impl.GoalStatusMessage
+        self._no_goals: bytes = codec_for(self._status_type).serialize(self._status_type())
+        self.publishers = [self._feedback, self._status]
+        self._expiry = _Expiry(self)
+
+    # -- requests and responses ----------------------------------------------------------------
+
+    def is_ready(self, wait_set: Any) -> tuple[bool, bool, bool, bool]:
+        """Say which of goal, cancel, result request and expiry is being executed, or is ready in a
+        wait set."""
+        parts = (self._goal, self._cancel, self._result)
+        goal, cancel, result = (self.is_part_ready(wait_set, part) for part in parts)
+        return goal, cancel, result, self._expired
+
+    def get_num_entities(self) -> tuple[int, int, int, int, int]:
+        """Count its subscriptions, guard conditions, timers, clients and services, as rcl does."""
+        return 0, 0, 1, 0, 3
+
+    def _take_request(self, part: GoalService, request_type: Any) -> tuple[RequestId, Any]:
+        request, info = part.service_take_request(request_type)
+        return info.request_id, request
+
+    def take_goal_request(self, request_type: Any) -> tuple[RequestId, Any]:
+        """Take the goal request that is being executed."""
+        return self._take_request(self._goal, request_type)
+
+    def take_cancel_request(self, request_type: Any) -> tuple[RequestId, Any]:
+        """Take the cancel request that is being executed."""
+        return self._take_request(self._cancel, request_type)
+
+    def take_result_request(self, request_type: Any) -> tuple[RequestId, Any]:
+        """Take the result request that is being executed."""
+        return self._take_request(self._result, request_type)
+
+    def send_goal_response(self, header: RequestId, response: Any) -> None:
+        """Answer a goal request."""
+        self._goal.service_send_response(response, header)
+
+    def send_cancel_response(self, header: RequestId, response: Any) -> None:
+        """Answer a cancel request."""
+        self._cancel.service_send_response(response, header)
+
+    def send_result_response(self, header: RequestId, response: Any) -> None:
+        """Answer a result request."""
+        self._result.service_send_response(response, header)
+
+    def publish_feedback(self, message: Any) -> None:
+        """Publish feedback on a goal."""
+        self._feedback.publish(message)
+
+    def publish_status(self) -> None:
+        """Publish the status of every goal that is known.
+
+        All of them are in each message, so the part of a goal that never changes is kept as bytes.
+        """
+        parts = [
+            (goal.status_bytes or self._keep_bytes(goal)) + goal.status.to_bytes(1, "little")
+            for goal in self.goals.values()
+        ]
+        number = len(parts).to_bytes(4, "little")
+        if parts:
+            parts[0] = parts[0][:_ID] + parts[0][_STAMP_AT:]
+        self._status.send(b"".join((self._no_goals[:_NUMBER_AT], number, *parts)))
+
+    def _keep_bytes(self, goal: GoalHandle) -> bytes:
+        from action_msgs.msg import GoalStatus
+
+        alone = self._status_type(status_list=[GoalStatus(goal_info=goal.info)])
+        data = codec_for(self._status_type).serialize(alone)[len(self._no_goals) : -1]
+        goal.status_bytes = data[:_ID] + bytes(_STAMP_AT - _ID) + data[_ID:]
+        return goal.status_bytes
+
+    # -- goals -----------------------------------------------------------------------------------
+
+    def goal_exists(self, goal_info: Any) -> bool:
+        """Return whether a goal of this id is known."""
+        return bytes(goal_info.goal_id.uuid) in self.goals
+
+    def process_cancel_request(self, request: Any, response_type: Any) -> Any:
+        """Find the goals a cancel request means (rcl_action_process_cancel_request)."""
+        wanted = bytes(request.goal_info.goal_id.uuid)
+        stamp = request.goal_info.stamp
+        stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+        by_id, by_time = any(wanted), stamp_ns > 0
+        response = response_type(return_code=_ERROR_NONE)
+        if by_id and not by_time:
+            goal = self.goals.get(wanted)
+            if goal is None:
+                response.return_code = _ERROR_UNKNOWN_GOAL_ID
+                return response
+            if not goal.is_active():
+                response.return_code = _ERROR_GOAL_TERMINATED
+                return response
+        for goal_id, goal in self.goals.items():
+            earlier = by_time and goal.accepted_ns <= stamp_ns
+            if (goal_id == wanted or earlier or not (by_id or by_time)) and goal.cancelable():
+                response.goals_canceling.append(goal.info)
+        return response
+
+    def notify_goal_done(self) -> None:
+        """Let the results of finished goals expire after the timeout."""
+        now_ns = self.stacks.loop.now_ns
+        for goal in self.goals.values():
+            if not goal.is_active() and goal.done_ns is None:
+                goal.done_ns = now_ns
+                if self._timeout_ns is not None:
+                    self.stacks.loop.schedule(now_ns + self._timeout_ns, self._expiry.wake)
+
+    def expire_goals(self, most: int) -> tuple[Any, ...]:
+        """Forget goals whose results have been kept long enough; return their infos."""
+        timeout_ns = self._timeout_ns
+        if timeout_ns is None:
+            return ()
+        oldest_ns = self.stacks.loop.now_ns - timeout_ns
+        gone = [
+            goal_id
+            for goal_id, goal in self.goals.items()
+            if goal.done_ns is not None and goal.done_ns <= oldest_ns
+        ]
+        return tuple(self.goals.pop(goal_id).info for goal_id in gone[:most])
+
+    async def expire(self) -> None:
+        """Do what rclpy's executors do for a waitable whose goals expire."""
+        waitable = self._expiry.wrapper
+        self._expired = True
+        try:
+            waitable.is_ready(None)
+            data = waitable.take_data()
+        finally:
+            self._expired = False
+        await waitable.execute(data)
+
+
+class _Expiry:
+    """Dispatches a server's expiry of goals; belongs to its goal service in the trace."""
+
+    def __init__(self, server: ActionServerHandle) -> None:
+        self._server = server
+        self.wrapper: Any = None
+
+    @property
+    def entity_id(self) -> int:
+        return self._server.parts[0].entity_id
+
+    @property
+    def node(self) -> NodeHandle:
+        return self._server.node
+
+    def wake(self) -> None:
+        """Expire goals now."""
+        if not self._server.destroyed:
+            self._server.stacks.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Expire goals, as one event."""
+        server = self._server
+        mailbox = self.node.mailbox
+        if mailbox is not None and mailbox.keeps(self):
+            return
+        self.wrapper = server.find_waitable()
+        if self.wrapper is None or server.stacks.groups.must_wait(self, self.wrapper):
+            return
+        handle: Any = self  # has what start_coroutine needs, but no place in the trace of its own
+        start_coroutine(server.stacks, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
+
+    def runnable(self) -> Runnable:
+        """Describe it to a policy."""
+        told = self.node.mailbox is not None
+        return on_no_executor(self.node, self.describe(), "waitable", told=told)
+
+    def describe(self) -> str:
+        return f"{self.node.fully_qualified_name}: expiry of goals of {self._server.name}"

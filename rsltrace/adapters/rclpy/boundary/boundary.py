@@ -1,0 +1,402 @@
+"""The object that stands where rclpy keeps its C extension (``installing`` puts it there).
+
+What has no side effect on the machine is passed through to the real extension: enums, exceptions,
+name validation, QoS structures, time points, log levels.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+from typing import Any
+
+from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
+from rsltrace.adapters.rclpy.actions.goal_handle import GoalHandle
+from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
+from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
+from rsltrace.adapters.rclpy.boundary.early_init import check_process
+from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
+from rsltrace.adapters.rclpy.handles.context import ContextHandle
+from rsltrace.adapters.rclpy.handles.destroyable import Destroyable, set_invalid_handle
+from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
+from rsltrace.adapters.rclpy.handles.lifecycle import StateMachineHandle
+from rsltrace.adapters.rclpy.handles.logs import Logs
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
+from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of
+from rsltrace.adapters.rclpy.handles.ros_timers import RosTimerHandle
+from rsltrace.adapters.rclpy.handles.services import (
+    ClientHandle,
+    ServiceHandle,
+    TypeDescriptionServiceHandle,
+)
+from rsltrace.adapters.rclpy.handles.timers import TimerHandle
+from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
+from rsltrace.adapters.rclpy.node_clocks import NodeClocks
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.errors import UnsupportedError
+from rsltrace.simulation.middleware.graph import names_and_types
+from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.qos.status import (
+    CountStatus,
+    IncompatibleQosStatus,
+    LivelinessChangedStatus,
+    MatchedStatus,
+)
+from rsltrace.simulation.middleware.services import RequestId, ServiceInfo
+from rsltrace.simulation.middleware.subscription import Subscription
+
+_PASSED_THROUGH = (
+    # enums and structures
+    "ClockChange ClockType GoalEvent QoSCheckCompatibleResult QoSCompatibility "
+    "RCUTILS_LOG_SEVERITY SignalHandlerOptions TransitionCallbackReturnType rcl_duration_t "
+    "rcl_publisher_event_type_t rcl_subscription_event_type_t rcl_time_point_t "
+    "rmw_incompatible_type_status_t rmw_qos_policy_kind_t rmw_qos_profile_t service_introspection "
+    "RCL_DEFAULT_DOMAIN_ID RMW_DURATION_INFINITE RMW_QOS_DEADLINE_BEST_AVAILABLE "
+    "RMW_QOS_LIVELINESS_LEASE_DURATION_BEST_AVAILABLE "
+    # exceptions
+    "InvalidHandle NodeNameNonExistentError NotImplementedError RCLError RCLInvalidROSArgsError "
+    "RCUtilsError RMWError UnknownROSArgsError UnsupportedEventTypeError TimerCancelledError "
+    # pure functions
+    "rclpy_expand_topic_name rclpy_get_validation_error_for_full_topic_name "
+    "rclpy_get_validation_error_for_namespace rclpy_get_validation_error_for_node_name "
+    "rclpy_get_validation_error_for_topic_name rclpy_remove_ros_args rclpy_qos_check_compatible "
+    "rclpy_action_get_rmw_qos_profile "
+    # log levels (rcutils keeps them per process; a run starts with fresh ones)
+    "rclpy_logging_get_logger_effective_level rclpy_logging_get_logger_level "
+    "rclpy_logging_get_logging_directory rclpy_logging_get_separator_string "
+    "rclpy_logging_initialize rclpy_logging_logger_is_enabled_for "
+    "rclpy_logging_set_logger_level rclpy_logging_severity_level_from_string "
+    "rclpy_logging_shutdown"
+).split()
+
+
+@dataclass(slots=True)
+class Surroundings:
+    """What the boundary needs of a world; ``clocks`` is None where all of them are right."""
+
+    stacks: Stacks
+    logs: Logs
+    states: NodeStates
+    clocks: NodeClocks | None = None
+
+
+class Boundary:
+    """Stands in for the module ``rclpy._rclpy_pybind11``; ``world`` is that of the moment."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+        self._world: Surroundings | None = None
+        self._last_now_ns = 0
+        self._signals = real.SignalHandlerOptions.NO
+        self.ros_clocks: list[weakref.ref[ClockHandle]] = []
+        for name in _PASSED_THROUGH:
+            if hasattr(real, name):
+                setattr(self, name, getattr(real, name))
+        set_invalid_handle(real.InvalidHandle)
+        self.Destroyable = Destroyable
+        self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
+        self.ClockEvent = type("ClockEvent", (ClockEventHandle,), {"boundary": self})
+        self.rmw_request_id_t = RequestId
+        self.rmw_service_info_t = ServiceInfo
+        self.rmw_matched_status_t = MatchedStatus
+        self.rmw_requested_qos_incompatible_event_status_t = IncompatibleQosStatus
+        self.rmw_liveliness_changed_status_t = LivelinessChangedStatus
+        for name in ("liveliness_lost", "message_lost", "offered_deadline_missed"):
+            setattr(self, f"rmw_{name}_status_t", CountStatus)
+        self.rmw_requested_deadline_missed_status_t = CountStatus
+
+    # -- the world of the moment ---------------------------------------------------------------
+
+    @property
+    def world(self) -> Surroundings:
+        """The world that new entities join.
+
+        :raises UnsupportedError: between runs.
+        """
+        if self._world is None:
+            raise UnsupportedError("no simulation is running in this process")
+        return self._world
+
+    @property
+    def stacks(self) -> Stacks:
+        """The stacks of the world of the moment."""
+        return self.world.stacks
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no simulation is under way in this process."""
+        return self._world is None
+
+    def now_ns(self) -> int:
+        """Return simulated time, or the last one between runs."""
+        return self._last_now_ns if self._world is None else self._world.stacks.loop.now_ns
+
+    def shown_ns(self, owner: str | None) -> int:
+        """Return what the clock of a node shows; without an owner, that of the present node."""
+        world = self._world
+        if world is None or world.clocks is None:
+            return self.now_ns()
+        return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
+
+    def follows(self, owner: str | None) -> bool:
+        """Return whether /clock drives the ROS time of a node in the run of the moment."""
+        world = self._world
+        return world is not None and world.clocks is not None and world.clocks.follows(owner)
+
+    def look_ns(self, owner: str | None) -> int:
+        """Return what a ROS clock of a node shows to user code, which may advance by the look."""
+        world = self._world
+        if world is None or world.clocks is None:
+            return self.now_ns()
+        return world.clocks.look(owner or self.current_node_name(), world.stacks.loop.now_ns)
+
+    def current_node_name(self) -> str | None:
+        """Return the name of the node whose callback or constructor runs, if any does."""
+        node = self._world.stacks.event.node if self._world is not None else None
+        return None if node is None else str(node.fully_qualified_name)
+
+    def enter(self, world: Surroundings) -> None:
+        """Make ``world`` the one that new entities join."""
+        if self._world is not None:
+            raise UnsupportedError("another simulation is running in this process")
+        self._world = world
+
+    def leave(self) -> None:
+        """End the world of the moment."""
+        self._last_now_ns = self.now_ns()
+        self._world = None
+
+    def jump_clocks(self, delta_ns: int) -> None:
+        """Tell ROS clocks with jump callbacks that time has jumped."""
+        for reference in list(self.ros_clocks):
+            clock = reference()
+            if clock is None:
+                self.ros_clocks.remove(reference)
+            else:
+                clock.jumped(delta_ns)
+
+    # -- entities --------------------------------------------------------------------------------
+
+    def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
+        check_process()
+        try:
+            context = ContextHandle(self.real, self.stacks, arguments, domain_id)
+        except UnknownArgumentsError as error:
+            raise self.real.UnknownROSArgsError(str(error)) from error
+        except InvalidArgumentsError as error:
+            raise self.real.RCLInvalidROSArgsError(str(error)) from error
+        programs = self.stacks.programs
+        if programs.main_context is None:
+            programs.main_context = context
+        return context
+
+    def Node(  # noqa: N802
+        self,
+        name: str,
+        namespace: str,
+        context: ContextHandle,
+        cli_args: list[str] | None,
+        use_global: bool,
+        rosout: bool,
+        rosout_qos: Any = None,  # from ROS 2 Kilted on
+    ) -> NodeHandle:
+        world = self.world
+        return NodeHandle(
+            self.real,
+            world.stacks,
+            world.logs,
+            world.states,
+            name,
+            namespace,
+            context,
+            cli_args,
+            use_global,
+            rosout,
+            rosout_qos,
+        )
+
+    def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
+        node.require_up("failed to create publisher")
+        return PublisherHandle(node, *arguments)
+
+    def Subscription(self, node: NodeHandle, *arguments: Any) -> SubscriptionHandle:  # noqa: N802
+        node.require_up("failed to create subscription")
+        return SubscriptionHandle(node, *arguments)
+
+    def Client(self, node: NodeHandle, *arguments: Any) -> ClientHandle:  # noqa: N802
+        node.require_up("failed to create client")
+        return ClientHandle(node, *arguments)
+
+    def Service(self, node: NodeHandle, *arguments: Any) -> ServiceHandle:  # noqa: N802
+        node.require_up("failed to create service")
+        return ServiceHandle(node, *arguments)
+
+    def TypeDescriptionService(self, node: NodeHandle) -> TypeDescriptionServiceHandle:  # noqa: N802
+        return TypeDescriptionServiceHandle(node)
+
+    def Timer(  # noqa: N802
+        self, clock: Any, context: ContextHandle, period_ns: int, autostart: bool = True
+    ) -> TimerHandle:
+        context.require("failed to create timer")
+        if clock.follows:
+            return RosTimerHandle(self.real, context.stacks, clock, period_ns, autostart)
+        return TimerHandle(self.real, context.stacks, period_ns, autostart)
+
+    def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
+        context.require("failed to create guard_condition")
+        return GuardConditionHandle(context.stacks)
+
+    def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
+        return EventHandle(parent, event_type)
+
+    def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
+        node.require_up("failed to create action server")
+        return ActionServerHandle(node, *arguments)
+
+    def ActionGoalHandle(self, server: ActionServerHandle, info: Any) -> GoalHandle:  # noqa: N802
+        return GoalHandle(self.real, server.goals, info)
+
+    def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
+        node.require_up("failed to create action client")
+        return ActionClientHandle(node, *arguments)
+
+    def LifecycleStateMachine(  # noqa: N802
+        self, node: NodeHandle, communicate: bool
+    ) -> StateMachineHandle:
+        return StateMachineHandle(node, communicate)
+
+    def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
+        return WaitSetHandle(*arguments)
+
+    def EventsExecutor(self, context: Any) -> Any:  # noqa: N802
+        """Return an executor that behaves as rclpy's: here all of them run on events."""
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor(context=context)
+
+    # -- names and graph -------------------------------------------------------------------------
+
+    def rclpy_resolve_name(
+        self, node: NodeHandle, name: str, only_expand: bool, is_service: bool
+    ) -> str:
+        try:
+            return node.resolve(name, service=is_service, only_expand=only_expand)
+        except ValueError as error:
+            raise self.real.RCLError(str(error)) from error
+
+    def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
+        return node.resolve(topic, service=False)
+
+    def rclpy_get_publisher_names_and_types_by_node(
+        self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        found = node.asked_graph.publishers_of(node.node_named(name, namespace))
+        return names_and_types([(end.topic, end.type_name) for end in found])
+
+    def rclpy_get_subscriber_names_and_types_by_node(
+        self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        found = node.asked_graph.subscriptions_of(node.node_named(name, namespace))
+        return names_and_types([(end.topic, end.type_name) for end in found])
+
+    def rclpy_get_service_names_and_types_by_node(
+        self, node: NodeHandle, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        found = node.asked_graph.services_of(node.node_named(name, namespace))
+        return names_and_types([(end.service, end.type_name) for end in found])
+
+    def rclpy_get_client_names_and_types_by_node(
+        self, node: NodeHandle, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        found = node.asked_graph.clients_of(node.node_named(name, namespace))
+        return names_and_types([(end.service, end.type_name) for end in found])
+
+    def rclpy_get_topic_names_and_types(
+        self, node: NodeHandle, no_demangle: bool
+    ) -> list[tuple[str, list[str]]]:
+        return node.asked_graph.topic_names_and_types()
+
+    def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
+        return node.asked_graph.service_names_and_types()
+
+    def rclpy_get_publishers_info_by_topic(
+        self, node: NodeHandle, topic: str, no_mangle: bool
+    ) -> list[dict[str, Any]]:
+        return [_endpoint_info(p, _PUBLISHER) for p in node.asked_graph.publishers(topic)]
+
+    def rclpy_get_subscriptions_info_by_topic(
+        self, node: NodeHandle, topic: str, no_mangle: bool
+    ) -> list[dict[str, Any]]:
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.asked_graph.subscriptions(topic)]
+
+    # -- messages ----------------------------------------------------------------------------------
+
+    def rclpy_serialize(self, message: Any, message_type: Any) -> bytes:
+        return codec_for(message_type).serialize(message)
+
+    def rclpy_deserialize(self, data: bytes, message_type: Any) -> Any:
+        return codec_for(message_type).deserialize(bytes(data))
+
+    def rclpy_assert_liveliness(self, publisher: Any) -> None:
+        publisher.assert_liveliness()
+
+    def rclpy_get_rmw_implementation_identifier(self) -> str:
+        return "rmw_rsltrace"
+
+    # -- logging -----------------------------------------------------------------------------------
+
+    def rclpy_logging_configure(self, context: Any) -> None:
+        """Do nothing: rcl's would open a log file below the home folder."""
+
+    def rclpy_logging_fini(self) -> None:
+        pass
+
+    def rclpy_logging_rosout_add_sublogger(self, name: str, child: str) -> bool:
+        return self._world is not None and self._world.logs.add_sublogger(name, child)
+
+    def rclpy_logging_rosout_remove_sublogger(self, name: str, child: str) -> None:
+        pass
+
+    def rclpy_logging_rcutils_log(
+        self, severity: int, name: str, message: str, function: str, file: str, line: int
+    ) -> None:
+        if self._world is not None:
+            self._world.logs.log(severity, name, message, function, file, line)
+
+    # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
+
+    def install_signal_handlers(self, options: Any) -> None:
+        self._signals = options
+
+    def uninstall_signal_handlers(self) -> None:
+        self._signals = self.real.SignalHandlerOptions.NO
+
+    def get_current_signal_handlers_options(self) -> Any:
+        return self._signals
+
+    def register_sigint_guard_condition(self, guard: Any) -> None:
+        pass
+
+    def unregister_sigint_guard_condition(self, guard: Any) -> None:
+        pass
+
+
+_PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
+
+
+def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:
+    _, text = endpoint.type.describe()
+    value = bytes.fromhex(text.removeprefix("RIHS01_")) if text.startswith("RIHS01_") else b""
+    return {
+        "node_name": endpoint.node.name,
+        "node_namespace": endpoint.node.namespace,
+        "topic_type": endpoint.type_name,
+        "topic_type_hash": {"version": 1 if value else 0, "value": value or bytes(32)},
+        "endpoint_type": endpoint_type,
+        "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
+        "qos_profile": profile_of(endpoint.qos),
+    }

@@ -1,0 +1,281 @@
+"""rclpy's executors on simulated time: what they wait for, and what they get to run.
+
+All of rclpy's executors, and those that users derive from ``rclpy.executors.Executor``, ask
+``wait_for_ready_callbacks`` for the next thing to do. Here that is answered from the mailboxes of
+the executor's nodes; if they are empty, the stack is set aside until something comes. Everything
+else (``spin``, ``spin_once``, worker threads, when exceptions come out where) is rclpy's own code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from rsltrace.adapters.rclpy.executors.standby import Ran, Standby, standby_of
+from rsltrace.adapters.rclpy.handles.waitables import activate_node
+from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
+from rsltrace.adapters.rclpy.stacks.callback_groups import begin, is_busy, is_custom
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
+from rsltrace.adapters.rclpy.stacks.runners import Wait
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.wait_reasons import awaited
+from rsltrace.simulation.loop.loop import Dispatchable
+from rsltrace.simulation.loop.ordered import OrderedLoop
+from rsltrace.simulation.middleware.graph import Graph
+
+_WORK = "work for its executor"
+
+
+class Pump:
+    """The simulated part of one executor."""
+
+    def __init__(self, stacks: Stacks, executor: Any) -> None:
+        from rclpy import executors
+        from rclpy.utilities import timeout_sec_to_nsec
+
+        self.stacks = stacks
+        self.executor = executor
+        self._rclpy: Any = executors
+        self._in_ns: Any = timeout_sec_to_nsec
+        self.nodes: dict[Any, Mailbox] = {}
+        self.tasks = Mailbox(stacks.loop)
+        self.tasks.pump = self
+        self.waits: list[Wait] = []
+        self.standby: Standby | None = None
+        """The stack that spins, while it can be given what is ready."""
+        self.woken = False
+        """Whether there has been a reason to look again."""
+        self._looked_ns = -1
+        self._name = f"executor {stacks.loop.next_place()}"
+        self._asked: tuple[Any, ...] = ()
+
+    def add(self, node: Any) -> None:
+        """Run a node's callbacks whenever the executor spins."""
+        handle = node.handle
+        if handle.mailbox is None:
+            handle.mailbox = Mailbox(self.stacks.loop)
+        handle.mailbox.pump = self
+        self.nodes[node] = handle.mailbox
+        if handle.wrapper is not node:
+            handle.wrapper = node
+            activate_node(handle)
+        self.wake()
+
+    def remove(self, node: Any) -> None:
+        """Leave what is ready of a node in its mailbox, for whoever spins it next."""
+        mailbox = self.nodes.pop(node, None)
+        if mailbox is not None and mailbox.pump is self:
+            mailbox.pump = None
+        self.wake()
+
+    def close(self) -> None:
+        """Take no more part: the executor is shut down."""
+        for node in list(self.nodes):
+            self.remove(node)
+        self.tasks.close()
+        self.wake()
+
+    def wake(self) -> None:
+        """Let who waits look again: something has come, or changed."""
+        self.woken = True
+        standby, self.standby = self.standby, None
+        if standby is not None:
+            standby.blocked.release()
+        waits, self.waits = self.waits, []
+        for blocked in waits:
+            blocked.release()
+
+    def next(
+        self, timeout: Any, nodes: list[Any] | None, condition: Callable[[], bool]
+    ) -> tuple[Any, Any, Any]:
+        """Do ``wait_for_ready_callbacks``: return a task that runs the next callback.
+
+        :raises: rclpy's exceptions for a timeout, a shutdown, and a condition that has come true.
+        """
+        executors = self._rclpy
+        self.stacks.programs.present.spun = True
+        timeout_ns: int = self._in_ns(getattr(timeout, "timeout", timeout))
+        loop = self.stacks.loop
+        until_ns = None if timeout_ns < 0 else loop.now_ns + timeout_ns
+        looked = False
+        if isinstance(loop, OrderedLoop) and loop.polls:
+            asked, self._asked = self._asked, (timeout, nodes, condition)
+            if asked != self._asked:  # rclpy makes a new generator
+                loop.forget(self._name)
+        while True:
+            if self.executor._is_shutdown:
+                raise executors.ShutdownException
+            if condition():
+                raise executors.ConditionReachedException
+            if not self.executor.context.ok():
+                if self.stacks.ending.closing:
+                    lose_patience(self.stacks)
+                raise executors.ExternalShutdownException
+            taken = self._take(nodes)
+            if taken is not None:
+                return self._handler(*taken)
+            has_limit = until_ns is not None
+            standby = standby_of(self.stacks, self, nodes, condition, has_limit=has_limit)
+            if until_ns is None:
+                patient = _is_always(condition) and not self.stacks.dispatcher.in_callback()
+                what = (
+                    _WORK
+                    if _is_always(condition)
+                    else _Awaited(self.stacks.domain.graph, condition)
+                )
+                self._wait(None, what=what, patient=patient, standby=standby)
+            elif loop.now_ns < until_ns:
+                self._wait(until_ns - loop.now_ns, what=_WORK, standby=standby)
+            elif timeout_ns or looked:
+                raise executors.TimeoutException
+            else:
+                looked = True
+                self._wait(self._look_ns(), what="its turn", standby=standby)
+            if standby is not None and standby.is_over:
+                return Ran(standby.failure), None, None
+
+    def _look_ns(self) -> int:
+        """Return how long a look without a timeout takes: nothing, for the first at an instant."""
+        now_ns = self.stacks.loop.now_ns
+        again, self._looked_ns = self._looked_ns == now_ns, now_ns
+        return POLL_NS if again else 0
+
+    def _wait(
+        self,
+        for_ns: int | None,
+        *,
+        what: object,
+        patient: bool = False,
+        standby: Standby | None = None,
+    ) -> None:
+        self.woken = True
+        until = self.waits.append if standby is None else standby.begin
+        serve = None if standby is None else standby.serve
+        stacks = self.stacks
+        wait(stacks, what, until=until, for_ns=for_ns, quiet=True, patient=patient, serve=serve)
+        if standby is not None and self.standby is standby:
+            self.standby = None
+        self.waits = [blocked for blocked in self.waits if blocked in self.stacks.runners.blocked]
+
+    def _take(self, nodes: list[Any] | None) -> tuple[Any, Mailbox, Dispatchable] | None:
+        """Take out what is next: tasks first, as in rclpy, then in the order of arrival; or what
+        the policy chooses, if it is asked for that."""
+        if isinstance(self.stacks.loop, OrderedLoop) and self.stacks.loop.polls:
+            return self._choose(self.stacks.loop, nodes)
+        if self.tasks.entries:
+            return None, self.tasks, self.tasks.entries.popleft()[1]
+        while True:
+            best: tuple[int, Any, Mailbox] | None = None
+            for node, mailbox in self.nodes.items():
+                if mailbox.entries and (nodes is None or node in nodes):
+                    first = mailbox.entries[0][0]
+                    if best is None or first < best[0]:
+                        best = (first, node, mailbox)
+            if best is None:
+                return None
+            _, node, mailbox = best
+            place, item = mailbox.entries.popleft()
+            if not _is_stale(item) and not self._parked(mailbox, place, item):
+                return node, mailbox, item
+
+    def _choose(
+        self, loop: OrderedLoop, nodes: list[Any] | None
+    ) -> tuple[Any, Mailbox, Dispatchable] | None:
+        """Take out what the policy chooses of all that is ready by now."""
+        loop.hand_over()
+        ready = [(None, self.tasks, entry) for entry in self.tasks.entries]
+        for node, mailbox in self.nodes.items():
+            if nodes is None or node in nodes:
+                ready += [(node, mailbox, entry) for entry in mailbox.entries]
+        ready.sort(key=lambda one: (one[1] is not self.tasks, one[2][0]))
+        free = []
+        for node, mailbox, (place, item) in ready:
+            gone = _is_stale(item) or not getattr(item, "is_due", True)
+            if gone or self._parked(mailbox, place, item):
+                mailbox.entries.remove((place, item))
+            else:
+                free.append((node, mailbox, (place, item)))
+        if not free:
+            return None
+        candidates = [loop.place(item).candidate for _, _, (_, item) in free]
+        chosen = loop.choose([replace(one, executor=self._name) for one in candidates])
+        node, mailbox, entry = free[chosen]
+        mailbox.entries.remove(entry)
+        return node, mailbox, entry[1]
+
+    def _parked(self, mailbox: Mailbox, place: int, item: Any) -> bool:
+        """Keep what its callback group does not let run now until the group is free."""
+        wrapper = getattr(item, "wrapper", None)
+        group = getattr(wrapper, "callback_group", None)
+        if group is None or not is_busy(group, wrapper):
+            return False
+
+        def retry() -> None:
+            mailbox.entries.appendleft((place, item))
+            if mailbox.pump is not None:
+                mailbox.pump.wake()
+
+        self.stacks.groups.park(group, item, retry)
+        return True
+
+    def _handler(self, node: Any, mailbox: Mailbox, item: Any) -> tuple[Any, Any, Any]:
+        task = self._rclpy.Task(self._run, (mailbox, item), executor=self.executor)
+        return task, getattr(item, "wrapper", None), node
+
+    def _run(self, mailbox: Mailbox, item: Dispatchable) -> None:
+        """Run one callback as an event, on the stack that spins."""
+        stacks = self.stacks
+        stacks.event.took_ns = 0
+        with set_aside(stacks):
+            mailbox.run(item)
+        failure, mailbox.raised = mailbox.raised, None
+        if stacks.event.took_ns:
+            self._be_busy(item, stacks.event.took_ns)
+        if failure is not None:
+            raise failure
+
+    def _be_busy(self, item: Any, for_ns: int) -> None:
+        """Let the execution time of a callback pass, on the stack and in the group that ran it."""
+        wrapper = getattr(item, "wrapper", None)
+        group = getattr(wrapper, "callback_group", None)
+        held = group is not None and not is_custom(group) and not is_busy(group, wrapper)
+        if held:
+            begin(group, wrapper)
+        try:
+            wait(self.stacks, "a callback to be over", for_ns=for_ns, quiet=True)
+        finally:
+            if held:
+                self.stacks.groups.end(group, wrapper)
+
+
+class _Awaited:
+    """Says which future a spin waits for, when somebody asks."""
+
+    def __init__(self, graph: Graph, condition: Callable[[], bool]) -> None:
+        self._graph = graph
+        self._future = getattr(condition, "__self__", None)
+
+    def __str__(self) -> str:
+        return f"a future to be completed: {awaited(self._graph, self._future)}"
+
+
+def _is_stale(item: Any) -> bool:
+    """Say whether there is nothing to do any more: destroyed, or dropped from a full queue."""
+    return getattr(item, "destroyed", False) or not getattr(item, "queue", True)
+
+
+def _is_always(condition: Callable[[], bool]) -> bool:
+    """Say whether a condition is none: rclpy's default for ``spin_once``."""
+    return getattr(condition, "__name__", "") == "<lambda>"
+
+
+def pump_of(stacks: Stacks, executor: Any) -> Pump:
+    """Return the simulated part of an executor."""
+    pump: Pump | None = executor.__dict__.get("_rsltrace_pump")
+    if pump is None or pump.stacks is not stacks:
+        pump = executor.__dict__["_rsltrace_pump"] = Pump(stacks, executor)
+    return pump
+
+
+__all__ = ["Pump", "pump_of"]

@@ -1,0 +1,101 @@
+"""The executor that nodes see: rclpy's Executor API, with the loop in place of ``spin``."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from rclpy.executors import Executor
+
+from rsltrace.adapters.rclpy.executors.user_executors import is_bookkeeping
+from rsltrace.adapters.rclpy.handles.waitables import (
+    activate_node,
+    deactivate_node,
+    sync_woken,
+)
+from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.coroutines import Resume
+from rsltrace.adapters.rclpy.stacks.sim_event import FutureWake, SimEvent
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.tasks import create_task
+from rsltrace.trace.model.stamp import patience_ns
+
+
+class SimExecutor(Executor):  # type: ignore[misc]
+    """The executor of a run. Adding a node to it is what makes the node's callbacks run."""
+
+    def __init__(self, stacks: Stacks, context: Any) -> None:
+        self._stacks = stacks
+        self._sim_nodes: dict[Any, None] = {}
+        super().__init__(context=context)
+
+    def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
+        """Run a callback or coroutine right after the present event."""
+        if type(callback) in (Resume, FutureWake) or is_bookkeeping(callback):
+            callback(*args)  # rclpy's own, not an event
+            return None
+        return create_task(self._stacks, callback, args, kwargs)
+
+    def add_node(self, node: Any) -> bool:
+        """Run a node's callbacks from now on."""
+        if node in self._sim_nodes:
+            return False
+        self._sim_nodes[node] = None
+        node.executor = self
+        handle = node.handle
+        mailbox, handle.mailbox = handle.mailbox, None
+        handle.wrapper = node
+        activate_node(handle)
+        if mailbox is not None:
+            self._stacks.loop.ready.extend(item for _, item in mailbox.entries)
+        return True
+
+    def remove_node(self, node: Any) -> None:
+        """Stop running a node's callbacks."""
+        if self._sim_nodes.pop(node, self) is None:
+            deactivate_node(node.handle)
+
+    def get_nodes(self) -> list[Any]:
+        """Return the nodes in the order in which they were added."""
+        return list(self._sim_nodes)
+
+    def wake(self) -> None:
+        """Look for waitables that have come or gone: the loop sees all other changes at once."""
+        sync_woken(self._sim_nodes, sys._getframe(1))
+
+    def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
+        """Wait in simulated time until the future is done; others run meanwhile."""
+        if future.done() or future.cancelled():
+            return
+        done = SimEvent(self._stacks, "a future to be completed")
+        future.add_done_callback(FutureWake(done))
+        done.wait(None if timeout_sec is None or timeout_sec < 0 else timeout_sec)
+
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Let everything that is ready run, or else what comes next within the timeout."""
+        stacks = self._stacks
+        loop = stacks.loop
+        if loop.tasks or loop.ready:
+            wait(stacks, "its turn", for_ns=0)
+            return
+        next_ns = loop.next_ns()
+        limit_ns = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            limit_ns = patience_ns(timeout_sec)
+        if next_ns is not None:
+            ahead_ns = max(next_ns - loop.now_ns, 0)
+            limit_ns = ahead_ns if limit_ns is None else min(limit_ns, ahead_ns)
+        wait(stacks, "anything to happen", for_ns=limit_ns)
+
+    def spin_once_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
+        """Wait as ``spin_once`` does, unless the future is done."""
+        if not future.done():
+            self.spin_once(getattr(timeout_sec, "timeout", timeout_sec))
+
+    def spin(self) -> None:
+        """Let others run until the run ends."""
+        while self._context.ok():
+            wait(self._stacks, "the run to end", patient=True)
+
+
+__all__ = ["SimExecutor"]

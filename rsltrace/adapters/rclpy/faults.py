@@ -1,0 +1,198 @@
+"""Nodes that crash, hang or start again, because the job says so.
+
+What goes wrong is the process that a node is in: natively it is that which dies or is stopped. Each
+entry of a job stands for one, whether its nodes are constructed by the job, made by a main, or in a
+real process. Each fault is an event of its own, before anything else that is ready.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, cast
+
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.stacks.mains import crash_program
+from rsltrace.adapters.rclpy.stacks.victims import Victims
+from rsltrace.adapters.rclpy.world import World
+from rsltrace.errors import RunError
+from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
+from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
+from rsltrace.simulation.middleware.participant import Participant
+from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.stamp import format_seconds
+
+_DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
+
+
+class RealProcess(Protocol):
+    """A process of its own in which nodes are."""
+
+    key: str
+
+    def crash(self) -> None:
+        """Be gone at once, within the event under way."""
+
+
+@dataclass(frozen=True, slots=True)
+class NodeFault:
+    """What happens to a node: ``kind`` is ``crash``, ``hang`` or ``restart``; ``for_ns`` as in the
+    job. When: at a time, after an event, or after a message (from 1) of a topic. ``where`` names
+    its line in the job."""
+
+    kind: str
+    node: str
+    where: str
+    at_ns: int | None = None
+    event: int | None = None
+    topic: str = ""
+    message: int = 0
+    for_ns: int | None = None
+
+
+class NodeFaults(EventObserver):
+    """The faults of one run that are about nodes. Armed before the first node is made."""
+
+    order = ObserverOrder.FAULTS
+
+    def __init__(self, world: World, faults: Sequence[NodeFault], start_ns: int) -> None:
+        self.world = world
+        self._strikes = [_Strike(self, fault) for fault in faults]
+        self._counts: dict[str, int] = {}
+        by_event = [strike for strike in self._strikes if strike.fault.event is not None]
+        self._by_event = sorted(by_event, key=lambda strike: -(strike.fault.event or 0))
+        if self._by_event:
+            world.domain.dispatcher.add_observer(self)
+        for strike in self._strikes:
+            if strike.fault.at_ns is not None:
+                world.domain.loop.schedule(start_ns + strike.fault.at_ns, strike.come)
+        for topic in dict.fromkeys(s.fault.topic for s in self._strikes if s.fault.topic):
+            world.domain.watch(topic, self._sent)
+
+    def missed(self) -> Iterator[tuple[str, str]]:
+        """Yield the place in the job of each fault that has not struck, and why."""
+        for strike in self._strikes:
+            if strike.missed:
+                yield strike.fault.where, strike.missed
+
+    def after_event(self) -> None:
+        """See which faults follow the event."""
+        events = self.world.domain.loop.events
+        while self._by_event and events > (self._by_event[-1].fault.event or 0):
+            self._by_event.pop().come()
+        if not self._by_event:
+            self.world.domain.dispatcher.remove_observer(self)
+
+    def _sent(self, publisher: Any, data: bytes) -> None:
+        topic = publisher.topic
+        count = self._counts[topic] = self._counts.get(topic, 0) + 1
+        for strike in self._strikes:
+            if strike.fault.topic == topic and strike.fault.message == count:
+                strike.come()
+
+
+class _Strike:
+    """One fault. The loop dispatches it when its time has come."""
+
+    def __init__(self, faults: NodeFaults, fault: NodeFault) -> None:
+        self._world = faults.world
+        self.fault = fault
+        self.missed = "it has not come to that"
+        self._victims: Victims | None = None
+
+    def come(self) -> None:
+        """Strike next, before anything else that is ready."""
+        if self._world.domain.loop.stopped is None:
+            self._world.domain.loop.tasks.append(self)
+
+    def dispatch(self) -> None:
+        """Strike, as one event; or let those go on again that hang."""
+        if self._victims is not None:
+            victims, self._victims = self._victims, None
+            if not victims.are_gone:
+                self._event(self._node(), Draw.GOES_ON, 0, victims.let_go)
+            return
+        node = self._node()
+        if node is None:
+            at = format_seconds(self._world.domain.loop.now_ns)
+            self.missed = f"there was no node {self.fault.node} at {at} s"
+            return
+        self.missed = ""
+        for_ns = self.fault.for_ns or 0
+        self._event(node, _DRAWS[self.fault.kind], for_ns, lambda: self._strike(node))
+
+    def runnable(self) -> Runnable:
+        """Describe it to a policy: it is on no executor."""
+        return on_no_executor(None, self.describe())
+
+    def describe(self) -> str:
+        """Name it for people."""
+        return f"{self.fault.kind} of {self.fault.node}"
+
+    def _node(self) -> Participant | None:
+        return self._world.domain.graph.node_named(self.fault.node)
+
+    def _event(
+        self, node: Participant | None, draw: Draw, value_ns: int, body: Callable[[], None]
+    ) -> None:
+        dispatcher = self._world.domain.dispatcher
+        entity = 0 if node is None else node.entity_id
+
+        def happen() -> None:
+            dispatcher.draw(entity, encode_draw(draw, value_ns))
+            body()
+
+        event = OutsideEvent(self.describe)
+        dispatcher.run_outside(event, EventKind.FAULT, entity, None, happen, (NO_EVENT, 0))
+
+    def _strike(self, node: Participant) -> None:
+        fault, world = self.fault, self._world
+        entry = self._entry(node)
+        if fault.kind == "restart":
+            if entry is None:
+                raise self._cannot("no entry of nodes: has made it, so it cannot be made anew")
+            world.starts.add_at(entry, world.domain.loop.now_ns + (fault.for_ns or 0))
+        if not isinstance(node, NodeHandle):
+            if node.process is None:
+                raise self._cannot("it plays a bag, or drives the run")
+            if fault.kind == "hang":
+                raise self._cannot("it is in a process of its own; crash and restart are possible")
+            cast("RealProcess", node.process).crash()
+            return
+        victims = Victims(world.stacks, self._nodes(node, entry), node.process, entry)
+        if fault.kind == "hang":
+            victims.hold()
+            if fault.for_ns is not None:
+                self._victims = victims
+                world.domain.loop.schedule(world.domain.loop.now_ns + fault.for_ns, self.come)
+            return
+        victims.vanish()
+        if node.process is not world.stacks.programs.host:
+            crash_program(world.stacks, node.process)
+            if fault.kind == "restart":
+                world.renew(node.process)
+        elif entry is not None:
+            world.stacks.programs.tell("ended", entry.key)
+
+    def _nodes(self, node: NodeHandle, entry: Entry | None) -> list[Any]:
+        """Return the nodes of the process that a node is in."""
+        own = [one for one in self._world.domain.graph.nodes if one.process is node.process]
+        if node.process.entry is not None:
+            return own
+        same = [one for one in own if isinstance(one, NodeHandle) and one.entry is entry]
+        return [node] if entry is None else same
+
+    def _entry(self, node: Participant) -> Entry | None:
+        """Return the entry of the job that stands for a node's process."""
+        if not isinstance(node, NodeHandle):
+            if node.process is None:
+                return None
+            key = cast("RealProcess", node.process).key
+            return next(one for one in self._world.constructed if one.key == key)
+        return node.process.entry or node.entry
+
+    def _cannot(self, why: str) -> RunError:
+        return RunError(f"{self.fault.where}: {self.fault.node} cannot {self.fault.kind}: {why}")

@@ -1,0 +1,75 @@
+"""What the guard asks of the simulated world: the time, the node, the event under way."""
+
+from __future__ import annotations
+
+from greenlet import getcurrent
+
+from rsltrace.adapters.rclpy.node_clocks import NodeClocks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.construction import entry_of, policy_of
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.trace.model.finding import Policy
+
+
+class GuardContext:
+    """Answers for one world."""
+
+    def __init__(self, stacks: Stacks, clocks: NodeClocks | None) -> None:
+        self._stacks = stacks
+        self._clocks = clocks
+        self.direct = (stacks.loop, stacks.event) if clocks is None else None
+
+    def look(self) -> tuple[int, str, int]:
+        """Return the index of the event under way, the node and simulated time."""
+        return self._stacks.loop.events, self.node(), self.now_ns()
+
+    def now_ns(self) -> int:
+        """Return simulated time."""
+        node, now_ns = self._stacks.event.node, self._stacks.loop.now_ns
+        if self._clocks is None or node is None:
+            return now_ns
+        return self._clocks.shows(node.fully_qualified_name, now_ns)
+
+    def node(self) -> str:
+        """Return the node whose code runs, or the entry whose constructor has made none yet."""
+        stacks = self._stacks
+        if stacks.event.node is not None:
+            return str(stacks.event.node.key)
+        entry = entry_of(stacks.event)
+        return entry.key if entry is not None else ""
+
+    def process(self) -> int:
+        """Return which main's code runs, counted from 1; 0 for that of the job's own nodes."""
+        programs = self._stacks.programs
+        return 0 if programs.is_hosted else programs.all.index(programs.present) + 1
+
+    def policy(self) -> Policy | None:
+        """Return the policy of that node."""
+        return policy_of(self._stacks.event)
+
+    def place(self) -> tuple[int, int]:
+        """Return the index of the event under way and the entity that runs."""
+        stacks = self._stacks
+        return stacks.loop.events, stacks.event.entity
+
+    def pass_time(self, for_ns: int) -> None:
+        """Let time pass for a callback that does nothing but look at the clock."""
+        stacks = self._stacks
+        if stacks.event.handle is not None and not stacks.ending.unwinding:
+            wait(stacks, "time to pass (it reads a clock again and again)", for_ns=for_ns)
+
+    def is_aside(self) -> bool:
+        """Return whether a thread or a main waits, not a callback: others can go on meanwhile."""
+        stacks = self._stacks
+        if not self.can_step() or stacks.dispatcher.in_callback():
+            return False
+        stack = getcurrent()
+        return stacks.threads.runs_on(stack) or stacks.programs.on_stack(stack) is not None
+
+    def can_step(self) -> bool:
+        """Return whether whoever runs can wait in simulated time at all."""
+        return self._stacks.event.handle is not None and not self._stacks.ending.unwinding
+
+    def step(self, for_ns: int) -> None:
+        """Let simulated time pass, and others go on."""
+        wait(self._stacks, "something outside of the run", for_ns=for_ns, quiet=True)

@@ -1,0 +1,203 @@
+"""Clocks: ROS, system and steady time are all simulated time, as each node's clock shows it.
+
+Only where the job says so is ROS time that of ``/clock``, or what somebody sets by hand; it is then
+kept as rcl keeps it.
+"""
+
+from __future__ import annotations
+
+import weakref
+from functools import partial
+from typing import Any, Protocol
+
+from rsltrace.adapters.rclpy.handles.destroyable import Handle
+from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
+
+
+class _Now:
+    """The part of ``rcl_time_point_t`` that rclpy reads."""
+
+    __slots__ = ("nanoseconds",)
+
+    def __init__(self, nanoseconds: int) -> None:
+        self.nanoseconds = nanoseconds
+
+
+class Follower(Protocol):
+    """What goes by the time of a clock that ``/clock`` drives."""
+
+    def time_changes(self) -> None:
+        """Take note that ROS time is about to be switched on or off."""
+
+    def time_changed(self, *, switched: bool) -> None:
+        """Look at the clock again: it shows another time, or another kind of time."""
+
+
+class ClockHandle(Handle):
+    """Stands in for ``_rclpy.Clock``.
+
+    A clock outlives runs (rclpy itself keeps one in a class attribute), so it asks the boundary
+    for the world of the moment; between runs it stands at the last simulated time.
+    """
+
+    boundary: Any
+
+    def __init__(self, clock_type: Any) -> None:
+        super().__init__()
+        self.clock_type = clock_type
+        self._override = False
+        self._set_ns = 0
+        self.followers: list[Follower] = []
+        self._callbacks: list[tuple[Any, bool, int, int]] = []
+        self._owner: str | None = self.boundary.current_node_name()
+        if clock_type == self.boundary.ClockType.ROS_TIME:
+            self.boundary.ros_clocks.append(weakref.ref(self))
+
+    @property
+    def follows(self) -> bool:
+        """Whether ``/clock`` drives it while ``use_sim_time`` is on."""
+        is_ros = self.clock_type == self.boundary.ClockType.ROS_TIME
+        return is_ros and bool(self.boundary.follows(self._owner))
+
+    @property
+    def is_driven(self) -> bool:
+        """Whether it shows what somebody has set, not simulated time."""
+        return self._override and self.follows
+
+    def get_now(self) -> _Now:
+        """Return simulated time, or what the clock of this node's computer shows instead."""
+        return _Now(self._set_ns if self.is_driven else self.boundary.look_ns(self._owner))
+
+    def now_ns(self) -> int:
+        """Return the same without that it counts as a look."""
+        return self._set_ns if self.is_driven else int(self.boundary.shown_ns(self._owner))
+
+    def get_ros_time_override_is_enabled(self) -> bool:
+        """Return whether ``use_sim_time`` switched this clock; it shows simulated time anyway."""
+        return self._override
+
+    def set_ros_time_override_is_enabled(self, enabled: bool) -> None:
+        """Remember the switch and tell those who asked for clock changes."""
+        if enabled == self._override:
+            return
+        changes = self.boundary.ClockChange
+        change = changes.ROS_TIME_ACTIVATED if enabled else changes.ROS_TIME_DEACTIVATED
+        wanted = [entry for entry in self._callbacks if entry[1]]
+        for follower in list(self.followers):
+            follower.time_changes()
+        self._jump(wanted, change, 0, lambda: setattr(self, "_override", enabled))
+        for follower in list(self.followers):
+            follower.time_changed(switched=True)
+
+    def set_ros_time_override(self, time_point: Any) -> None:
+        """Set ROS time if ``/clock`` drives it; else the loop is the only source of time."""
+        if not self.follows:
+            return
+        time_ns = time_point.nanoseconds
+        if not self._override:
+            self._set_ns = time_ns
+            return
+        delta_ns = time_ns - self._set_ns
+        change = self.boundary.ClockChange.ROS_TIME_NO_CHANGE
+        self._jump(self._exceeded(delta_ns), change, delta_ns, partial(self._set, time_ns))
+        for follower in list(self.followers):
+            follower.time_changed(switched=False)
+
+    def _set(self, time_ns: int) -> None:
+        self._set_ns = time_ns
+
+    def add_clock_callback(
+        self, jump_handle: Any, on_clock_change: bool, min_forward: int, min_backward: int
+    ) -> None:
+        """Register a jump handle; thresholds in nanoseconds, 0 for none."""
+        self._callbacks.append((jump_handle, on_clock_change, min_forward, min_backward))
+
+    def remove_clock_callback(self, jump_handle: Any) -> None:
+        """Forget a jump handle."""
+        self._callbacks = [entry for entry in self._callbacks if entry[0] is not jump_handle]
+
+    def jumped(self, delta_ns: int) -> None:
+        """Tell those whose threshold a jump of simulated time exceeds (start of the run)."""
+        if self.is_driven:
+            return
+        change = self.boundary.ClockChange
+        kind = change.ROS_TIME_NO_CHANGE if self._override else change.SYSTEM_TIME_NO_CHANGE
+        self._jump(self._exceeded(delta_ns), kind, delta_ns, lambda: None)
+
+    def _exceeded(self, delta_ns: int) -> list[Any]:
+        """Return the jump handles whose threshold a jump exceeds."""
+        return [
+            entry
+            for entry in self._callbacks
+            if (delta_ns > 0 and 0 < entry[2] <= delta_ns)
+            or (delta_ns < 0 and delta_ns <= entry[3] < 0)
+        ]
+
+    def _jump(self, entries: list[Any], change: Any, delta_ns: int, act: Any) -> None:
+        for jump_handle, *_ in entries:
+            if jump_handle._pre_callback is not None:
+                jump_handle._pre_callback()
+        act()
+        for jump_handle, *_ in entries:
+            if jump_handle._post_callback is not None:
+                jump_handle._post_callback({"clock_change": change, "delta": delta_ns})
+
+
+class ClockEventHandle:
+    """Stands in for ``_rclpy.ClockEvent``: sleeping until a time, or until it is set."""
+
+    boundary: Any
+
+    def __init__(self) -> None:
+        self._event = SimEvent(self.boundary.stacks, "a time to come (Clock.sleep_until)")
+
+    def set(self) -> None:
+        """Wake sleepers."""
+        self._event.set()
+
+    def clear(self) -> None:
+        """Let sleepers sleep again."""
+        self._event.clear()
+
+    def is_set(self) -> bool:
+        """Return whether it is set."""
+        return self._event.is_set()
+
+    def _wait_until(self, clock: Any, until: Any) -> bool:
+        left_ns = until.nanoseconds - clock.now_ns()
+        return left_ns <= 0 or self._event.wait_ns(left_ns)
+
+    def wait_until_ros(self, clock: Any, until: Any) -> bool:
+        """Wait until a ROS clock shows a time; ``/clock`` may be what lets it."""
+        while clock.is_driven:
+            if clock.now_ns() >= until.nanoseconds:
+                return True
+            if self._event.is_set():
+                return False
+            sleeper = _Sleeper(self._event)
+            clock.followers.append(sleeper)
+            self._event.wait_ns(None)
+            clock.followers.remove(sleeper)
+            if sleeper.woken:
+                self._event.clear()
+        return self._wait_until(clock, until)
+
+    wait_until_steady = _wait_until
+    wait_until_system = _wait_until
+
+
+class _Sleeper:
+    """Wakes who sleeps until a time whenever its clock shows another one."""
+
+    def __init__(self, event: SimEvent) -> None:
+        self._event = event
+        self.woken = False
+
+    def time_changes(self) -> None:
+        """Sleep on: only what the clock shows afterwards matters."""
+
+    def time_changed(self, *, switched: bool) -> None:
+        """Wake up, unless somebody else has ended the sleep."""
+        if not self._event.is_set():
+            self.woken = True
+            self._event.set()

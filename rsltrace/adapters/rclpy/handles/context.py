@@ -1,0 +1,111 @@
+"""The handle of ``rclpy.Context``: init arguments, and a shutdown.
+
+That of a node which the job constructs ends the run; a main shuts down only itself. As in rcl, what
+belongs to a context that is down can be destroyed, and hardly anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from greenlet import getcurrent
+
+from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.adapters.rclpy.handles.destroyable import Handle
+from rsltrace.adapters.rclpy.stacks.runners import RunEnded
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.event import OutputKind
+
+DEFAULT_DOMAIN = 2**64 - 1
+_DOWN = (
+    "the given context is not valid, either rcl_init() was not called or rcl_shutdown() was called."
+)
+
+
+class ContextHandle(Handle):
+    """Stands in for ``_rclpy.Context``."""
+
+    def __init__(self, real: Any, stacks: Stacks, arguments: Sequence[str], domain_id: int) -> None:
+        super().__init__()
+        self._real = real
+        self.stacks = stacks
+        for argument in arguments:
+            argument.encode()  # raises what rclpy raises for what is not text
+        self.program = stacks.programs.present
+        self.program.contexts.append(self)
+        self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
+        self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
+        self.is_up = True
+
+    def ok(self) -> bool:
+        """Return whether the context has not been shut down."""
+        return self.is_up
+
+    def get_domain_id(self) -> int:
+        """Return the domain id; nothing in a simulation depends on it."""
+        return self._domain_id
+
+    def shutdown(self) -> None:
+        """Shut down. Within an event this ends the run once the event is over."""
+        if not self.is_up:
+            text = "failed to shutdown: rcl_shutdown already called on the given context"
+            raise self._real.RCLError(text)
+        self.end()
+        stacks = self.stacks
+        if self.program is not stacks.programs.host:
+            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
+            return
+        if stacks.event.node is not None and self is stacks.programs.main_context:
+            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
+            name = stacks.event.node.fully_qualified_name
+            stacks.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
+
+    def end(self) -> None:
+        """Shut down from outside, as a signal does."""
+        self.is_up = False
+        graph = self.stacks.domain.graph
+        for node in graph.nodes:
+            if getattr(node, "context", None) is self:
+                for publisher in graph.publishers_of(node):
+                    publisher.refuse(self._refuse)  # type: ignore[attr-defined]
+
+    def _refuse(self, message: object) -> NoReturn:
+        self._cut_off()
+        raise self._real.RCLError("Failed to publish: publisher's context is invalid")
+
+    def require(self, task: str) -> None:
+        """Raise RCLError if the context is down: rcl refuses the task then."""
+        if not self.is_up:
+            self._cut_off()
+            raise self._real.RCLError(f"{task}: {_DOWN}")
+
+    def _cut_off(self) -> None:
+        """End a callback or thread that the end of the run has met in the middle: that is no fault
+        of theirs. Main itself is told of the end, and sees to the rest as it would natively.
+
+        :raises RunEnded: in all code of a main's program but that of main.
+        """
+        stacks, main = self.stacks, self.program.stack
+        if not stacks.ending.closing or main is None:
+            return
+        if stacks.dispatcher.in_callback() or main is not getcurrent():
+            raise RunEnded
+
+
+def _only_ros(arguments: Sequence[str]) -> list[str]:
+    """Keep what stands between ``--ros-args`` and ``--`` (the program's own flags are not ours)."""
+    kept: list[str] = []
+    inside = False
+    for argument in arguments:
+        if argument == "--ros-args":
+            inside = True
+        if inside:
+            kept.append(argument)
+        if argument == "--":
+            inside = False
+    return kept
+
+
+__all__ = ["ContextHandle", "InvalidArgumentsError"]

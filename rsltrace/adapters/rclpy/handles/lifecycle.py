@@ -1,0 +1,195 @@
+"""Lifecycle nodes, through rclpy's own Python layer: the state machine behind them.
+
+States, transitions and labels are those of rcl_lifecycle's default state machine (read from a
+native one); services and the transition event topic are ordinary entities of the node.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rsltrace.adapters.rclpy.handles.destroyable import Handle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
+from rsltrace.adapters.rclpy.handles.services import ServiceHandle
+
+_STATES = {
+    0: "unknown",
+    1: "unconfigured",
+    2: "inactive",
+    3: "active",
+    4: "finalized",
+    10: "configuring",
+    11: "cleaningup",
+    12: "shuttingdown",
+    13: "activating",
+    14: "deactivating",
+    15: "errorprocessing",
+}
+_TRANSITIONS = (
+    (1, "configure", 1, 10),
+    (10, "transition_success", 10, 2),
+    (11, "transition_failure", 10, 1),
+    (12, "transition_error", 10, 15),
+    (2, "cleanup", 2, 11),
+    (20, "transition_success", 11, 1),
+    (21, "transition_failure", 11, 2),
+    (22, "transition_error", 11, 15),
+    (3, "activate", 2, 13),
+    (30, "transition_success", 13, 3),
+    (31, "transition_failure", 13, 2),
+    (32, "transition_error", 13, 15),
+    (4, "deactivate", 3, 14),
+    (40, "transition_success", 14, 2),
+    (41, "transition_failure", 14, 3),
+    (42, "transition_error", 14, 15),
+    (5, "shutdown", 1, 12),
+    (6, "shutdown", 2, 12),
+    (7, "shutdown", 3, 12),
+    (50, "transition_success", 12, 4),
+    (51, "transition_failure", 12, 4),
+    (52, "transition_error", 12, 15),
+    (60, "transition_success", 15, 1),
+    (61, "transition_failure", 15, 4),
+    (62, "transition_error", 15, 4),
+)
+"""(transition id, label, start state, goal state), in rcl_lifecycle's order."""
+
+Description = tuple[int, str, int, str, int, str]
+
+
+def transition_event(start: tuple[int, str], goal: tuple[int, str]) -> Any:
+    """Return what rcl_lifecycle publishes of a change between states (numbers and labels)."""
+    from lifecycle_msgs.msg import State, TransitionEvent
+
+    return TransitionEvent(
+        start_state=State(id=start[0], label=start[1]),
+        goal_state=State(id=goal[0], label=goal[1]),
+    )
+
+
+class StateMachineHandle(Handle):
+    """Stands in for ``_rclpy.LifecycleStateMachine``."""
+
+    def __init__(self, node: NodeHandle, communicate: bool) -> None:
+        if not isinstance(communicate, bool):
+            raise TypeError(f"enable_communication_interface must be a bool, not {communicate!r}")
+        super().__init__()
+        self._real = node.real
+        self._state = 1
+        self._events: PublisherHandle | None = None
+        self._services: dict[str, ServiceHandle] = {}
+        if communicate:
+            self._open(node)
+
+    def _open(self, node: NodeHandle) -> None:
+        from lifecycle_msgs.msg import TransitionEvent
+        from lifecycle_msgs.srv import (
+            ChangeState,
+            GetAvailableStates,
+            GetAvailableTransitions,
+            GetState,
+        )
+
+        predefined = self._real.rmw_qos_profile_t.predefined
+        self._events = PublisherHandle(
+            node, TransitionEvent, "~/transition_event", predefined("qos_profile_default")
+        )
+        profile = predefined("qos_profile_services_default")
+        for name, kind in (
+            ("change_state", ChangeState),
+            ("get_state", GetState),
+            ("get_available_states", GetAvailableStates),
+            ("get_available_transitions", GetAvailableTransitions),
+            ("get_transition_graph", GetAvailableTransitions),
+        ):
+            self._services[name] = ServiceHandle(node, kind, f"~/{name}", profile)
+
+    # -- states ------------------------------------------------------------------------------------
+
+    @property
+    def initialized(self) -> bool:
+        """True: the machine is ready as soon as it is made."""
+        return True
+
+    @property
+    def current_state(self) -> tuple[int, str]:
+        """The present state: its number and label."""
+        return self._state, _STATES[self._state]
+
+    @property
+    def available_states(self) -> list[tuple[int, str]]:
+        """Every state there is."""
+        return list(_STATES.items())
+
+    @property
+    def available_transitions(self) -> list[Description]:
+        """The transitions that lead away from the present state."""
+        return [t for t in self.transition_graph if t[2] == self._state]
+
+    @property
+    def transition_graph(self) -> list[Description]:
+        """Every transition there is: number, label, start state, goal state with their labels."""
+        return [
+            (number, label, start, _STATES[start], goal, _STATES[goal])
+            for number, label, start, goal in _TRANSITIONS
+        ]
+
+    def get_transition_by_label(self, label: str) -> int:
+        """Return the transition of that label from here. Raises RCLError if there is none."""
+        for number, name, start, _ in _TRANSITIONS:
+            if start == self._state and name == label:
+                return number
+        raise self._real.RCLError(f"Failed to get transition from label: {label}")
+
+    def trigger_transition_by_id(self, transition: int, publish_update: bool) -> None:
+        """Go where a transition leads. Raises RCLError if it does not start here."""
+        for number, _, start, goal in _TRANSITIONS:
+            if number == transition and start == self._state:
+                self._go(start, goal, publish_update)
+                return
+        raise self._real.RCLError(
+            "Failed to trigger lifecycle state machine transition: Transition is not registered: "
+            f"no transition matching {transition} found for current state {_STATES[self._state]}"
+        )
+
+    def trigger_transition_by_label(self, label: str, publish_update: bool) -> None:
+        """Go where the transition of that label leads. Raises RCLError if there is none here."""
+        self.trigger_transition_by_id(self.get_transition_by_label(label), publish_update)
+
+    def _go(self, start: int, goal: int, publish_update: bool) -> None:
+        self._state = goal
+        if publish_update and self._events is not None:
+            self._events.publish(transition_event((start, _STATES[start]), (goal, _STATES[goal])))
+
+    # -- services ----------------------------------------------------------------------------------
+
+    @property
+    def service_change_state(self) -> ServiceHandle | None:
+        """The service ``~/change_state``, if the node has any."""
+        return self._services.get("change_state")
+
+    @property
+    def service_get_state(self) -> ServiceHandle | None:
+        """The service ``~/get_state``, if the node has any."""
+        return self._services.get("get_state")
+
+    @property
+    def service_get_available_states(self) -> ServiceHandle | None:
+        """The service ``~/get_available_states``, if the node has any."""
+        return self._services.get("get_available_states")
+
+    @property
+    def service_get_available_transitions(self) -> ServiceHandle | None:
+        """The service ``~/get_available_transitions``, if the node has any."""
+        return self._services.get("get_available_transitions")
+
+    @property
+    def service_get_transition_graph(self) -> ServiceHandle | None:
+        """The service ``~/get_transition_graph``, if the node has any."""
+        return self._services.get("get_transition_graph")
+
+    def _destroy(self) -> None:
+        for handle in [*self._services.values(), self._events]:
+            if handle is not None and not handle.destroyed:
+                handle.destroy_when_not_in_use()

@@ -1,0 +1,344 @@
+"""The handle of ``rclpy.Node``: names, arguments, parameters, graph counts."""
+
+from __future__ import annotations
+
+import sys
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from itertools import count
+from typing import Any, Protocol
+
+from rsltrace.adapters.rclpy.arguments import (
+    InvalidArgumentsError,
+    RosArguments,
+    UnknownArgumentsError,
+)
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.handles.context import ContextHandle
+from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
+from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.stacks.construction import policy_of
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
+from rsltrace.adapters.rclpy.stacks.program import Program
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
+from rsltrace.simulation.middleware.events.census import Asker
+from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
+from rsltrace.simulation.middleware.participant import Participant, full_name
+
+_GROUP_KINDS = {
+    "MutuallyExclusiveCallbackGroup": "exclusive",
+    "ReentrantCallbackGroup": "reentrant",
+}
+_FRAMES_MAX = 10
+"""Between the boundary and the constructor of ``rclpy.Node`` are two or three."""
+
+
+class LogSink(Protocol):
+    """Where log records go; it publishes those of a node on /rosout."""
+
+    def attach(self, node: Any, qos: Any = None) -> None:
+        """Give a node its /rosout publisher."""
+
+    def detach(self, node: Any) -> None:
+        """Forget a node."""
+
+
+class NodeHandle(Destroyable, Participant):
+    """Stands in for ``_rclpy.Node``.
+
+    ``wrapper`` is the ``rclpy.Node`` once an executor of this run has it; only then do its
+    callbacks run. The rules for names are those of ``rcl_node_init``; ``real`` is rclpy's own
+    extension.
+    """
+
+    destroy = Participant.destroy
+    process: Program
+
+    def __init__(
+        self,
+        real: Any,
+        stacks: Stacks,
+        logs: LogSink,
+        states: NodeStates,
+        node_name: str,
+        namespace: str,
+        context: ContextHandle,
+        cli_args: Sequence[str] | None,
+        use_global_arguments: bool,
+        enable_rosout: bool,
+        rosout_qos: Any = None,
+    ) -> None:
+        if real.rclpy_get_validation_error_for_node_name(node_name) is not None:
+            raise ValueError(f"invalid node name: {node_name}")
+        if not namespace.startswith("/"):
+            namespace = "/" + namespace
+        if real.rclpy_get_validation_error_for_namespace(namespace) is not None:
+            raise ValueError(f"invalid node namespace: {namespace}")
+        try:
+            self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
+        except UnknownArgumentsError as error:
+            raise real.UnknownROSArgsError(str(error)) from error
+        except InvalidArgumentsError as error:
+            message = f"Failed to parse ROS arguments: {error}"
+            raise real.RCLInvalidROSArgsError(message) from error
+        # The job's arguments for this node are the process's arguments of ``ros2 run``.
+        programs = stacks.programs
+        program = programs.present
+        entry = programs.constructing if programs.is_hosted else program.entry
+        given = entry.arguments if entry is not None else []
+        own = given if programs.is_hosted else program.parameters
+        self._outer = [context.arguments, *own] if use_global_arguments else []
+        self._entry = entry
+        self.wrapper: Any = None
+        self.process = program
+        self.stacks = stacks
+        self.real = real
+        self.context = context
+        self._logs = logs
+        name, namespace = self._renamed(node_name, namespace)
+        domain = stacks.domain
+        Participant.__init__(self, domain.dispatcher, name, namespace, domain.dispatcher.door)
+        self._number_among_others()
+        self.policy = policy_of(stacks.event)
+        self.state = states.add(self)
+        self.mailbox: Mailbox | None = None
+        self.rosout: DomainEntity | None = None
+        self._made = _node_being_made()
+        self._groups: list[weakref.ref[Any]] = []
+        self.user_waitables: dict[Any, Any] = {}
+        self.waitable_count = 0
+        domain.graph.add_node(self)
+        domain.event.node = self
+        for observer in domain.dispatcher.node_observers:
+            observer.node_entered(self, is_made=True)
+        self._set_log_levels()
+        said = [each.rosout() for each in [*self._outer, self.arguments]]
+        if enable_rosout and next((s for s in reversed(said) if s is not None), True):
+            logs.attach(self, rosout_qos)
+
+    @property
+    def entry(self) -> Entry | None:
+        """The job's entry that made it, if one did."""
+        return self._entry
+
+    @property
+    def entry_key(self) -> str:
+        """The key of the job's entry that made it; empty if none did."""
+        return self._entry.key if self._entry is not None else ""
+
+    @property
+    def log_exceptions(self) -> bool:
+        """Whether a callback of its that raises is logged instead of ending the run."""
+        return self._entry is not None and self._entry.log_exceptions
+
+    def _number_among_others(self) -> None:
+        """Tell the node apart from others of its name. ROS allows that; it is seldom meant."""
+        others = _at_work(self.stacks, self.fully_qualified_name)
+        if others:
+            taken = {other.number for other in others}
+            self.number = next(number for number in count(1) if number not in taken)
+            note = f"several nodes are named {self.fully_qualified_name}"
+            notes = self.stacks.domain.outcome.notes
+            if note not in notes:
+                notes.append(note)
+
+    def _set_log_levels(self) -> None:
+        """Do what ``--log-level`` asks for, for the loggers it names and for this node's."""
+        real = self.real
+        levels: dict[str, str] = {}
+        for arguments in [*self._outer, self.arguments]:
+            levels.update(arguments.log_levels())
+        everybody = levels.pop("", None)
+        if everybody is not None:  # but not for other programs of the run
+            levels.setdefault(self.logger_name(), everybody)
+        for logger, level in levels.items():
+            number = real.rclpy_logging_severity_level_from_string(level)
+            real.rclpy_logging_set_logger_level(logger, number)
+
+    def _renamed(self, name: str, namespace: str) -> tuple[str, str]:
+        outer = self._outer_names()
+        name = self.arguments.remap_node_name(name, outer)
+        return name, self.arguments.remap_namespace(namespace, name, outer)
+
+    def _outer_names(self) -> RosArguments | None:
+        """Return the process-wide arguments that rename things: the job's, or the context's."""
+        if not self._outer:
+            return None
+        if self.process is not self.stacks.programs.host:
+            return self._outer[0]  # of a main, the job's arguments are among the context's
+        return self._outer[min(1, len(self._outer) - 1)]
+
+    def resolve(self, name: str, *, service: bool, only_expand: bool = False) -> str:
+        """Return a topic or service name fully qualified and remapped.
+
+        :raises ValueError: if the name is not valid.
+        """
+        real = self.real
+        expanded: str = real.rclpy_expand_topic_name(name, self.name, self.namespace)
+        if not only_expand:
+            if (census := self.dispatcher.entities.census) is not None:
+                asker = Asker(self.entry_key, self.name, self.namespace)
+                census.asked.setdefault(asker, {})[expanded, service] = None
+            expanded = self.arguments.remap_topic(
+                expanded, self.name, self.namespace, self._outer_names(), service=service
+            )
+        if real.rclpy_get_validation_error_for_full_topic_name(expanded) is not None:
+            raise ValueError(f"topic name is invalid: {expanded}")
+        return expanded
+
+    # -- what rclpy calls ----------------------------------------------------------------------
+
+    def get_node_name(self) -> str:
+        """Return the node's name after remapping."""
+        return self.name
+
+    def get_namespace(self) -> str:
+        """Return the node's namespace after remapping."""
+        return self.namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """Return namespace and name."""
+        return self.fully_qualified_name
+
+    def logger_name(self) -> str:
+        """Return the name rcl gives the node's logger: the FQN with dots."""
+        return self.fully_qualified_name.strip("/").replace("/", ".")
+
+    def get_parameters(self, parameter_class: Any) -> dict[str, Any]:
+        """Return the parameter overrides for this node as rclpy Parameters by name."""
+        values: dict[str, Any] = {}
+        for arguments in [*self._outer, self.arguments]:
+            values.update(arguments.parameters(self.fully_qualified_name))
+        return {name: parameter_class(name, value=value) for name, value in values.items()}
+
+    def get_count_publishers(self, topic: str) -> int:
+        """Count the publishers of a fully qualified topic."""
+        return len(self.asked_graph.publishers(topic))
+
+    def get_count_subscribers(self, topic: str) -> int:
+        """Count the subscriptions of a fully qualified topic."""
+        return len(self.asked_graph.subscriptions(topic))
+
+    def get_count_clients(self, service: str) -> int:
+        """Count the clients of a fully qualified service."""
+        return len(self.asked_graph.clients(service))
+
+    def get_count_services(self, service: str) -> int:
+        """Count the servers of a fully qualified service."""
+        return len(self.asked_graph.services(service))
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Return every node of the graph, in creation order."""
+        return [(node.name, node.namespace) for node in self.asked_graph.nodes]
+
+    def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
+        """Return every node of the graph with its enclave (always the root one)."""
+        return [(node.name, node.namespace, "/") for node in self.asked_graph.nodes]
+
+    def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return every action of the graph with its type."""
+        return action_names_and_types(self.asked_graph.topic_names_and_types())
+
+    def get_action_client_names_and_types_by_node(
+        self, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        """Return the actions that a node is a client of."""
+        ends = self.asked_graph.subscriptions_of(self.node_named(name, namespace))
+        return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
+
+    def get_action_server_names_and_types_by_node(
+        self, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        """Return the actions that a node serves."""
+        ends = self.asked_graph.publishers_of(self.node_named(name, namespace))
+        return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
+
+    def node_named(self, name: str, namespace: str) -> Participant:
+        """Return a participant of the graph. Raises NodeNameNonExistentError if there is none."""
+        found = self.asked_graph.node_named(full_name(namespace, name))
+        if found is None:
+            missing = full_name(namespace, name)
+            raise self.real.NodeNameNonExistentError(f"cannot find node {missing}")
+        return found
+
+    @property
+    def asked_graph(self) -> Graph:
+        """The graph, for user code that asks: it can as long as the context is up."""
+        self.require_up("failed to ask the graph")
+        return self.stacks.domain.graph
+
+    def require_up(self, task: str) -> None:
+        """Raise RCLError if the node's context is shut down: rcl refuses the task then."""
+        if not self.context.is_up:
+            raise self.real.RCLError(f"{task}: rcl node's context is invalid")
+
+    # -- the trace -----------------------------------------------------------------------------
+
+    def trace_type(self) -> str:
+        return "" if self.made is None else class_name(type(self.made))
+
+    def user_callback(self) -> object:
+        return None if self.made is None else type(self.made)  # its constructor
+
+    def group_name(self, group: Any) -> str:
+        """Return what the trace calls a callback group, by its kind and its number in the node:
+        ``reentrant 2``; "" for the default one."""
+        if group is None or group is getattr(self.made, "default_callback_group", group):
+            return ""
+        number = next((n for n, one in enumerate(self._groups, 1) if one() is group), 0)
+        if not number:
+            self._groups.append(weakref.ref(group))
+            number = len(self._groups)
+        kind = type(group).__name__
+        return f"{_GROUP_KINDS.get(kind, kind)} {number}"
+
+    @property
+    def made(self) -> Any:
+        """The ``rclpy.Node``, also while its constructor waits; None if it is gone."""
+        return self._made() if self.wrapper is None else self.wrapper
+
+    def timer_periods(self) -> Iterable[tuple[str, int]]:
+        timers = () if self.wrapper is None else self.wrapper.timers
+        return ((callback_name(each.callback), each.handle.state.period_ns) for each in timers)
+
+    def shortest_period_ns(self) -> int | None:
+        timers = () if self.wrapper is None else self.wrapper.timers
+        return min((timer.handle.state.period_ns for timer in timers), default=None)
+
+    def _destroy(self) -> None:
+        super()._destroy()
+        self._logs.detach(self)
+        if self.rosout is not None:
+            self.rosout.destroy()
+
+
+def _node_being_made() -> Callable[[], Any]:
+    """Return a reference to the ``rclpy.Node`` whose constructor makes a handle."""
+    frame = sys._getframe(2)
+    for _ in range(_FRAMES_MAX):
+        made = frame.f_locals.get("self")
+        if frame.f_code.co_name == "__init__" and isinstance(made, sys.modules["rclpy.node"].Node):
+            return weakref.ref(made)
+        if frame.f_back is None:
+            break
+        frame = frame.f_back
+    return lambda: None
+
+
+def class_name(cls: type) -> str:
+    """Return ``module:Class`` of a node's class."""
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _at_work(stacks: Stacks, name: str) -> list[Participant]:
+    """Return the nodes of a name that are at work.
+
+    In a program's hands a node may be left behind: its context is shut down, or nobody spins it.
+    """
+    return [
+        node
+        for node in stacks.domain.graph.nodes_named(name)
+        if not isinstance(node, NodeHandle)
+        or (node.context.ok() and (node.wrapper is not None or stacks.programs.is_hosted))
+    ]

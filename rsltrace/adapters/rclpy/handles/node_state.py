@@ -1,0 +1,137 @@
+"""The state of a node after each of its events: its own attributes, not those rclpy gave it."""
+
+from __future__ import annotations
+
+import dis
+import json
+from collections.abc import Iterator
+from functools import lru_cache
+from types import CodeType, FunctionType
+from typing import Any
+
+from rsltrace.guard.guard import engage
+from rsltrace.guard.state.hashing import UNCHANGING, StateHasher
+from rsltrace.guard.state.snapshot import Snapshots
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.finding import Policy
+
+
+class NodeState:
+    """Hashes one node's state; ``keeps`` says whether what changes is written down, too."""
+
+    def __init__(self, dispatcher: Dispatcher, handle: Any, *, keeps: bool) -> None:
+        self._dispatcher = dispatcher
+        self._handle = handle
+        self._hasher = StateHasher()
+        self._snapshots = Snapshots() if keeps else None
+        self._names: list[str | None] = []
+        self._shown: dict[str, tuple[str, bool]] = {}
+        self._last: dict[str, tuple[object, int, str]] = {}
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """What has no hash: types by attribute."""
+        return self._hasher.skipped
+
+    def after_event(self) -> int:
+        """Return the hash of the node's state now, 0 as long as there is no node."""
+        node = self._handle.wrapper
+        if node is None:
+            return 0
+        with engage(None):  # what a hash looks at is no finding
+            attributes = self._attributes(node)
+            hashes, text = self._hashes(attributes)
+            recorder = self._dispatcher.recorder
+            if self._snapshots is not None and recorder is not None:
+                changes = self._snapshots.changes(attributes, hashes)
+                if changes:
+                    changed = json.dumps(changes, separators=(",", ":"), sort_keys=True)
+                    recorder.state(self._handle.entity_id, self._dispatcher.loop.now_ns, changed)
+        return hash64(text.encode("utf-8", "surrogatepass")) or 1
+
+    def _hashes(self, attributes: dict[str, Any]) -> tuple[dict[str, int], str]:
+        """Return the hash of each attribute, and all of them as a text."""
+        last, hashes, parts = self._last, {}, []
+        for name, value in attributes.items():
+            before = last.get(name)
+            if before is not None and before[0] is value:  # it never changes, and has not been set
+                _, digest, part = before
+            else:
+                digest = self._hasher.digest(value, name)
+                part = f"{name}={digest:x};"
+                if type(value) in UNCHANGING:
+                    last[name] = value, digest, part
+            hashes[name] = digest
+            parts.append(part)
+        return hashes, "".join(parts)
+
+    def _attributes(self, node: Any) -> dict[str, Any]:
+        hook = getattr(node, "rsltrace_state", None)
+        if callable(hook):
+            state = hook()
+            return dict(state) if isinstance(state, dict) else {"rsltrace_state()": state}
+        own, parameters = vars(node), node._parameters
+        names = [*own, None, *parameters]
+        if names != self._names:
+            rclpys = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
+            self._names = names
+            shown = {name: (name, False) for name in own if name not in rclpys}
+            shown.update({f"parameter {name}": (name, True) for name in parameters})
+            self._shown = dict(sorted(shown.items()))
+        return {
+            as_shown: parameters[name].value if is_parameter else own[name]
+            for as_shown, (name, is_parameter) in self._shown.items()
+        }
+
+
+def own_attributes(node: Any) -> dict[str, Any]:
+    """Return a node's attributes, except for those that rclpy gave it, and its parameters."""
+    rclpys = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
+    found = {name: value for name, value in vars(node).items() if name not in rclpys}
+    found.update({f"parameter {name}": one.value for name, one in node._parameters.items()})
+    return dict(sorted(found.items()))
+
+
+class NodeStates:
+    """The states of the nodes of one run; ``policy`` is that of nodes without their own."""
+
+    def __init__(self) -> None:
+        self.policy = Policy()
+        self.by_node: dict[str, NodeState] = {}
+
+    def add(self, handle: Any) -> NodeState | None:
+        """Return the state of a new node, or None if it is not hashed."""
+        wanted = (handle.policy or self.policy).state
+        if not wanted:
+            return None
+        state = NodeState(handle.dispatcher, handle, keeps=wanted == "record")
+        self.by_node[handle.key] = state
+        return state
+
+
+@lru_cache(maxsize=256)
+def _attributes_of_rclpy(kind: type) -> frozenset[str]:
+    """Return the attributes that rclpy's own classes set on a node of this class."""
+    return frozenset(
+        name
+        for cls in kind.__mro__
+        if cls.__module__.partition(".")[0] in ("rclpy", "rsltrace")
+        for function in vars(cls).values()
+        if isinstance(function, FunctionType)
+        for name in _stored_on_self(function.__code__)
+    )
+
+
+def _stored_on_self(code: CodeType) -> Iterator[str]:
+    before = None
+    for instruction in dis.get_instructions(code):
+        # Python 3.13 loads the value and self in one instruction.
+        if (
+            instruction.opname == "STORE_ATTR"
+            and before is not None
+            and before.opname.startswith("LOAD_FAST")
+            and "self" in str(before.argval)
+        ):
+            yield str(instruction.argval)
+        before = instruction

@@ -1,0 +1,207 @@
+"""Publishers and subscriptions: messages of rclpy to bytes, and back for each callback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+from rsltrace.adapters.rclpy.handles.entity_handle import EntityHandle, ReceiverHandle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
+from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.code_lines import CallSites
+from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.wire.interfaces import message_type
+from rsltrace.errors import UnsupportedError
+from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.qos.policies import Qos
+from rsltrace.simulation.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
+
+
+class PublisherHandle(EntityHandle, Publisher):
+    """Stands in for ``_rclpy.Publisher``."""
+
+    lists = "publishers"
+
+    def __init__(self, node: NodeHandle, msg_type: Any, topic: str, qos: Any) -> None:
+        resolved = node.resolve(topic, service=False)
+        codec = codec_for(msg_type)
+        self.msg_type = msg_type
+        self.stacks = node.stacks
+        self._serialize = codec.serialize
+        self._canonical = codec.canonical
+        profile = qos if isinstance(qos, Qos) else qos_of(qos)
+        domain = node.stacks.domain
+        Publisher.__init__(self, domain.transport, node, resolved, message_type(msg_type), profile)
+        self._event = node.dispatcher.event
+        self._sites = CallSites(node.dispatcher, self.entity_id)
+        domain.graph.add_publisher(self)
+
+    def publish(self, msg: Any) -> None:
+        """Publish a message: a snapshot of it goes to every connected subscription."""
+        serialize = self._serialize  # as elsewhere: Python calls what is in a variable sooner
+        data = serialize(msg)
+        sites = self._sites
+        if self._count == sites.due or self._event.entity != sites.running:
+            sites.look(self._count)
+        self.send(data)
+
+    def publish_raw(self, data: bytes) -> None:
+        """Publish a serialized message, in canonical form.
+
+        :raises ValueError: if the bytes are not a message of this topic's type.
+        """
+        data = self._canonical(data)
+        self._sites.look(self._count)
+        self.send(data)
+
+    def refuse(self, refusal: Callable[[object], NoReturn]) -> None:
+        """Publish nothing any more: ``refusal`` raises what rclpy raises then. It takes the place
+        of what serializes, so that no publication has to ask first."""
+        self._serialize = self._canonical = refusal
+
+    def get_topic_name(self) -> str:
+        """Return the resolved topic."""
+        return self.topic
+
+    def get_subscription_count(self) -> int:
+        """Count the connected subscriptions."""
+        self.node.require_up("failed to get subscription count")
+        return len(self.subscriptions)
+
+    def wait_for_all_acked(self, timeout: Any) -> bool:
+        """Wait in simulated time until what was sent has reached every reliable subscription.
+
+        Returns whether it has; without links it has at once.
+        """
+        limit_ns: int = timeout.nanoseconds
+        left_ns = self.acknowledged_ns() - self.stacks.loop.now_ns
+        if left_ns <= 0 or limit_ns == 0:
+            return left_ns <= 0
+        acked = limit_ns < 0 or left_ns <= limit_ns
+        wait(self.stacks, "its messages to be acknowledged", for_ns=left_ns if acked else limit_ns)
+        return acked
+
+    settle, trace_name = Publisher.settle, Publisher.trace_name
+
+
+class SubscriptionHandle(ReceiverHandle, Subscription):
+    """Stands in for ``_rclpy.Subscription``."""
+
+    lists = "subscriptions"
+
+    def __init__(
+        self,
+        node: NodeHandle,
+        msg_type: Any,
+        topic: str,
+        qos: Any,
+        content_filter: Any = None,
+    ) -> None:
+        resolved = node.resolve(topic, service=False)
+        if content_filter is not None:
+            self._refuse_filter(resolved, content_filter[0])
+        self._deserialize = codec_for(msg_type).deserialize
+        self.msg_type = msg_type
+        self.stacks = node.stacks
+        self._real = node.real
+        self._callback: Any = None
+        self._coroutine = False
+        self._with_info = False
+        graph = node.stacks.domain.graph
+        profile = graph.settled_request(resolved, qos_of(qos))
+        Subscription.__init__(
+            self, node.dispatcher, node, resolved, message_type(msg_type), profile
+        )
+        graph.add_subscription(self)
+
+    def dispatch(self) -> None:
+        """Take the oldest message and run the callback with a copy of its own."""
+        if not self.may_run():
+            return
+        wrapper = self.wrapper
+        _, _, _, _, data, event, position, digest, _, _ = delivery = self.queue.popleft()
+        callback = wrapper._callback
+        if callback is not self._callback:
+            self._learn(wrapper)
+        deserialize = self._as_received if wrapper.raw else self._deserialize
+        message = deserialize(data)
+        args = (message, _message_info(delivery)) if self._with_info else (message,)
+        if self._coroutine:
+            start_callback(self.stacks, self, SUBSCRIPTION, callback, args, event, position, digest)
+            return
+        self.dispatcher.execute(
+            self, self.entity_id, self.node, SUBSCRIPTION, callback, args, event, position, digest
+        )
+
+    def _as_received(self, data: bytes) -> bytes:
+        """Return the bytes that Fast DDS gives: between processes, their number is padded to four.
+
+        Each entry of a job stands for a process.
+        """
+        own = self.node
+        if self.publishers and all(
+            other.node.process is own.process
+            and getattr(other.node, "entry_key", None) == own.entry_key
+            for other in self.publishers
+        ):
+            return data
+        return data + bytes(-len(data) % 4)
+
+    def _learn(self, wrapper: Any) -> None:
+        """Look at a callback once, when it is new; users may exchange it."""
+        self._callback = wrapper._callback
+        self._coroutine = is_awaited(self.stacks, wrapper._callback)
+        self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
+
+    def forget_callback(self) -> None:
+        """Look at the callback once more: it may be run in another way from now on."""
+        self._callback = None
+
+    def take_message(self, msg_type: Any, raw: bool) -> Any:
+        """Take a message by hand, as a wait set would; None if there is none."""
+        if not self.queue:
+            return None
+        delivery = self.queue.popleft()
+        data = delivery[4]
+        message = self._as_received(data) if raw else codec_for(msg_type).deserialize(data)
+        return message, _message_info(delivery)
+
+    def get_topic_name(self) -> str:
+        """Return the resolved topic."""
+        return self.topic
+
+    def is_cft_enabled(self) -> bool:
+        """Return False: there are no content filters."""
+        return False
+
+    def set_content_filter(self, expression: str, parameters: list[str]) -> None:
+        """Refuse: DDS's filter language is not spoken here (ROS 2 Kilted and later)."""
+        self._refuse_filter(self.topic, expression)
+
+    def _refuse_filter(self, topic: str, expression: str) -> None:
+        raise UnsupportedError(
+            f"the subscription of {topic} has a content filter ({expression!r}), which cannot "
+            "be simulated by this version of rsltrace: compare in the callback instead"
+        )
+
+    def get_content_filter(self) -> Any:
+        """Refuse, as rclpy does for a subscription without a content filter."""
+        raise self._real.RCLError("content filter topic is not enabled")
+
+    def get_publisher_count(self) -> int:
+        """Count the connected publishers."""
+        return len(self.publishers)
+
+    trace_name = Subscription.trace_name
+
+
+def _message_info(delivery: Delivery) -> dict[str, int | None]:
+    """Return the MessageInfo dictionary that rclpy 7 passes to callbacks."""
+    return {
+        "source_timestamp": delivery[8],
+        "received_timestamp": delivery[0],
+        "publication_sequence_number": delivery[9],
+        "reception_sequence_number": None,
+    }

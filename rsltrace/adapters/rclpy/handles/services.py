@@ -1,0 +1,264 @@
+"""Services and clients: requests and responses of rclpy to bytes, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.adapters.rclpy.handles.introspection import (
+    REQUEST_RECEIVED,
+    REQUEST_SENT,
+    RESPONSE_RECEIVED,
+    RESPONSE_SENT,
+    ServiceEvents,
+    reconfigured,
+)
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of, qos_of
+from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, Functions
+from rsltrace.adapters.rclpy.stacks.tasks import (
+    executor_of,
+    is_awaited,
+    is_coroutine_function,
+    start_coroutine,
+)
+from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.wire.interfaces import service_type
+from rsltrace.adapters.rclpy.wire.type_descriptions import answer
+from rsltrace.simulation.middleware.graph import Graph
+from rsltrace.simulation.middleware.services import (
+    CLIENT,
+    SERVICE,
+    Client,
+    RequestId,
+    Service,
+    ServiceEnd,
+    ServiceInfo,
+)
+
+
+class ServiceEndHandle(ReceiverHandle, ServiceEnd):
+    """What the handles of a client and of a server have in common."""
+
+    def _prepare(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> tuple[Any, ...]:
+        """Set what rclpy's side needs; return what the middleware is given."""
+        service = node.resolve(name, service=True)
+        self._request = codec_for(srv_type.Request)
+        self._response = codec_for(srv_type.Response)
+        self.srv_type = srv_type
+        self.stacks = node.stacks
+        self._service_events: ServiceEvents | None = None
+        return node.stacks.domain.transport, node, service, service_type(srv_type), qos_of(qos)
+
+    def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
+        """Publish what is sent and received from now on, or no longer."""
+        self._service_events = reconfigured(self._service_events, self, clock, qos, state)
+
+    def _tell(self, event_type: int, request_id: RequestId, message: Any) -> None:
+        """Publish a service event, if introspection is on."""
+        if self._service_events is not None:
+            self._service_events.publish(event_type, request_id, message)
+
+    trace_name = ServiceEnd.trace_name
+
+    def _destroy(self) -> None:
+        super()._destroy()
+        if self._service_events is not None:
+            self._service_events.close()
+
+
+class ServiceHandle(ServiceEndHandle, Service):
+    """Stands in for ``_rclpy.Service``."""
+
+    lists = "services"
+
+    def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
+        Service.__init__(self, *self._prepare(node, srv_type, name, qos))
+        node.stacks.domain.graph.add_service(self)
+
+    @property
+    def name(self) -> str:
+        """The resolved service name."""
+        return self.service
+
+    @property
+    def qos(self) -> dict[str, Any]:
+        """The QoS profile as rclpy's lifecycle nodes ask for it."""
+        return profile_of(self.profile)
+
+    def dispatch(self) -> None:
+        """Take the oldest request, run the callback and send what it returns."""
+        if not self.may_run():
+            return
+        data, event, position, digest, header = self.queue.popleft()
+        request = self._request.deserialize(data)
+        wrapper = self.wrapper
+        if is_awaited(self.stacks, wrapper.callback):
+            start_coroutine(
+                self.stacks,
+                self,
+                SERVICE,
+                self._serve_async,
+                (request, header),
+                event,
+                position,
+                digest,
+            )
+            return
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            SERVICE,
+            self._serve,
+            (request, header),
+            event,
+            position,
+            digest,
+        )
+
+    def _serve(self, request: Any, header: ServiceInfo) -> None:
+        wrapper = self.wrapper
+        if self._service_events is not None:
+            self._tell(REQUEST_RECEIVED, header.request_id, request)
+        response = wrapper.callback(request, self.srv_type.Response())
+        wrapper.send_response(response, header)
+
+    async def _serve_async(self, request: Any, header: ServiceInfo) -> None:
+        from rclpy import executors
+
+        wrapper = self.wrapper
+        self._tell(REQUEST_RECEIVED, header.request_id, request)
+        empty = self.srv_type.Response()
+        response = await executors.await_or_execute(wrapper.callback, request, empty)
+        wrapper.send_response(response, header)
+
+    def service_take_request(self, request_type: Any) -> tuple[Any, Any]:
+        """Take a request by hand; ``(None, None)`` if there is none."""
+        if not self.queue:
+            return None, None
+        data, _, _, _, header = self.queue.popleft()
+        request = self._request.deserialize(data)
+        self._tell(REQUEST_RECEIVED, header.request_id, request)
+        return request, header
+
+    def service_send_response(self, response: Any, request_id: RequestId) -> None:
+        """Send a response to the client that asked."""
+        self.respond(self._response.serialize(response), request_id)
+        if self._service_events is not None:
+            self._tell(RESPONSE_SENT, request_id, response)
+
+
+class ClientHandle(ServiceEndHandle, Client):
+    """Stands in for ``_rclpy.Client``."""
+
+    lists = "clients"
+
+    def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
+        Client.__init__(self, *self._prepare(node, srv_type, name, qos))
+        self._sites = CallSites(node.dispatcher, self.entity_id)
+        self._functions = Functions(node.dispatcher)
+        node.stacks.domain.graph.add_client(self)
+
+    @property
+    def service_name(self) -> str:
+        """The resolved service name."""
+        return self.service
+
+    def service_server_is_available(self) -> bool:
+        """Return whether a server is there now."""
+        self.node.require_up("failed to check service availability")
+        return bool(self.servers())
+
+    def send_request(self, request: Any) -> int:
+        """Send a request to every server of that name; without one it is lost, as in DDS."""
+        data = self._request.serialize(request)
+        sites = self._sites
+        if self._sequence == sites.due or self.dispatcher.event.entity != sites.running:
+            sites.look(self._sequence)
+        request_id = self.request(data)
+        if self._service_events is not None:
+            self._tell(REQUEST_SENT, request_id, request)
+        return request_id.sequence_number
+
+    def take_response(self, response_type: Any) -> tuple[Any, Any]:
+        """Take a response by hand; ``(None, None)`` if there is none."""
+        if not self.queue:
+            return None, None
+        data, _, _, _, header = self.queue.popleft()
+        response = self._response.deserialize(data)
+        self._tell(RESPONSE_RECEIVED, header.request_id, response)
+        return header, response
+
+    def dispatch(self) -> None:
+        """Take the oldest response and complete its future."""
+        if not self.may_run():
+            return
+        data, event, position, digest, header = self.queue.popleft()
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            CLIENT,
+            self._complete,
+            (self._response.deserialize(data), header.request_id),
+            event,
+            position,
+            digest,
+        )
+
+    def _complete(self, response: Any, request_id: RequestId) -> None:
+        """Set the result; plain done callbacks belong to this event, coroutines become tasks. Where
+        executors poll, all do, as rclpy has it."""
+        if self._service_events is not None:
+            self._tell(RESPONSE_RECEIVED, request_id, response)
+        try:
+            future = self.wrapper.get_pending_request(request_id.sequence_number)
+        except KeyError:
+            return  # cancelled, or another server was faster
+        executor = executor_of(self.stacks, self)
+        future._set_executor(executor)
+        if self.stacks.loop.polls:
+            future.set_result(response)  # done callbacks are tasks
+            return
+        with future._lock:
+            callbacks, future._callbacks = future._callbacks, []
+        future.set_result(response)
+        for callback in callbacks:
+            self._functions.run(self.entity_id, callback)
+            if is_coroutine_function(callback):
+                executor.create_task(callback, future)
+            else:
+                callback(future)
+
+
+class TypeDescriptionServiceHandle:
+    """Stands in for ``_rclpy.TypeDescriptionService``."""
+
+    def __init__(self, node: NodeHandle) -> None:
+        from rclpy.impl.implementation_singleton import rclpy_implementation as boundary
+        from type_description_interfaces.srv import GetTypeDescription
+
+        profile = boundary.rmw_qos_profile_t.predefined("qos_profile_services_default")
+        self._graph = node.stacks.domain.graph
+        self.impl = ServiceHandle(node, GetTypeDescription, "~/get_type_description", profile)
+
+    def handle_request(self, request: Any, response_type: Any, node: Any) -> Any:
+        """Describe an interface that one of the node's endpoints uses."""
+        return answer(request, response_type, _interfaces_of(self._graph, node))
+
+    def destroy_when_not_in_use(self) -> None:
+        """Destroy the service, unless the node has done so already."""
+        self.impl.destroy_when_not_in_use()
+
+
+def _interfaces_of(graph: Graph, node: Any) -> Iterator[Any]:
+    """Yield the classes of the messages, services and actions that a node uses."""
+    for end in graph.endpoints_of(node):
+        if isinstance(end, PublisherHandle | SubscriptionHandle):
+            yield end.msg_type
+        elif isinstance(end, ServiceEndHandle):
+            yield end.srv_type
+    yield from (action.action_type for action in node.actions)

@@ -1,0 +1,158 @@
+"""The handle of ``rclpy.Timer``."""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+from rsltrace.adapters.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
+from rsltrace.simulation.middleware.timer import TIMER, Timer
+from rsltrace.trace.model.event import NO_EVENT
+
+
+class TimerHandle(EntityHandle, Timer):
+    """Stands in for ``_rclpy.Timer``. It runs once the node that lists it is being run."""
+
+    lists = "timers"
+
+    def __init__(self, real: Any, stacks: Stacks, period_ns: int, autostart: bool) -> None:
+        if period_ns < 0:
+            raise real.RCLError("timer period must be non-negative")
+        self.stacks = stacks
+        self._real = real
+        self._callback: Any = None
+        self._coroutine = False
+        self._info: str | None = None
+        Timer.__init__(self, stacks.dispatcher, None, int(period_ns), canceled=not autostart)
+
+    activate = Timer.activate
+
+    def deactivate(self) -> None:
+        super().deactivate()
+        self.dispatcher.loop.timers.remove(self.state)
+
+    def dispatch(self) -> None:
+        """Run the callback of a timer that is due, and move it to its next deadline."""
+        wrapper = self.wrapper
+        dispatcher = self.dispatcher
+        loop = dispatcher.loop
+        state = self.state
+        mailbox = self.node.mailbox
+        if mailbox is not None:
+            if mailbox.keeps(self, self._leave):
+                return
+            if wrapper is None or state.canceled or state.deadline_ns > loop.now_ns:
+                return
+            loop.timers.add(state)
+        group = wrapper.callback_group
+        if self.own_group:
+            if not self.stacks.groups.enter(self, wrapper, self.activate):
+                loop.timers.remove(state)
+                return
+        elif getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
+            loop.timers.remove(state)
+            self.stacks.groups.park(group, self, self.activate)
+            return
+        callback = wrapper.callback
+        if callback is not self._callback:
+            self._callback = callback
+            self._coroutine = is_awaited(self.stacks, callback)
+            self._info = _info_parameter(callback)
+        digest = self.deadline_hash()
+        if self._info is not None:
+            callback = partial(callback, **{self._info: self._timer_info()})
+        state.call(loop.now_ns)
+        loop.timers.ran(state)
+        if self._coroutine:
+            start_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
+        else:
+            dispatcher.execute(
+                self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
+            )
+
+    def forget_callback(self) -> None:
+        """Look at the callback once more: it may be run in another way from now on."""
+        self._callback = None
+
+    def _leave(self) -> None:
+        self.dispatcher.loop.timers.remove(self.state)
+
+    def _timer_info(self) -> Any:
+        from rclpy.timer import TimerInfo
+
+        return TimerInfo(
+            expected_call_time=self.state.deadline_ns,
+            actual_call_time=self.dispatcher.loop.now_ns,
+            clock_type=self.wrapper.clock.clock_type,
+        )
+
+    # -- what rclpy calls ----------------------------------------------------------------------
+
+    def call_timer(self) -> None:
+        """Account for a call made by hand."""
+        if self.state.canceled:
+            raise self._real.RCLError("timer is canceled")
+        self.state.call(self.dispatcher.loop.now_ns)
+        if self.active:
+            self.dispatcher.loop.timers.moved(self.state)
+
+    def call_timer_with_info(self) -> dict[str, int]:
+        """Do ``call_timer`` and say when it was due and when it happened (ns)."""
+        expected_ns = self.state.deadline_ns
+        self.call_timer()
+        return {"expected_call_time": expected_ns, "actual_call_time": self.dispatcher.loop.now_ns}
+
+    def cancel_timer(self) -> None:
+        """Stop; ``reset_timer`` starts again."""
+        self.cancel()
+
+    def reset_timer(self) -> None:
+        """Start a new period now."""
+        self.reset()
+
+    def change_timer_period(self, period_ns: int) -> None:
+        """Set the period; the present deadline stays."""
+        if period_ns < 0:
+            raise self._real.RCLError("timer period must be non-negative")
+        self.set_period(period_ns)
+
+    def get_timer_period(self) -> int:
+        """Return the period in nanoseconds."""
+        return self.state.period_ns
+
+    def is_timer_ready(self) -> bool:
+        """Return whether the timer is due."""
+        return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
+
+    def is_timer_canceled(self) -> bool:
+        """Return whether the timer is cancelled."""
+        return self.state.canceled
+
+    def time_until_next_call(self) -> int | None:
+        """Return nanoseconds to the deadline (negative: overdue), None if cancelled."""
+        if self.state.canceled:
+            return None
+        return self.state.deadline_ns - self.dispatcher.loop.now_ns
+
+    def time_since_last_call(self) -> int:
+        """Return nanoseconds since the last call, or since creation."""
+        return self.dispatcher.loop.now_ns - self.state.last_call_ns
+
+
+def _info_parameter(callback: Any) -> str | None:
+    """Return which parameter of a callback wants a TimerInfo (ROS 2 Kilted and later)."""
+    import rclpy.timer
+
+    wanted = getattr(rclpy.timer, "TimerInfo", None)
+    if wanted is None:
+        return None
+    with suppress(TypeError, ValueError):  # no signature: then it wants none
+        for parameter in inspect.signature(callback).parameters.values():
+            if parameter.annotation == wanted:
+                return parameter.name
+    return None

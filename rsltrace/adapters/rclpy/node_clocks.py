@@ -1,0 +1,97 @@
+"""The clocks of nodes that do not show simulated time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from rsltrace.simulation.chance.clock import ClockModel, WrongClock
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.trace.model.draw import encode_clock
+
+
+@dataclass(frozen=True, slots=True)
+class ClockRule:
+    """What is different about the clocks of nodes (a glob). One that ``advances`` shows a
+    nanosecond more at each look at one time. Of one that ``follows``, /clock sets ROS time."""
+
+    node: str
+    model: ClockModel
+    advances: bool = False
+    follows: bool = False
+
+
+class NodeClocks:
+    """What each node's clock shows. Each has a stream of its own for random jumps; that one has
+    happened is an output of the event in which the clock is read next."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        rules: tuple[ClockRule, ...],
+        *,
+        seed: int,
+        start_ns: int,
+    ) -> None:
+        self._domain = domain
+        self._seed = seed
+        self._rules = rules
+        self._start_ns = start_ns
+        self._clocks: dict[str, WrongClock | None] = {}
+        self._rule_of: dict[str, ClockRule | None] = {}
+        self._ahead: dict[str, tuple[int, int]] = {}
+        """Of a clock that advances: the time of the last look, and how far ahead it was."""
+
+    def shows(self, node: str | None, now_ns: int) -> int:
+        """Return what the clock of ``node`` (None: nobody's) shows at simulated time ``now_ns``."""
+        if node is None:
+            return now_ns
+        if node not in self._clocks:
+            rule = self._rule(node)
+            self._clocks[node] = None
+            if rule is not None:
+                stream = Stream(self._seed, f"clock\0{node}")
+                self._clocks[node] = WrongClock(rule.model, stream, self._start_ns)
+        clock = self._clocks[node]
+        if clock is None:
+            return now_ns
+        if self._domain.event.handle is not None and (by_ns := clock.set_since(now_ns)):
+            self._note(node, by_ns)
+        return clock.shows(now_ns)
+
+    def follows(self, node: str | None) -> bool:
+        """Return whether /clock (or who sets it by hand) drives the ROS time of a node."""
+        rule = self._rule(node or "")
+        return rule is not None and rule.follows
+
+    def advances(self, node: str | None) -> bool:
+        """Return whether a ROS clock of a node shows more at each look."""
+        rule = self._rule(node or "")
+        return rule is not None and rule.advances
+
+    def look(self, node: str | None, now_ns: int) -> int:
+        """Return what a ROS clock of ``node`` shows to who looks at it now."""
+        shown_ns, name = self.shows(node, now_ns), node or ""
+        if not self.advances(name):
+            return shown_ns
+        before_ns, ahead_ns = self._ahead.get(name, (-1, 0))
+        if before_ns != now_ns:
+            ahead_ns = 0
+        else:
+            next_ns = self._domain.loop.later_ns()
+            if next_ns is None or now_ns + ahead_ns + 1 < next_ns:
+                ahead_ns += 1
+        self._ahead[name] = now_ns, ahead_ns
+        return shown_ns + ahead_ns
+
+    def _rule(self, node: str) -> ClockRule | None:
+        """Return what is different about a node's clock; "" is code of no node."""
+        if node not in self._rule_of:
+            rules = (rule for rule in self._rules if fnmatchcase(node, rule.node))
+            self._rule_of[node] = next(rules, None)
+        return self._rule_of[node]
+
+    def _note(self, node: str, by_ns: int) -> None:
+        for handle in self._domain.graph.nodes_named(node):
+            self._domain.dispatcher.draw(handle.entity_id, encode_clock(by_ns))

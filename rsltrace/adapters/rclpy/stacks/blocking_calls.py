@@ -1,0 +1,193 @@
+"""Calls that block become simulated waiting: time passes, other callbacks run, then they return.
+
+In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RESUME`` event. How the
+stacks take turns is in ``runners.py``.
+"""
+
+from __future__ import annotations
+
+import os
+from _thread import get_ident
+from asyncio import _get_running_loop, _set_running_loop
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, NoReturn
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.adapters.rclpy.stacks import callback_groups as groups
+from rsltrace.adapters.rclpy.stacks.runners import Patience, RunEnded, Wait
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.errors import UnsupportedError
+from rsltrace.guard.redirect import copy_of
+from rsltrace.trace.model.event import EventFlag, EventKind
+
+POLL_NS = 1_000_000
+"""What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
+
+_RESUME = int(EventKind.RESUME)
+_SUSPENDED = int(EventFlag.SUSPENDED)
+getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
+_PATIENCE = 100
+"""How often a stack may go on to wait after the end of the run before it is left where it is."""
+
+# Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
+# be collected: that would raise in them once more.
+_abandoned: list[greenlet] = []
+
+
+def wait(
+    stacks: Stacks,
+    what: object,
+    *,
+    until: Callable[[Wait], None] | None = None,
+    for_ns: int | None = None,
+    quiet: bool = False,
+    patient: Patience = False,
+    serve: Callable[..., bool] | None = None,
+) -> bool:
+    """Block the present callback in simulated time; return whether it was woken (not timed out).
+
+    ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
+    wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
+    something comes of it. A ``patient`` one may last for ever. ``serve`` runs on this stack what is
+    given to it meanwhile, and returns whether the wait is over by that.
+
+    :raises RunEnded: when the run ends before the wait does.
+    :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
+    """
+    _check_may_wait(stacks, what)
+    group = _hold_group(stacks)
+    blocked = Wait(stacks.runners, what, group, quiet=quiet, patient=patient)
+    if until is not None:
+        until(blocked)
+    if for_ns is not None:
+        blocked.deadline_ns = stacks.loop.now_ns + stacks.ending.grace_ns + max(for_ns, 0)
+        stacks.loop.schedule(blocked.deadline_ns, blocked.time_out)
+    _end_stretch(stacks)
+    stacks.runners.blocked[blocked] = None
+    stacks.event.on_end = None
+    stacks.programs.leave()
+    running = _get_running_loop()
+    if running is not None:  # asyncio keeps one per thread, here each stack has its own
+        _set_running_loop(None)
+    given = stacks.runners.next().switch()
+    if given and serve is not None and serve(*given):
+        blocked.stop_waiting()
+        blocked.resumed()
+        return True
+    if running is not None:
+        _set_running_loop(running)
+    stacks.runners.blocked.pop(blocked, None)
+    blocked.stop_waiting()
+    blocked.resumed()
+    if stacks.ending.unwinding:
+        raise RunEnded
+    if blocked.error is not None:
+        error, blocked.error = blocked.error, None
+        raise error
+    return not blocked.timed_out
+
+
+def _check_may_wait(stacks: Stacks, what: object) -> None:
+    """Refuse where there is no stack that can be set aside, and when the run is over."""
+    if get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
+        place = "thread" if getpid() == stacks.runners.process else "process"
+        raise UnsupportedError(
+            f"a {place} that a node has started waits for {what}, which takes simulated time: only "
+            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
+            f"there, or let a callback wait and hand the result to the {place}"
+        )
+    if stacks.ending.unwinding or stacks.programs.present.ended:
+        _refuse(stacks)
+    if stacks.event.handle is None:
+        raise UnsupportedError(
+            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
+            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
+        )
+
+
+def _end_stretch(stacks: Stacks) -> None:
+    """Record the event under way as one that will go on, unless it is quiet and said nothing."""
+    event = stacks.event
+    if event.quiet and not stacks.dispatcher.has_outputs():
+        event.quiet = False
+        event.flags = 0
+        return
+    event.flags |= _SUSPENDED
+    stacks.dispatcher.end_event()
+
+
+@contextmanager
+def set_aside(stacks: Stacks) -> Iterator[None]:
+    """Let other events run on this stack, between two parts of the event under way."""
+    event, programs, dispatcher = stacks.event, stacks.programs, stacks.dispatcher
+    whose = event.handle, event.entity, event.node
+    constructing, on_end = programs.constructing, event.on_end
+    _end_stretch(stacks)
+    event.on_end = None
+    try:
+        yield
+    finally:
+        event.handle, event.entity, event.node = whose
+        for observer in dispatcher.node_observers:
+            observer.node_entered(event.node, is_made=False)
+        event.kind, event.input_hash = _RESUME, 0
+        event.cause_event, event.cause_output = stacks.loop.events - 1, 0
+        programs.constructing, event.on_end = constructing, on_end
+        event.quiet = True
+        for observer in dispatcher.resume_observers:
+            observer.resumed()
+
+
+def _refuse(stacks: Stacks) -> NoReturn:
+    """Do not wait any more, the run is over."""
+    lose_patience(stacks)
+    raise RunEnded
+
+
+def abandon(stack: greenlet) -> None:
+    """Leave a stack where it is, for ever: nothing is raised in it, nothing in it is collected."""
+    _abandoned.append(stack)
+
+
+def lose_patience(stacks: Stacks) -> None:
+    """Count that somebody goes on although the run is over; in the end, leave it where it is."""
+    stacks.ending.refused += 1
+    if stacks.ending.refused > _PATIENCE and getcurrent() is not stacks.runners.main:
+        stacks.ending.refused = 0
+        stacks.dispatcher.end_event()
+        abandon(getcurrent())
+        stacks.programs.host.enter()
+        assert stacks.runners.main is not None
+        stacks.runners.main.switch()
+
+
+def _hold_group(stacks: Stacks) -> object:
+    """Keep the callback's group busy while it is blocked, as an executor would; return it."""
+    event = stacks.event
+    wrapper: Any = getattr(event.handle, "wrapper", None)
+    group = getattr(wrapper, "callback_group", None)
+    if (
+        event.on_end is None
+        and group is not None
+        and not groups.is_custom(group)  # that of a callback is held already
+        and not groups.is_busy(group, wrapper)
+    ):
+        groups.begin(group, wrapper)
+        event.on_end = lambda: stacks.groups.end(group, wrapper)
+    return group
+
+
+def end_blocked(stacks: Stacks) -> None:
+    """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
+    stacks.ending.unwinding = True
+    stacks.loop.halt()
+    here = getcurrent()
+    for blocked in list(stacks.runners.blocked):
+        stacks.runners.waiting.append(here)
+        blocked.stack.switch()
+    for runner in stacks.runners.waiting:
+        if runner is not here and not runner.dead:
+            runner.throw(RunEnded)
+    stacks.runners.waiting.clear()

@@ -1,0 +1,322 @@
+"""Locks for threads that are none: who finds one taken waits in simulated time.
+
+``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks;
+with these in their place all of them work. A lock that is free costs no more than a flag. Outside
+of a run, and in real threads, real locks are made.
+"""
+
+from __future__ import annotations
+
+import _thread
+import atexit
+import os
+import sys
+import threading
+import weakref
+from collections import deque
+from typing import Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.runners import Wait
+from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.errors import UnsupportedError
+from rsltrace.trace.model.stamp import patience_ns
+
+_real_rlock = _thread.RLock
+
+
+_LAST: Any = object()
+
+
+def _no_stack() -> Any:
+    """Stand in for ``getcurrent`` while Python ends: greenlet is over by then, but objects of nodes
+    may still lock something when they go (``__del__``, handlers of ``logging``)."""
+    return _LAST
+
+
+@atexit.register
+def _forget_stacks() -> None:
+    global getcurrent
+    getcurrent = _no_stack
+
+
+class SimLock:
+    """Stands in for ``threading.Lock``.
+
+    As in CPython, a release wakes who has waited longest, and whoever runs may take the lock again
+    before that one comes. It then waits on, and is not overtaken a second time.
+    """
+
+    __slots__ = ("__weakref__", "_called", "_owner", "_taken", "_waits")
+
+    def __new__(cls) -> Any:
+        return _thread.allocate_lock() if simulated_stacks() is None else object.__new__(cls)
+
+    def __init__(self) -> None:
+        self._taken = False
+        self._owner: greenlet | None = None
+        self._waits: deque[tuple[Wait, bool]] = deque()
+        """Who waits, and whether it has been overtaken."""
+        self._called: Wait | None = None
+        """Who was woken by a release and has not come yet."""
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock, waiting for it if need be; return whether it is ours now."""
+        if not self._taken:
+            self._taken = True
+            self._owner = getcurrent()
+            return True
+        if not blocking:
+            if timeout != -1:
+                raise ValueError("can't specify a timeout for a non-blocking call")
+            return False
+        if timeout != -1 and timeout < 0:
+            raise ValueError("timeout value must be a non-negative number")
+        return self._wait(timeout)
+
+    def _wait(self, timeout: float) -> bool:
+        stacks = simulated_stacks()
+        if stacks is None and getcurrent is _no_stack:
+            return True  # nobody else is left who could have it
+        if stacks is None:
+            raise UnsupportedError(
+                "a real thread, or code outside of a run, waits for a lock of the simulation"
+            )
+        in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
+        now_ns = stacks.loop.now_ns
+        until_ns = None if timeout == -1 else now_ns + patience_ns(timeout)
+        overtaken = False
+        while True:
+            for_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
+            what = _Holder(stacks, self._owner, for_work=in_condition)
+            if not self._turn(stacks, what, for_ns, overtaken=overtaken):
+                return False
+            if overtaken or not self._taken:  # left taken for us, or free
+                self._taken = True
+                self._owner = getcurrent()
+                return True
+            overtaken = True
+
+    def _turn(self, stacks: Stacks, what: _Holder, for_ns: int | None, *, overtaken: bool) -> bool:
+        """Wait until a release calls; return whether one did before the time was up."""
+        mine: list[Wait] = []
+
+        def join(blocked: Wait) -> None:
+            mine.append(blocked)
+            (self._waits.appendleft if overtaken else self._waits.append)((blocked, overtaken))
+
+        came = False
+        try:
+            came = wait(stacks, what, until=join, for_ns=for_ns, patient=what.is_idle)
+        finally:
+            called = bool(mine) and self._called is mine[0]
+            if called:
+                self._called = None
+            if not came:
+                self._waits = deque(one for one in self._waits if one[0].waiting)
+                if called and (overtaken or not self._taken):  # raised in: the next one may have it
+                    self._taken = True
+                    self.release()
+        return came
+
+    def release(self) -> None:
+        """Give the lock up, and wake who has waited longest for it."""
+        if not self._taken:
+            raise RuntimeError("release unlocked lock")
+        self._owner = None
+        self._taken = False
+        while self._waits and self._called is None:
+            blocked, overtaken = self._waits.popleft()
+            if blocked.waiting:
+                self._called = blocked
+                self._taken = overtaken
+                blocked.wake()
+
+    def locked(self) -> bool:
+        """Return whether somebody has the lock."""
+        return self._taken
+
+    def is_mine(self) -> bool:
+        """Return whether the calling stack has the lock."""
+        return self._taken and self._owner is getcurrent()
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *exc: object) -> None:
+        self.release()
+
+    def _at_fork_reinit(self) -> None:
+        self.__init__()  # type: ignore[misc]
+
+
+class LockOfPools:
+    """Stands in for the lock that all thread pools of a process share (``concurrent.futures``).
+
+    A pool starts a worker while it has it, and the worker runs first: it may well want it, too.
+    Real threads keep ``real``.
+    """
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+        self._own: SimLock = object.__new__(SimLock)
+        self._own.__init__()  # type: ignore[misc]
+
+    def __enter__(self) -> bool:
+        return bool((self._real if simulated_stacks() is None else self._own).acquire())
+
+    def __exit__(self, *exc: object) -> None:
+        (self._own if self._own.is_mine() else self._real).release()
+
+
+class SimRLock:
+    """Stands in for ``threading.RLock``: whoever has it may take it again."""
+
+    __slots__ = ("__weakref__", "_count", "_lock", "_owner")
+
+    def __new__(cls) -> Any:
+        return _real_rlock() if simulated_stacks() is None else object.__new__(cls)
+
+    def __init__(self) -> None:
+        self._lock = SimLock()
+        self._owner: greenlet | None = None
+        self._count = 0
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock once more, waiting for it if somebody else has it."""
+        me = getcurrent()
+        if self._owner is me:
+            self._count += 1
+            return True
+        if not self._lock.acquire(blocking, timeout):
+            return False
+        self._owner = me
+        self._count = 1
+        return True
+
+    def release(self) -> None:
+        """Give the lock up once."""
+        if self._owner is not getcurrent():
+            raise RuntimeError("cannot release un-acquired lock")
+        self._count -= 1
+        if not self._count:
+            self._owner = None
+            self._lock.release()
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *exc: object) -> None:
+        self.release()
+
+    # What Condition asks of a lock.
+
+    def _is_owned(self) -> bool:
+        return self._owner is getcurrent()
+
+    def _release_save(self) -> tuple[int, greenlet | None]:
+        state = self._count, self._owner
+        self._count, self._owner = 0, None
+        self._lock.release()
+        return state
+
+    def _acquire_restore(self, state: tuple[int, greenlet | None]) -> None:
+        self._lock.acquire()
+        self._count, self._owner = state
+
+    def _recursion_count(self) -> int:
+        return self._count if self._is_owned() else 0
+
+    def _at_fork_reinit(self) -> None:
+        self.__init__()  # type: ignore[misc]
+
+
+# -- in a forked process --------------------------------------------------------------------------
+
+_making = _thread.allocate_lock()
+_real: weakref.WeakKeyDictionary[SimLock, Any] = weakref.WeakKeyDictionary()
+
+
+def _real_of(lock: SimLock, *, anew: bool = False) -> Any:
+    with _making:
+        found = None if anew else _real.get(lock)
+        if found is None:
+            found = _real[lock] = _thread.allocate_lock()
+            if lock._taken and not anew:
+                found.acquire()
+        return found
+
+
+def _acquire(self: SimLock, blocking: bool = True, timeout: float = -1) -> bool:
+    return bool(_real_of(self).acquire(blocking, timeout))
+
+
+def _release(self: SimLock) -> None:
+    _real_of(self).release()
+
+
+def _locked(self: SimLock) -> bool:
+    return bool(_real_of(self).locked())
+
+
+def _reinit(self: SimLock) -> None:
+    _real_of(self, anew=True)
+
+
+def _become_real() -> None:
+    """Have the locks of the simulation lock real threads: a forked process has no others.
+
+    A condition keeps bound methods of its lock, so it is their code that is exchanged.
+    """
+    if world_exists():
+        kind: Any = SimLock
+        for name, real in (
+            ("acquire", _acquire),
+            ("release", _release),
+            ("locked", _locked),
+            ("_at_fork_reinit", _reinit),
+        ):
+            getattr(kind, name).__code__ = real.__code__
+
+
+os.register_at_fork(after_in_child=_become_real)
+
+
+class _Holder:
+    """Says who has a lock, when somebody asks: for the report of a deadlock."""
+
+    def __init__(self, stacks: Stacks, owner: greenlet | None, *, for_work: bool) -> None:
+        self._stacks = stacks
+        self._owner = owner
+        self._me = getcurrent()
+        self._for_work = for_work
+
+    def is_idle(self) -> bool:
+        """Say whether a thread waits for work (a queue, an event) that may never come.
+
+        So does a main that leaves the work to threads which spin.
+        """
+        stacks = self._stacks
+        if not self._for_work or stacks.threads.runs_on(self._me):
+            return self._for_work
+        program = stacks.programs.on_stack(self._me)
+        return program is not None and any(
+            blocked.quiet and blocked.program is program and blocked.stack is not self._me
+            for blocked in stacks.runners.blocked
+        )
+
+    def __str__(self) -> str:
+        if self._for_work:
+            return "somebody to wake it (an event, a condition, a queue, a future)"
+        if self._owner is self._me:
+            return "a lock that it holds itself"
+        for blocked in self._stacks.runners.blocked:
+            if blocked.stack is self._owner:
+                return f"a lock that is held by {blocked.describe()}"
+        return "a lock that nobody will release"
+
+
+__all__ = ["LockOfPools", "SimLock", "SimRLock"]

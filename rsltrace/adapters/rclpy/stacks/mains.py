@@ -1,0 +1,261 @@
+"""How a main begins and ends: by returning, by ``sys.exit``, by an exception, or with the run.
+
+When the run is over, every main that still waits is told as ``ros2 launch`` tells a node: its
+contexts are shut down and the call that blocks raises ``KeyboardInterrupt``. What it does then
+(``finally`` blocks, joining threads) runs to its end, while simulated time stands still.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.adapters.rclpy.error_text import exit_status
+from rsltrace.adapters.rclpy.stacks.construction import Construction
+from rsltrace.adapters.rclpy.stacks.exit_handlers import run_exit_handlers
+from rsltrace.adapters.rclpy.stacks.program import Program
+from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Wait
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.threads import SimThread
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.model.stamp import format_seconds
+
+_EVERY_MAIN_ENDED = "every main has ended"
+_INTERRUPTED = 130
+"""What a shell shows of a process that SIGINT, and so ``KeyboardInterrupt``, has ended."""
+
+
+def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO_EVENT, 0)) -> None:
+    """Run a main until it ends or blocks for the first time, as one event; ``cause`` is the event
+    and output that it follows from."""
+    entities = stacks.domain.entities
+    program.begun_ns = stacks.loop.now_ns
+    program.entity_id = entities.new_id()
+    entities.pending.append(program)
+
+    def body() -> None:
+        program.enter()
+        event = Construction(program.describe, program.entry)
+        stacks.dispatcher.run_outside(
+            event,
+            EventKind.CONSTRUCT,
+            program.entity_id,
+            None,
+            lambda: _run(stacks, program),
+            cause,
+        )
+        stacks.programs.host.enter()
+        stacks.runners.step_aside()
+
+    stacks.runners.waiting.append(getcurrent())
+    program.stack = greenlet(body)
+    program.stack.switch()
+
+
+def _run(stacks: Stacks, program: Program) -> None:
+    assert program.entry is not None
+    error: BaseException | None = None
+    stacks.programs.tell("started", program.entry.key)
+    try:
+        status = program.entry.make()
+        if status is not None:  # a console script is sys.exit(main())
+            raise SystemExit(status)
+    except BaseException as raised:
+        error = raised
+    try:
+        _finish_process(stacks, program, error)
+    except BaseException as raised:
+        error = raised
+    end_program(stacks, program, error)
+
+
+def end_program(stacks: Stacks, program: Program, error: BaseException | None) -> None:
+    """Do what the end of a process does, within the last event of its main.
+
+    An exception that nobody caught is raised again: it fails the run, except while that ends.
+    """
+    notes = stacks.domain.outcome.notes
+    program.ended = True
+    _stop_threads(stacks, program)
+    failed = _judge(stacks, program, error)
+    idle = [node.fully_qualified_name for node in _nodes(stacks, program) if node.wrapper is None]
+    at = format_seconds(stacks.loop.now_ns)
+    ending = stacks.ending
+    if not (ending.unwinding or ending.closing or failed or program.exit_code):
+        if not program.spun:
+            never = f": no callback of {', '.join(idle)} has run" if idle else ""
+            notes.append(f"{program.label} ended at {at} s without ever spinning{never}")
+        else:
+            notes.append(f"{program.label} ended at {at} s")
+    _vanish(stacks, program)
+    if failed:
+        assert error is not None
+        raise error
+    _has_ended(stacks, program)
+
+
+def _has_ended(stacks: Stacks, program: Program) -> None:
+    """Tell of the end of a process; with the last one the run may be over."""
+    programs = stacks.programs
+    assert program.entry is not None
+    programs.tell("ended", program.entry.key)
+    mains = programs.all
+    alone = not (programs.fed or programs.to_come) and all(
+        node.process in mains for node in stacks.domain.graph.nodes
+    )
+    if alone and stacks.loop.stopped is None and all(other.ended for other in mains):
+        stacks.loop.stop(Stop(_EVERY_MAIN_ENDED))
+
+
+def crash_program(stacks: Stacks, program: Program) -> None:
+    """Let a process be gone in the event under way; nothing of it runs any more (``Victims``)."""
+    for context in program.contexts:
+        context.end()
+    program.ended = True
+    at = format_seconds(stacks.loop.now_ns)
+    stacks.domain.outcome.notes.append(f"{program.label} crashed at {at} s, as the job says")
+    _has_ended(stacks, program)
+
+
+def _finish_process(stacks: Stacks, program: Program, error: BaseException | None) -> None:
+    """Do what Python does when main is over: wait for its threads, run its exit handlers.
+
+    A main that fails ends the run at once instead.
+    """
+    if error is None or isinstance(error, (SystemExit, KeyboardInterrupt)):
+        _wait_for_threads(stacks, program)
+        run_exit_handlers(program)
+
+
+def _wait_for_threads(stacks: Stacks, program: Program) -> None:
+    """Wait for all threads that are no daemons, as a process does when its main has returned; they
+    may start more of them meanwhile."""
+    with contextlib.suppress(RunEnded, KeyboardInterrupt):
+        while True:
+            own = [t for t in stacks.threads.alive if t.program is program and not t.ended]
+            for thread in own:
+                thread.dismiss()
+            if all(thread.daemon for thread in own):
+                break
+            for thread in own:
+                if not thread.daemon:
+                    thread.join(None)
+
+
+def _stop_threads(stacks: Stacks, program: Program) -> None:
+    """Unwind the threads that are left: they end with their process."""
+    for blocked in list(stacks.runners.blocked):
+        if blocked.program is program:
+            blocked.error = RunEnded()
+            blocked.release()
+
+
+def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> bool:
+    """Take note of how main ended; return whether that fails the run."""
+    if error is None or isinstance(error, RunEnded):
+        return False
+    notes = stacks.domain.outcome.notes
+    over = stacks.ending.closing or stacks.ending.unwinding
+    if isinstance(error, SystemExit) or (isinstance(error, KeyboardInterrupt) and not over):
+        program.exit_code = exit_status(error) if isinstance(error, SystemExit) else _INTERRUPTED
+        stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, program.exit_code)
+        if program.exit_code:
+            said = text_of(error) if not isinstance(getattr(error, "code", 0), int) else ""
+            said = f": {said}" if said else ""
+            at = format_seconds(stacks.loop.now_ns)
+            notes.append(f"{program.label} exited with {program.exit_code} at {at} s{said}")
+        return False
+    if over:
+        if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
+            kind = type(error).__qualname__
+            notes.append(f"{program.label}, told to end, raised {kind}: {text_of(error)}")
+        return False
+    return True
+
+
+def _is_external_shutdown(error: BaseException) -> bool:
+    from rclpy.executors import ExternalShutdownException
+
+    return isinstance(error, ExternalShutdownException)
+
+
+def _nodes(stacks: Stacks, program: Program) -> list[Any]:
+    return [node for node in stacks.domain.graph.nodes if node.process is program]
+
+
+def _vanish(stacks: Stacks, program: Program) -> None:
+    """Take a process's nodes out of the graph, as its end does."""
+    for context in program.contexts:
+        context.end()
+    for node in _nodes(stacks, program):
+        if node.mailbox is not None:
+            node.mailbox.close()
+        for endpoint in stacks.domain.graph.endpoints_of(node):
+            endpoint.destroy()
+        node.destroy()
+
+
+def end_programs(stacks: Stacks) -> None:
+    """Tell every main that is still there to end, and let it."""
+    if stacks.ending.closing or not stacks.programs.all:
+        return
+    stacks.ending.closing = True
+    stacks.loop.halt()
+    for program in stacks.programs.all:
+        if not program.ended and program.begun_ns is not None:
+            interrupt(stacks, program)
+            _let_run(stacks, program)
+
+
+def interrupt(stacks: Stacks, program: Program) -> None:
+    """Do what SIGINT does to a process; the call that its main is in raises ``KeyboardInterrupt``
+    (who is in no call has to raise it)."""
+    shut_down(stacks, program)
+    blocked = next((one for one in stacks.runners.blocked if one.stack is program.stack), None)
+    if blocked is not None:
+        blocked.error = KeyboardInterrupt()
+        blocked.release()
+
+
+def shut_down(stacks: Stacks, program: Program) -> None:
+    """Shut a process's contexts down from outside, as rclpy's handler of signals does."""
+    for context in program.contexts:
+        context.end()
+    for other in list(stacks.runners.blocked):
+        if other.program is program and other.quiet:
+            other.release()
+
+
+def _let_run(stacks: Stacks, program: Program) -> None:
+    """Let a program end that has been told to, as long as ros2 launch leaves it.
+
+    Time stands still meanwhile: who sleeps goes on when nobody else can.
+    """
+    loop = stacks.loop
+    stacks.ending.grace_ns = 0
+    while not program.ended:
+        item = loop.tasks.popleft() if loop.tasks else loop.ready.popleft() if loop.ready else None
+        if isinstance(item, Wait):
+            stacks.runners.waiting.append(getcurrent())
+            item.stack.switch()
+        elif isinstance(item, SimThread):
+            item.dispatch()
+        elif item is None:
+            timed = [
+                (w.deadline_ns, w) for w in stacks.runners.blocked if w.deadline_ns and w.waiting
+            ]
+            own = [pair for pair in timed if pair[1].program is program]
+            if not own:
+                return
+            deadline_ns, first = min(own, key=lambda pair: pair[0])
+            stacks.ending.grace_ns = max(deadline_ns - loop.now_ns, stacks.ending.grace_ns + 1)
+            if stacks.ending.grace_ns > _GRACE_NS:
+                return
+            first.time_out()
+
+
+_GRACE_NS = 10_000_000_000

@@ -1,0 +1,250 @@
+"""Blocked calls, and the stacks that run the loop meanwhile.
+
+There is one thread, so whoever blocks gives its call stack up for a while: greenlets do that. The
+loop runs on the stack of whoever runs it; when a callback blocks deep inside it, another stack
+takes the loop over, and when the wait is over the loop's present runner switches back to the
+callback, which finishes and goes on as the loop's runner. Callbacks that do not block (nearly all)
+never meet any of this.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import traceback
+from _thread import get_ident
+from collections.abc import Callable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.adapters.rclpy.stacks.callback_groups import CallbackGroups
+from rsltrace.adapters.rclpy.stacks.program import Programs
+from rsltrace.adapters.rclpy.stacks.wait_reasons import called_service
+from rsltrace.guard.callers import is_telling
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.simulation.middleware.entity import Runnable
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
+
+_RESUME = int(EventKind.RESUME)
+
+Patience = bool | Callable[[], bool]
+"""Whether it is in order to wait for ever, or what says so when somebody asks."""
+
+
+class RunEnded(BaseException):
+    """Raised in a blocked call when the run ends, so that ``finally`` blocks run."""
+
+
+class Runners:
+    """The stacks of one run. ``waiting`` are those that wait to run the loop again, ``main`` is the
+    one that began. What happens in another ``process`` or real ``thread`` is not simulated."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        programs: Programs,
+        groups: CallbackGroups,
+        run: Callable[[], None],
+    ) -> None:
+        self.domain = domain
+        self.programs = programs
+        self.groups = groups
+        self.process = os.getpid()
+        self.thread = get_ident()
+        self.blocked: dict[Wait, None] = {}
+        self.main: greenlet | None = None
+        self.waiting: list[greenlet] = []
+        self.error: BaseException | None = None
+        self.numbers: WeakKeyDictionary[greenlet, int] | None = None
+        """A number for each stack whose callback has been at a line where another could go on, if
+        threads are switched at lines."""
+        self._next_number = itertools.count(1).__next__
+        self._run = run
+        self._maker: greenlet | None = None
+
+    def next(self) -> greenlet:
+        """Return the stack to switch to when a callback blocks: who runs the loop from then on.
+
+        New runners all begin on the stack of one maker, so that however many calls are blocked, the
+        next callback does not run deeper (in Python's recursion limit, and in C).
+        """
+        if self.waiting:
+            return self.waiting.pop()
+        if self._maker is None:
+            self._maker = greenlet(self._make, self.main)
+        return self._maker
+
+    def close(self) -> None:
+        """Let go of the stack that makes runners, or it would keep this world alive for ever."""
+        maker, self._maker = self._maker, None
+        if maker is not None:
+            maker.throw()
+
+    def _make(self) -> None:
+        while True:
+            greenlet(self._run, self.main).switch()
+
+    def number_of(self, stack: greenlet) -> int:
+        """Return the number of a stack, where stacks have numbers."""
+        if self.numbers is None:
+            return 0
+        number = self.numbers.get(stack)
+        if number is None:
+            number = self.numbers[stack] = self._next_number()
+        return number
+
+    def step_aside(self) -> None:
+        """Have whoever switched to the present stack go on once it ends."""
+        getcurrent().parent = self.waiting.pop()
+
+
+class Wait:
+    """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
+
+    def __init__(
+        self, runners: Runners, what: object, group: object, *, quiet: bool, patient: Patience
+    ) -> None:
+        domain, programs = runners.domain, runners.programs
+        event = domain.event
+        self._runners = runners
+        self.what = what
+        self._patient = patient
+        self.error: BaseException | None = None
+        """What to raise in the blocked call when it goes on."""
+        self.program = programs.present
+        self.since_ns = domain.loop.now_ns
+        self.deadline_ns: int | None = None
+        self.quiet = quiet
+        self._group = group
+        self.stack = getcurrent()
+        self.timed_out = False
+        self.woken = False
+        """Whether anything lets the call return."""
+        self.event = (event.handle, event.entity, event.node)
+        """Whose event it is that waits: handle, entity and node."""
+        self.constructing = programs.constructing
+        """The entry under construction where it waits."""
+        self._end_group = event.on_end
+        self._cause = (NO_EVENT, 0)
+        self._input_hash = 0
+        self._busy_ns = event.busy_ns
+
+    @property
+    def entity_id(self) -> int:
+        """The entity whose callback waits."""
+        return self.event[1]
+
+    @property
+    def group(self) -> object:
+        """The callback group that the wait keeps busy, or None."""
+        return self._group
+
+    @property
+    def waiting(self) -> bool:
+        """Whether nothing has let the call return yet."""
+        return not self.woken
+
+    def stop_waiting(self) -> None:
+        """Take no more notice of what the call waited for."""
+        self.woken = True
+
+    def is_patient(self) -> bool:
+        """Return whether it is in order to wait for ever: for more work, say."""
+        patient, self._patient = self._patient, False  # False, should somebody ask in a circle
+        try:
+            return patient if isinstance(patient, bool) else patient()
+        finally:
+            self._patient = patient
+
+    def wake(self) -> None:
+        """Let the call return: because of the event under way."""
+        if not self.woken:
+            self.woken = True
+            domain = self._runners.domain
+            position = domain.dispatcher.note(OutputKind.TASK, self.event[1], 2)
+            self._cause = (domain.loop.events, position)
+            self._input_hash = domain.event.input_hash
+            domain.loop.tasks.append(self)
+
+    def release(self) -> None:
+        """Let the call return, because of nothing that has an event."""
+        if not self.woken:
+            self.woken = True
+            self._runners.domain.loop.tasks.append(self)
+
+    def time_out(self) -> None:
+        """Let the call return: because its time is up."""
+        if not self.woken:
+            self.woken = self.timed_out = True
+            self._runners.domain.loop.ready.append(self)
+
+    def give_way(self, output: int) -> None:
+        """Let the call return when it is its turn among those that are ready: it waits for nothing.
+        ``output`` of the event under way says so."""
+        self.woken = True
+        self._cause = (self._runners.domain.loop.events, output)
+        self._runners.domain.loop.ready.append(self)
+
+    @property
+    def held(self) -> list[Any] | None:
+        """Where it is kept if its process hangs or has crashed, else None."""
+        held = self.program.held
+        return held if held is not None or self.event[2] is None else self.event[2].held
+
+    def dispatch(self) -> None:
+        """Give the loop's runner up to the blocked call (called on the runner's stack)."""
+        if (held := self.held) is not None:
+            held.append(self)
+            return
+        self._runners.waiting.append(getcurrent())
+        self.stack.switch()
+
+    def resumed(self) -> None:
+        """Begin the RESUME event (called on the blocked call's own stack)."""
+        dispatcher, programs = self._runners.domain.dispatcher, self._runners.programs
+        event = dispatcher.event
+        event.handle, event.entity, event.node = self.event
+        for observer in dispatcher.node_observers:
+            observer.node_entered(event.node, is_made=False)
+        event.kind = _RESUME
+        event.cause_event, event.cause_output = self._cause
+        event.input_hash = self._input_hash
+        programs.constructing = self.constructing
+        event.on_end = self._end_group
+        event.quiet = self.quiet
+        event.busy_ns = self._busy_ns
+        if self.program is not programs.present:
+            self.program.enter()
+        for observer in dispatcher.resume_observers:
+            observer.resumed()
+
+    def follow(self, event: int) -> None:
+        """Go on after ``event``, which has run on the stack meanwhile."""
+        self._cause = (event, 0)
+
+    def runnable(self) -> Runnable:
+        """Describe it to a policy: a callback under way goes on, and has its worker."""
+        thread = self._runners.number_of(self.stack)
+        return Runnable("resume", "", self.entity_id, thread=thread)
+
+    def describe(self) -> str:
+        """Name the callback that waits."""
+        return self.event[0].describe() if self.event[0] is not None else "the run"
+
+    def waits_for(self) -> str:
+        """Say who waits for what, with the lines of user code that led there."""
+        frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
+        own = [frame for frame in frames if is_telling(frame.filename)]
+        where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
+        hint = ""
+        if self._group is not None and self._runners.groups.waiting_for(self._group):
+            hint = (
+                ", which may be among the events that wait for its callback group: a blocked "
+                "callback keeps a mutually exclusive group busy, so give the client, timer or "
+                "subscription it waits for a callback group of its own"
+            )
+        graph = self._runners.domain.graph
+        what = called_service(graph, self.stack.gr_frame) or self.what
+        return f"{self.describe()} waits for {what}{hint}{where}"

@@ -1,0 +1,128 @@
+"""Tasks with rclpy's semantics: ``create_task``, and callbacks that are ``async def``."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from types import FunctionType, MethodType
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.trace.model.event import EventKind, OutputKind
+
+_TASK = int(EventKind.TASK)
+
+_is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
+
+
+def is_coroutine_function(callback: object) -> bool:
+    """Return whether calling ``callback`` gives a coroutine; about a function, look only once.
+
+    Looking costs a microsecond, and more where an audit hook is told of each look at code.
+    """
+    function = callback.__func__ if type(callback) is MethodType else callback
+    if type(function) is not FunctionType:
+        return inspect.iscoroutinefunction(callback)
+    known = _is_coroutine.get(function)
+    if known is None:
+        known = _is_coroutine[function] = inspect.iscoroutinefunction(callback)
+    return known
+
+
+def is_awaited(stacks: Stacks, callback: object) -> bool:
+    """Return whether a callback is run as a coroutine: it is one, or user code has its own way."""
+    return stacks.runs_callbacks is not None or is_coroutine_function(callback)
+
+
+def executor_of(stacks: Stacks, handle: Any) -> Any:
+    """Return the executor that runs a handle's node: the user's own, or the run's."""
+    mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
+    if mailbox is not None and mailbox.pump is not None:
+        return mailbox.pump.executor
+    return stacks.executor
+
+
+def start_callback(
+    stacks: Stacks,
+    handle: Any,
+    kind: int,
+    callback: Callable[..., Any],
+    args: tuple[Any, ...],
+    *cause: int,
+) -> None:
+    """Run an entity's callback that ``is_awaited``, as rclpy's executors would."""
+    if stacks.runs_callbacks is not None:
+        callback, args = stacks.runs_callbacks, (callback, *args)
+    start_coroutine(stacks, handle, kind, callback, args, *cause)
+
+
+def start_coroutine(
+    stacks: Stacks,
+    handle: Any,
+    kind: int,
+    callback: Callable[..., Any],
+    args: tuple[Any, ...],
+    cause_event: int,
+    cause_output: int,
+    input_hash: int,
+) -> None:
+    """Run an entity's ``async def`` callback up to its first suspension, as one event."""
+    from rclpy.task import Task
+
+    wrapper = handle.wrapper
+    group = wrapper.callback_group
+    stacks.groups.begin_coroutine(group, wrapper)
+    run = TaskRun(
+        stacks.coroutines,
+        Task(callback, args, None, executor=executor_of(stacks, handle)),
+        called=(callback, args),
+        entity=handle.entity_id,
+        node=handle.node,
+        kind=kind,
+        label=handle.describe,
+        on_end=lambda: stacks.groups.end(group, wrapper),
+        mailbox=handle.node.mailbox if handle.node is not None else None,
+    )
+    run.cause_event, run.cause_output, run.input_hash = cause_event, cause_output, input_hash
+    if run.mailbox is None:
+        run.dispatch()
+    else:
+        run.mailbox.run(run)  # the executor has it under way already
+
+
+def create_task(
+    stacks: Stacks,
+    callback: Any,
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    *,
+    executor: Any = None,
+    mailbox: Mailbox | None = None,
+) -> Any:
+    """Make a Task that runs right after the present event; it belongs to that event's entity.
+
+    ``executor`` runs it: one of the user's own takes it from ``mailbox``, None is the run's.
+    """
+    from rclpy.task import Task
+
+    task = Task(callback, args, kwargs, executor=executor or stacks.executor)
+    event = stacks.event
+    name = getattr(callback, "__qualname__", type(callback).__qualname__)
+    owner = event.node.fully_qualified_name if event.node is not None else "the run"
+    run = TaskRun(
+        stacks.coroutines,
+        task,
+        called=(callback, args),
+        entity=event.entity,
+        node=event.node,
+        kind=_TASK,
+        label=lambda: f"{owner}: task {name}",
+        mailbox=mailbox,
+    )
+    run.cause_output = stacks.dispatcher.note(OutputKind.TASK, event.entity)
+    run.input_hash = event.input_hash
+    stacks.loop.tasks.append(run)
+    return task

@@ -1,0 +1,189 @@
+"""One main's terminal: a pseudo-terminal of the system, at which the job types.
+
+The system's line discipline does what it does natively (lines, raw keys, ``termios``). Only when
+there is something to read is ours: keys are typed when their time has come and somebody looks for
+them, so that nothing is lost that a node flushes, and who waits for them waits in simulated time.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import select
+import struct
+import termios
+from collections import deque
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import Any
+
+from rsltrace.adapters.rclpy.entry import Typed
+from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
+from rsltrace.adapters.rclpy.stacks.runners import Wait
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.guard.redirect import copy_of
+
+_END = b"\x04"
+_LOCAL_MODES = 3
+_SIZE = (24, 80)
+"""Lines and columns."""
+_openpty = copy_of(os.openpty)  # type: ignore[arg-type]
+_read = copy_of(os.read)  # type: ignore[arg-type]
+_write = copy_of(os.write)  # type: ignore[arg-type]
+_close = copy_of(os.close)  # type: ignore[arg-type]
+_poll = copy_of(select.poll)  # type: ignore[arg-type]
+_tcgetattr = copy_of(termios.tcgetattr)  # type: ignore[arg-type]
+_get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
+
+
+class Terminal:
+    """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. While ``has_screen``,
+    what the main prints goes there, too (curses)."""
+
+    def __init__(self, stacks: Stacks, typed: Sequence[Typed], start_ns: int) -> None:
+        self._stacks = stacks
+        self._typed = deque(typed)
+        self._start_ns = start_ns
+        self._keyboard, self.fd = map(_above_standard, _openpty())
+        os.set_blocking(self._keyboard, False)
+        fcntl.ioctl(self.fd, termios.TIOCSWINSZ, struct.pack("HHHH", *_SIZE, 0, 0))
+        self.has_screen = False
+        self._waiting: list[Wait] = []
+        self._at_end = False
+        self._looked_ns = -1
+        self.stream = io.TextIOWrapper(io.BufferedReader(_Input(self)), encoding="utf-8")
+        for at_ns in {at_ns for at_ns, _ in typed if at_ns is not None}:
+            stacks.loop.schedule(start_ns + at_ns, self._wake)
+
+    def close(self) -> None:
+        """Close both ends."""
+        for fd in (self._keyboard, self.fd):
+            _close(fd)
+
+    def _wake(self) -> None:
+        waits, self._waiting = self._waiting, []
+        for blocked in waits:
+            blocked.release()
+
+    # -- typing ------------------------------------------------------------------------------------
+
+    def offer(self) -> bool:
+        """Type what is due unless there is something to read; return whether there is."""
+        while not self._is_readable():
+            if not self._typed or not self._is_due(self._typed[0][0]):
+                return False
+            keys = self._typed.popleft()[1]
+            if keys is not None:
+                self._type(keys)
+            elif self._takes_lines():
+                self._type(_END)
+            self._at_end = keys is None
+        return True
+
+    def _is_due(self, at_ns: int | None) -> bool:
+        return at_ns is None or self._start_ns + at_ns <= self._stacks.loop.now_ns
+
+    def _type(self, keys: bytes) -> None:
+        _write(self._keyboard, keys)
+        self.drain()
+
+    def drain(self) -> None:
+        """Take away what it shows, which is for nobody to see."""
+        with suppress(BlockingIOError):
+            while _read(self._keyboard, 65536):
+                pass
+
+    def _is_readable(self) -> bool:
+        poll = _poll()
+        poll.register(self.fd, select.POLLIN)
+        return bool(poll.poll(0))
+
+    def _takes_lines(self) -> bool:
+        return bool(_tcgetattr(self.fd)[_LOCAL_MODES] & termios.ICANON)
+
+    # -- reading -----------------------------------------------------------------------------------
+
+    def await_input(self, for_ns: int | None = None) -> bool:
+        """Wait in simulated time until there is something to read; return whether there is."""
+        stacks = self._stacks
+        until_ns = None if for_ns is None else stacks.loop.now_ns + for_ns
+        while not self.offer():
+            left_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
+            if left_ns is not None and left_ns <= 0:
+                return False
+            if self._at_end and not self._typed and self._takes_lines():
+                wait(stacks, "the end of its input", for_ns=POLL_NS, quiet=True)
+                self._type(_END)  # the end stays the end, however often it is read
+                continue
+            wait(
+                stacks,
+                "something to be typed (stdin)",
+                until=self._waiting.append,
+                for_ns=left_ns,
+                patient=True,
+            )
+            self._waiting = [blocked for blocked in self._waiting if blocked.waiting]
+        return True
+
+    def look(self) -> bool:
+        """Return whether there is something to read. Who looks again at one instant waits a
+        millisecond: time has to pass somehow."""
+        loop = self._stacks.loop
+        if self.offer():
+            return True
+        again, self._looked_ns = self._looked_ns == loop.now_ns, loop.now_ns
+        return again and self.await_input(POLL_NS)
+
+    def read(self, size: int) -> bytes:
+        """Read what has been typed, as ``os.read`` does.
+
+        :raises BlockingIOError: there is nothing, and the main has made it non-blocking.
+        """
+        if _get_blocking(self.fd):
+            self.await_input()
+        else:
+            self.offer()
+        found: bytes = _read(self.fd, size)
+        return found
+
+
+def _above_standard(fd: int) -> int:
+    """Return a descriptor that is no standard stream: where rsltrace has none, it would be."""
+    if fd > 2:
+        return fd
+    moved: int = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3)
+    _close(fd)
+    return moved
+
+
+class _Input(io.RawIOBase):
+    """What ``sys.stdin`` reads from. In the main, the terminal is descriptor 0."""
+
+    name = "<stdin>"
+    mode = "rb"
+
+    def __init__(self, terminal: Terminal) -> None:
+        self._terminal = terminal
+
+    def fileno(self) -> int:
+        """Return the number of standard input."""
+        return 0
+
+    def isatty(self) -> bool:
+        """Return that it is a terminal."""
+        return True
+
+    def readable(self) -> bool:
+        """Return that one can read from it."""
+        return True
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        """Read what there is, at most as much as fits."""
+        view = memoryview(buffer).cast("B")
+        try:
+            data = self._terminal.read(len(view))
+        except BlockingIOError:
+            return None
+        view[: len(data)] = data
+        return len(data)

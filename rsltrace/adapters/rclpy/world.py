@@ -1,0 +1,357 @@
+"""A simulated ROS world from its first node to its last: construction, the jump to the start, the
+run, and the destruction of the nodes."""
+
+from __future__ import annotations
+
+import gc
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.adapters.rclpy.boundary.boundary import Boundary, Surroundings
+from rsltrace.adapters.rclpy.boundary.installation import installed
+from rsltrace.adapters.rclpy.callback_errors import RclpyDoor
+from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.executors.exchanged import note_exchanged
+from rsltrace.adapters.rclpy.executors.user_executors import own_executors
+from rsltrace.adapters.rclpy.handles.logs import Logs
+from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
+from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
+from rsltrace.adapters.rclpy.stacks.asyncio_loops import simulated_event_loops
+from rsltrace.adapters.rclpy.stacks.blocked_groups import note_waits
+from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked
+from rsltrace.adapters.rclpy.stacks.construction import Construction
+from rsltrace.adapters.rclpy.stacks.exit_handlers import own_exit_handlers
+from rsltrace.adapters.rclpy.stacks.forked_child import forked_children_end
+from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
+from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs
+from rsltrace.adapters.rclpy.stacks.process_exit import own_process_ends
+from rsltrace.adapters.rclpy.stacks.program import Program
+from rsltrace.adapters.rclpy.stacks.signals import own_signal_handlers
+from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_waiting
+from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.starts import Starts
+from rsltrace.adapters.rclpy.stacks.threads import cooperative_threads
+from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
+from rsltrace.adapters.rclpy.unmade_node import constructor_of, is_unmade
+from rsltrace.errors import DeadlockError, JobError, RunError
+from rsltrace.simulation.chance.network import NetworkPlan
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.ordered import OrderedLoop
+from rsltrace.simulation.middleware.domain import Domain
+from rsltrace.simulation.middleware.events.event import OutsideEvent
+from rsltrace.simulation.middleware.links import Network
+from rsltrace.simulation.middleware.scheduling import Scheduling, SchedulingPlan
+from rsltrace.trace.model.event import NO_EVENT, EventKind
+
+
+class World:
+    """Nodes in a loop. Use as a context manager: within it, rclpy is simulated.
+
+    ``domain`` is what all participants share, ``stacks`` what belongs to the call stacks of user
+    code, ``states`` are the hashed ones of nodes, ``clocks`` is None where all of them are right.
+
+    :param base_dir: the job's folder; source paths in logs are relative to it.
+    :param echo: print log records on stderr.
+    """
+
+    def __init__(
+        self, loop: EventLoop, *, base_dir: Path, seed: int = 0, echo: bool = True
+    ) -> None:
+        self.domain = Domain(loop)
+        self.stacks = Stacks(self.domain)
+        self.states = NodeStates()
+        self.clocks: NodeClocks | None = None
+        self.nodes: list[Any] = []
+        self.parameters: dict[str, Parameters] = {}
+        self._seed = seed
+        self._logs = Logs(self.domain, base_dir=base_dir, echo=echo)
+        self.domain.dispatcher.door = RclpyDoor(self.stacks, self._logs)
+        self._surroundings = Surroundings(self.stacks, self._logs, self.states)
+        self._boundary: Boundary
+        self._terminals: Terminals
+        self._stack = ExitStack()
+        self.constructed: list[Entry] = []
+        """The entries in the order in which they have been constructed."""
+        self.starts = Starts(self.stacks, self.construct)
+        self.start_process: Callable[[Entry, tuple[int, int]], None]
+        """Starts an entry that runs as a process of its own, as one event."""
+
+    def __enter__(self) -> World:
+        stacks = self.stacks
+        with ExitStack() as stack:
+            self._boundary = stack.enter_context(installed())
+            stack.enter_context(_fresh_rclpy(self._boundary))
+            stack.callback(stacks.programs.leave)
+            self._boundary.enter(self._surroundings)
+            stack.callback(self._boundary.leave)
+            import rclpy
+
+            from rsltrace.adapters.rclpy.executors.sim_executor import SimExecutor
+
+            stack.enter_context(simulated_waiting(stacks, self._seed))
+            stack.enter_context(own_executors(stacks))
+            stack.enter_context(cooperative_threads(stacks))
+            stack.enter_context(simulated_event_loops(stacks))
+            stack.enter_context(own_exit_handlers(stacks))
+            stack.enter_context(own_process_ends(stacks))
+            stack.enter_context(forked_children_end(stacks))
+            stack.enter_context(own_signal_handlers(stacks))
+            self._terminals = stack.enter_context(simulated_terminals(stacks))
+            rclpy.init(args=[])
+            stacks.runners.main = getcurrent()
+            stacks.executor = SimExecutor(stacks, rclpy.get_default_context())
+            setattr(rclpy, "__executor", stacks.executor)  # what rclpy.spin* use
+            stack.callback(self._close)
+            # The executor's own guard conditions are no entities.
+            self.domain.entities.pending.clear()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+
+    def _close(self) -> None:
+        import rclpy
+
+        programs, error = self.stacks.programs, self.error
+        programs.main_context = None  # from here on a shutdown is ours
+        self.domain.event.handle = None
+        self.stacks.runners.close()
+        self.stacks.executor.shutdown()
+        for node in self.nodes:  # has been destroyed, as far as it could be
+            untrack = getattr(node.context, "untrack_node", None)
+            if untrack is not None:  # from ROS 2 Kilted on, a shutdown destroys nodes once more
+                untrack(node)
+        rclpy.try_shutdown()
+        # What user code has left behind must meet its finalizers while rclpy is still simulated.
+        if error is not None and error.__cause__ is not None:
+            traceback.clear_frames(error.__cause__.__traceback__)
+        self.nodes.clear()
+        for program in (programs.host, *programs.all):
+            program.forget()
+        gc.collect()
+
+    def use_network(self, plan: NetworkPlan) -> None:
+        """Give what nodes send delays and losses. Before the first node is made."""
+        self.domain.transport.network = Network(self.domain.dispatcher, plan)
+
+    def plan(self, entries: Sequence[Entry], start_ns: int) -> None:
+        """Say what will be constructed, and when the run starts: a main that ends must know of
+        those that begin later."""
+        programs = self.stacks.programs
+        programs.all = [
+            Program(programs, entry)
+            for entry in entries
+            if entry.argv is not None and entry.program is None
+        ]
+        self._terminals.make(programs.all, start_ns)
+
+    @contextmanager
+    def importing(self) -> Iterator[None]:
+        """Let what modules make when they are imported (a lock, a thread) belong to the run."""
+        programs = self.stacks.programs
+        programs.importing = True
+        try:
+            yield
+        finally:
+            programs.importing = False
+
+    def use_clocks(self, rules: tuple[ClockRule, ...], start_ns: int) -> None:
+        """Let the clocks of some nodes be different. Before the first node is made."""
+        if rules:
+            self.clocks = NodeClocks(self.domain, rules, seed=self._seed, start_ns=start_ns)
+            self._surroundings.clocks = self.clocks
+
+    def use_scheduling(self, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        """Let a plan say what runs when, and how long it takes. Before the first node is made."""
+        Scheduling(self.domain.dispatcher, loop, plan)
+        if plan.execution and self.domain.transport.network is None:
+            # What a callback sends leaves when it is over: that takes links.
+            self.use_network(NetworkPlan())
+
+    def switch_at_lines(self, loop: OrderedLoop, packages: frozenset[str]) -> None:
+        """Let threads take turns at lines of user code; that of ``packages`` is, too."""
+        self._stack.enter_context(switches_at_lines(self.stacks, loop, packages))
+
+    def show_log(self, severity: int, name: str, text: str) -> None:
+        """Print a log record of a node that publishes its records itself, if they are printed."""
+        self._logs.show(severity, name, text)
+
+    def echo_logs(self, echo: bool) -> None:
+        """Print log records on stderr from now on, or no longer."""
+        self._logs.echo = echo
+
+    # -- the stages of a run ---------------------------------------------------------------------
+
+    def construct(self, entry: Entry, cause: tuple[int, int] = (NO_EVENT, 0)) -> bool:
+        """Construct one entry of the job as one event; return False if that ended the run.
+
+        ``cause`` is the event and output that it follows from.
+        """
+        stacks = self.stacks
+        self.constructed.append(entry)
+        if entry.program is not None:
+            self.start_process(entry, cause)
+            return stacks.loop.stopped is None
+        if entry.argv is not None:
+            program = next(one for one in stacks.programs.all if one.entry is entry)
+            begin_program(stacks, program, cause)
+            return stacks.loop.stopped is None
+
+        def build() -> None:
+            made = entry.make()
+            for node in made if isinstance(made, (list, tuple)) else [made]:
+                self._adopt(node, entry.name)
+            stacks.programs.tell("started", entry.key)
+
+        def construct() -> None:
+            event = Construction(lambda: f"constructing {entry.name}", entry)
+            stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build, cause)
+            # Whoever switched here goes on: this function, or the loop's runner after a wait.
+            stacks.runners.step_aside()
+
+        # A constructor that blocks (on a service, say) is left waiting while others go on.
+        stacks.programs.constructing = entry
+        stacks.runners.waiting.append(getcurrent())
+        greenlet(construct).switch()
+        stacks.programs.constructing = None
+        return stacks.loop.stopped is None
+
+    def run_outside(self, name: str, kind: EventKind, body: Callable[[], object]) -> None:
+        """Run ``body`` as one event that is no entity's callback."""
+        self.domain.dispatcher.run_outside(OutsideEvent(lambda: name), kind, 0, None, body)
+
+    def _adopt(self, node: Any, name: str) -> None:
+        from rclpy.node import Node
+
+        if not isinstance(node, Node):
+            raise JobError(
+                f"{name} gave a {type(node).__qualname__}, not an rclpy Node: name a Node subclass "
+                "or a function that returns a node (or a list of nodes)"
+            )
+        if is_unmade(node):
+            raise RunError(f"{constructor_of(node)} has not called super().__init__(name)")
+        self.nodes.append(node)
+        self.stacks.executor.add_node(node)
+
+    def all_nodes(self) -> list[Any]:
+        """Return the rclpy nodes there are, in the order of their construction."""
+        wrappers = [getattr(handle, "wrapper", None) for handle in self.domain.graph.nodes]
+        return [wrapper for wrapper in wrappers if wrapper is not None]
+
+    def keep(self, node: Any) -> None:
+        """Destroy ``node`` with the others at the end, although it is not run."""
+        self.nodes.append(node)
+
+    def renew(self, program: Program) -> None:
+        """Let a main that has crashed be constructed once more, in a process of its own."""
+        programs = self.stacks.programs
+        new = Program(programs, program.entry)
+        programs.all[programs.all.index(program)] = new
+        self._terminals.hand_over(program, new)
+
+    def jump(self, time_ns: int) -> None:
+        """Move from construct time to the start of the run, telling clocks of the jump."""
+        loop = self.domain.loop
+        delta_ns = time_ns - loop.now_ns
+        loop.jump(time_ns)
+        if delta_ns:
+            self.run_outside(
+                "the jump to the start",
+                EventKind.CLOCK_JUMP,
+                lambda: self._boundary.jump_clocks(delta_ns),
+            )
+
+    def go_on(self) -> None:
+        """Run the loop until it ends or its gate pauses it; afterwards this may be called again.
+
+        The loop never runs on this stack, so that no callback can keep it from going on. A quiet
+        end with somebody still waiting is a deadlock.
+        """
+        stacks, outcome = self.stacks, self.domain.outcome
+        runners, ending = stacks.runners, stacks.ending
+        runners.next().switch()
+        stacks.programs.leave()  # it may have ended between two programs
+        if stacks.loop.stopped is None and runners.error is None:
+            return  # paused
+        outcome.note_end(stacks.loop.events)
+        if outcome.error is None:
+            note_waits(stacks, outcome)
+        note_exchanged(stacks, hosted=bool(self.nodes))
+        self.parameters = parameters_of(self.domain.graph)
+        end_programs(stacks)
+        end_blocked(stacks)
+        if runners.error is not None:
+            raise runners.error
+        if ending.stuck and outcome.error is None:
+            outcome.error = DeadlockError(_deadlock(ending.stuck))
+
+    def waiting(self) -> str:
+        """Say who waits for what, where nothing can happen any more."""
+        return _deadlock(self.stacks.who_waits())
+
+    def blocked(self) -> list[str]:
+        """Say of each blocked call that may not wait for ever what it waits for."""
+        return [one.waits_for() for one in self.stacks.runners.blocked if not one.is_patient()]
+
+    def destroy(self) -> None:
+        """Destroy the nodes in creation order, each as one event."""
+        stacks, outcome = self.stacks, self.domain.outcome
+        outcome.note_end(stacks.loop.events)
+        end_programs(stacks)
+        end_blocked(stacks)  # constructors that still wait, if the run never began
+        for node in self.nodes:
+            stacks.ending.shutdown_ns = 0
+            handle = node.handle
+            if handle.destroyed or outcome.error is not None:
+                continue
+            event = OutsideEvent(handle.describe)
+            stacks.dispatcher.run_outside(
+                event, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node
+            )
+
+    @property
+    def exit_code(self) -> int:
+        """The first exit status other than 0 with which a main ended."""
+        return next((p.exit_code for p in self.stacks.programs.all if p.exit_code), 0)
+
+    @property
+    def error(self) -> RunError | None:
+        """What went wrong, if anything did."""
+        return self.domain.outcome.error
+
+
+def _deadlock(waits: list[str]) -> str:
+    lines = "\n".join(f"  {text}" for text in waits[:20])
+    return f"nothing can happen any more, but somebody waits:\n{lines}"
+
+
+@contextmanager
+def _fresh_rclpy(boundary: Boundary) -> Iterator[None]:
+    """Give rclpy's module globals their first values for a run, and their old ones afterwards."""
+    import rclpy
+    import rclpy.context
+    import rclpy.utilities
+
+    first_values: list[tuple[Any, str, Any]] = [
+        (rclpy.utilities, "g_default_context", None),
+        (rclpy.context, "g_logging_ref_count", 0),
+        (rclpy, "__executor", None),
+    ]
+    saved = [(module, name, getattr(module, name, None)) for module, name, _ in first_values]
+    for module, name, first in first_values:
+        setattr(module, name, first)
+    boundary.ros_clocks.clear()
+    boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
+    boundary.real.rclpy_logging_initialize()
+    try:
+        yield
+    finally:
+        for module, name, old in saved:
+            setattr(module, name, old)

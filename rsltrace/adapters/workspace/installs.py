@@ -1,0 +1,181 @@
+"""What the build files of a package would install: files and folders, modules, executables."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
+from pathlib import Path
+
+from rsltrace.adapters.workspace.build_files import (
+    console_scripts_in,
+    entry_points,
+    package_dir,
+    packages,
+    setup_py,
+    source_root,
+)
+from rsltrace.adapters.workspace.cmake import Command, commands, is_expanded
+from rsltrace.source_packages import SourcePackage, source_packages
+
+_KINDS = ("DIRECTORY", "FILES", "PROGRAMS")
+_OPTIONS = frozenset(
+    "DESTINATION TYPE RENAME PATTERN REGEX FILES_MATCHING EXCLUDE USE_SOURCE_PERMISSIONS "
+    "PERMISSIONS FILE_PERMISSIONS DIRECTORY_PERMISSIONS CONFIGURATIONS COMPONENT OPTIONAL "
+    "EXCLUDE_FROM_ALL MESSAGE_NEVER DIRECTORY FILES PROGRAMS".split()
+)
+"""The keywords of ``install``, each of which ends the list before it."""
+_PYTHON_PACKAGE, _PYTHON_MODULE = "ament_python_install_package", "ament_python_install_module"
+_PROGRAMS = ("add_executable", "ament_auto_add_executable")
+_NO_MODULES = frozenset("test tests launch setup conftest scripts doc docs config resource".split())
+
+
+def installed_files(package: SourcePackage) -> Iterator[tuple[str, Path]]:
+    """Give where each file or folder would be installed below the prefix, and where it is now."""
+    setup = setup_py(package.folder)
+    for folder, files in setup.get("data_files", ()):
+        for file in files:
+            yield f"{folder}/{os.path.basename(file)}", package.folder / file
+    for file in setup.get("scripts", ()):
+        yield f"lib/{package.name}/{os.path.basename(file)}", package.folder / file
+    for command in commands(package):
+        yield from _installed(command)
+
+
+def _installed(command: Command) -> Iterator[tuple[str, Path]]:
+    """Give what an ``install`` of ``CMakeLists.txt`` puts where."""
+    words = command.words
+    if command.name != "install" or words[:1] not in [(kind,) for kind in _KINDS]:
+        return
+    (target,) = _values(words, "DESTINATION")[:1] or ("",)
+    target = target.strip("/")
+    renamed = _values(words, "RENAME")
+    for source in filter(is_expanded, _values(words, words[0])):
+        path = command.folder / source
+        if words[0] == "DIRECTORY" and source.endswith("/") and path.is_dir():
+            for child in sorted(path.iterdir()):
+                yield f"{target}/{child.name}", child
+        else:
+            yield f"{target}/{renamed[0] if renamed else path.name}", path
+
+
+def _values(words: Sequence[str], keyword: str) -> list[str]:
+    """Return the words after a keyword of ``install``, up to the next one."""
+    if keyword not in words:
+        return []
+    rest = words[words.index(keyword) + 1 :]
+    return list(takewhile(lambda word: word not in _OPTIONS, rest))
+
+
+def executables(package: SourcePackage) -> dict[str, str | Path]:
+    """Return what ``ros2 run`` would find: ``module:function`` or a script, by name."""
+    found: dict[str, str | Path] = dict(_console_scripts(package))
+    for place, source in installed_files(package):
+        folder, _, name = place.rpartition("/")
+        if folder == f"lib/{package.name}" and source.is_file():
+            found.setdefault(name, source)
+    return found
+
+
+def compiled_executables(package: SourcePackage) -> set[str]:
+    """Return the names of the programs that a package has to be built for."""
+    found = set()
+    for command in commands(package):
+        if command.name in _PROGRAMS:
+            found |= set(command.words[:1])
+        elif command.name == "rclcpp_components_register_node":
+            found |= set(_option(command, "EXECUTABLE"))
+    return set(filter(is_expanded, found))
+
+
+def unknown_installs(package: SourcePackage) -> list[str]:
+    """Say which files and modules are installed that have no name before the package is configured,
+    with the line of ``CMakeLists.txt``."""
+    said = (
+        command.unknown()
+        for command in commands(package)
+        if (command.name == "install" and command.words[:1] in [(kind,) for kind in _KINDS])
+        or command.name in (*_PROGRAMS, _PYTHON_PACKAGE, _PYTHON_MODULE)
+    )
+    return [one for one in said if one is not None]
+
+
+def modules(package: SourcePackage) -> dict[str, Path]:
+    """Return the modules that a package would install, by name: files, or folders with modules."""
+    found = {**_modules_of_build_files(package.folder), **_modules_of_cmake(package)}
+    for place in dict.fromkeys((package.folder, package.folder / source_root(package.folder))):
+        for init in sorted(place.glob("*/__init__.py")):
+            if init.parent.name not in _NO_MODULES:
+                found.setdefault(init.parent.name, init.parent)
+        if any((place / package.name).glob("*.py")):  # without __init__.py: a namespace package
+            found.setdefault(package.name, place / package.name)
+    return {name: path for name, path in found.items() if _is_module(name, path)}
+
+
+def _is_module(name: str, path: Path) -> bool:
+    """Whether a path is a module; find_namespace_packages() takes every folder for one."""
+    is_package = (path / "__init__.py").is_file()
+    return path.is_file() or is_package or (path.is_dir() and name not in _NO_MODULES)
+
+
+def _modules_of_build_files(folder: Path) -> dict[str, Path]:
+    given = package_dir(folder)
+    root = folder / source_root(folder)
+    setup = setup_py(folder)
+    found = {str(name): root / f"{name}.py" for name in setup.get("py_modules", ())}
+    for name in {name.partition(".")[0] for name in packages(folder)}:
+        found[name] = folder / given[name] if name in given else root / name
+    return found
+
+
+def _modules_of_cmake(package: SourcePackage) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for command in commands(package):
+        words = command.words
+        if command.name == _PYTHON_PACKAGE and words and is_expanded(words[0]):
+            folder = _option(command, "PACKAGE_DIR")[:1] or [words[0]]
+            if is_expanded(folder[0]):
+                found[words[0]] = command.folder / folder[0]
+        elif command.name == _PYTHON_MODULE and words and is_expanded(words[0]):
+            path = command.folder / words[0]
+            found[path.stem] = path
+    return found
+
+
+def _option(command: Command, keyword: str) -> list[str]:
+    """Return the word after a keyword, if it is there."""
+    words = command.words
+    return list(words[words.index(keyword) + 1 :][:1]) if keyword in words else []
+
+
+def module_folders(folders: Iterable[Path], *, ask: bool = True) -> list[Path]:
+    """Return where the modules of the packages in and below some folders lie.
+
+    Unless ``ask``, no ``setup.py`` is run to find out: they may lie where people have them.
+    """
+    packages = source_packages(folders).values()
+    if not ask:
+        return [place for one in packages for place in (one.folder, one.folder / "src")]
+    return list(dict.fromkeys(path.parent for one in packages for path in modules(one).values()))
+
+
+def _console_scripts(package: SourcePackage) -> dict[str, str]:
+    found = dict(entry_points(package.folder).get("console_scripts", {}))
+    for command in commands(package):  # ament_python_install_package(NAME SETUP_CFG FILE)
+        if command.name == _PYTHON_PACKAGE and command.words:
+            given = _option(command, "SETUP_CFG") or [
+                f"{path}/../setup.cfg" for path in _option(command, "PACKAGE_DIR")
+            ]
+            for file in filter(is_expanded, given):
+                found |= console_scripts_in(command.folder / file)
+    return {name: target.partition("[")[0].strip() for name, target in found.items()}
+
+
+__all__ = [
+    "compiled_executables",
+    "executables",
+    "installed_files",
+    "module_folders",
+    "modules",
+    "unknown_installs",
+]

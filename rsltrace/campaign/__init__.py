@@ -1,1 +1,0 @@
-"""Many runs of one job, each in a process of its own."""

@@ -1,0 +1,280 @@
+"""Going through one file: every call, and every function that is passed on to be called later."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rsltrace.guard.audit import rules
+from rsltrace.guard.audit.durations import is_difference_of_now
+from rsltrace.guard.audit.exchanges import exchanged
+from rsltrace.guard.audit.model import Rule
+from rsltrace.guard.audit.names import Names
+from rsltrace.guard.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, rule_of
+from rsltrace.guard.audit.scopes import Module, Scope
+from rsltrace.guard.audit.sets import is_set, order_matters
+
+_SQL = re.compile(
+    r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)",
+    re.IGNORECASE,
+)
+_SORTERS = ("builtins.sorted", "builtins.min", "builtins.max")
+_DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
+_ORDERINGS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
+_LISTINGS_UNORDERED = (
+    "builtins.sorted",
+    "builtins.len",
+    "builtins.set",
+    "builtins.frozenset",
+    "builtins.any",
+    "builtins.all",
+    "builtins.min",
+    "builtins.max",
+)
+_SHOWING = ("str", "repr", "hex", "print", "format", "sorted", "min", "max", "divmod")
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A place that is worth a line. ``alias`` is the expression of a mere alias."""
+
+    node: ast.expr | ast.stmt
+    call: str
+    rule: Rule
+    alias: ast.expr | None = None
+
+
+def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iterator[Place]:
+    """Yield what is found in a module; ``as_script``: its ``if __name__ == "__main__"`` runs."""
+    skipped = set() if as_script else set(_never_run(module))
+    seeded = _seeded(module, names)
+    stack: list[ast.AST] = [module.tree]
+    while stack:
+        node = stack.pop()
+        if node in skipped:
+            continue
+        for place in _at(module, node, names):
+            shared = place.rule in SHARED and place.call.startswith(tuple(seeded))
+            if not shared:
+                yield place
+        stack.extend(ast.iter_child_nodes(node))
+
+
+def _at(module: Module, node: ast.AST, names: Names) -> Iterator[Place]:
+    for place, name in exchanged(module, node, names):
+        yield Place(place, name, rules.EXCHANGED)
+    if isinstance(node, ast.Call):
+        yield from _call(module, node, names)
+    elif isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Load):
+        yield from _reference(module, node, names)
+    elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        if node.name == "__del__" and isinstance(module.parents.get(node), ast.ClassDef):
+            yield Place(node, "__del__()", rules.DEL)
+    elif isinstance(node, ast.FormattedValue):
+        spec = node.format_spec
+        last = spec.values[-1] if isinstance(spec, ast.JoinedStr) and spec.values else None
+        if isinstance(last, ast.Constant) and str(last.value).endswith("n"):
+            yield Place(node.value, "format 'n'", rules.LOCALE_FORMAT)
+    elif (
+        isinstance(node, ast.BinOp)
+        and isinstance(node.op, _DIVISIONS)
+        and is_difference_of_now(node.right, module.scope_of(node))
+    ):
+        yield Place(node, f"division by {_text(node.right)}", rules.STANDS_STILL)
+    if isinstance(node, ast.expr):
+        scope = module.scope_of(node)
+        if is_set(node, scope, names) and order_matters(node, scope, names):
+            yield Place(node, f"order of the set {_text(node)}", rules.ORDER)
+
+
+def _call(module: Module, node: ast.Call, names: Names) -> Iterator[Place]:
+    scope = module.scope_of(node)
+    names.passed.clear()
+    name = names.of(node.func, scope)
+    if isinstance(node.func, ast.Attribute) and node.func.attr == "__hash__":
+        if not _inside_hash(module, node):
+            yield Place(node, "__hash__()", rules.HASH)
+        return
+    if name is None:
+        if isinstance(node.func, ast.Attribute):
+            rule = METHODS.get(node.func.attr)
+            if rule is not None and not _consumed(module, node, scope, names):
+                yield Place(node, f"{node.func.attr}()", rule)
+            if node.func.attr in ("execute", "executemany", "executescript") and node.args:
+                yield from _sql(node)
+            elif node.func.attr == "sort":
+                yield from _sorting(node, scope, names)
+        return
+    rule = rule_of(name)
+    if rule is not None:
+        condition = CONDITIONS.get(name)
+        listed = rule.kind == "directory" and _consumed(module, node, scope, names)
+        if (condition is None or condition(node)) and not listed:
+            first = node.args[0] if node.args and rule.kind in ("environment", "clock") else None
+            given = repr(first.value) if isinstance(first, ast.Constant) else ""
+            yield Place(node, f"{name.removeprefix('builtins.')}({given})", rule)
+    elif name == "builtins.id":
+        if _shows_address(module, node, scope, names):
+            yield Place(node, "id()", rules.ADDRESS)
+    elif name == "builtins.hash":
+        if not _inside_hash(module, node) and not _plain_number(node):
+            yield Place(node, "hash()", rules.HASH)
+    elif name in _SORTERS:
+        yield from _sorting(node, scope, names)
+
+
+def _reference(module: Module, node: ast.Name | ast.Attribute, names: Names) -> Iterator[Place]:
+    parent = module.parents.get(node)
+    scope = module.scope_of(node)
+    if isinstance(parent, ast.Attribute):
+        if parent.value is node and names.of(node, scope) == "os.environ":
+            yield from _environ(module, parent)
+        return
+    if isinstance(parent, ast.Call) and parent.func is node:
+        return
+    if _in_annotation(module, node):
+        return
+    name = names.of(node, scope)
+    if name is None:
+        return
+    if name == "os.environ":
+        if isinstance(parent, ast.Subscript) and not isinstance(parent.ctx, ast.Load):
+            return
+        if isinstance(parent, (ast.Assign, ast.AnnAssign)):
+            return  # an alias: what is read through it is found there
+        key = parent.slice if isinstance(parent, ast.Subscript) else None
+        shown = f"[{key.value!r}]" if isinstance(key, ast.Constant) else ""
+        yield Place(node, f"os.environ{shown}", rules.ENVIRON)
+        return
+    rule = rule_of(name)
+    if rule is None or name in ("numpy.datetime64", "datetime.datetime.fromtimestamp"):
+        return
+    if rule.is_class or rule.kind in ("finalizer", "locale"):
+        is_base = isinstance(parent, ast.ClassDef) and node in parent.bases
+        is_value = name.startswith("time.")  # tzname and its like are no functions
+        if not (is_base and rule.kind in ("thread", "process")) and not is_value:
+            return
+    shown = name.removeprefix("builtins.")
+    if rule.kind in ("thread", "process") and isinstance(parent, ast.ClassDef):
+        yield Place(node, f"class {parent.name}({shown})", rule)
+    else:
+        bound = isinstance(parent, (ast.Assign, ast.AnnAssign, ast.arguments))
+        yield Place(node, shown, rule, alias=node if bound else None)
+
+
+def _environ(module: Module, attribute: ast.Attribute) -> Iterator[Place]:
+    if attribute.attr in ("update", "clear", "__setitem__", "__delitem__"):
+        return
+    call = module.parents.get(attribute)
+    first = call.args[0] if isinstance(call, ast.Call) and call.args else None
+    given = f"[{first.value!r}]" if isinstance(first, ast.Constant) else ""
+    yield Place(attribute, f"os.environ{given}", rules.ENVIRON)
+
+
+def _sorting(node: ast.Call, scope: Scope, names: Names) -> Iterator[Place]:
+    """``sorted(things, key=id)``."""
+    for word in node.keywords:
+        name = names.of(word.value, scope) if word.arg == "key" else None
+        if name in ("builtins.id", "builtins.hash"):
+            rule = rules.ADDRESS if name == "builtins.id" else rules.HASH
+            yield Place(word.value, f"order by {name.removeprefix('builtins.')}()", rule)
+
+
+def _sql(node: ast.Call) -> Iterator[Place]:
+    first = node.args[0]
+    if isinstance(first, ast.Constant) and isinstance(first.value, str):
+        match = _SQL.search(first.value)
+        if match is not None:
+            yield Place(first, f"SQLite: {match.group()}", rules.SQL_CLOCK)
+
+
+def _consumed(module: Module, node: ast.expr, scope: Scope, names: Names) -> bool:
+    """Whether the order of a listing is not looked at: ``sorted(os.listdir(folder))``."""
+    place: ast.AST = node
+    user = module.parents.get(place)
+    while isinstance(user, (ast.comprehension, ast.GeneratorExp, ast.ListComp, ast.SetComp)):
+        if isinstance(user, ast.SetComp):
+            return True
+        place, user = user, module.parents.get(user)
+    return (
+        isinstance(user, ast.Call)
+        and place in user.args
+        and names.of(user.func, scope) in _LISTINGS_UNORDERED
+    )
+
+
+def _shows_address(module: Module, node: ast.Call, scope: Scope, names: Names) -> bool:
+    """Whether an ``id()`` is compared, shown or computed with; as a key it does no harm."""
+    user = module.parents.get(node)
+    if isinstance(user, ast.Compare):
+        return any(isinstance(op, _ORDERINGS) for op in user.ops)
+    if isinstance(user, (ast.FormattedValue, ast.BinOp)):
+        return True
+    if isinstance(user, ast.Lambda):
+        word = module.parents.get(user)
+        return isinstance(word, ast.keyword) and word.arg == "key"
+    if isinstance(user, ast.Tuple):
+        outer = module.parents.get(user)
+        pushed = isinstance(outer, ast.Call) and names.of(outer.func, scope)
+        return bool(pushed) and str(pushed).startswith("heapq.")
+    if isinstance(user, ast.Call):
+        name = names.of(user.func, scope) or ""
+        return name.removeprefix("builtins.") in _SHOWING
+    return False
+
+
+def _inside_hash(module: Module, node: ast.AST) -> bool:
+    place: ast.AST | None = node
+    while place is not None and not isinstance(place, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        place = module.parents.get(place)
+    return isinstance(place, ast.FunctionDef) and place.name in ("__hash__", "__eq__")
+
+
+def _plain_number(node: ast.Call) -> bool:
+    first = node.args[0] if node.args else None
+    return isinstance(first, ast.Constant) and isinstance(first.value, (int, float))
+
+
+def _in_annotation(module: Module, node: ast.AST) -> bool:
+    """Whether a name stands for a type only: an annotation, ``isinstance``, ``except``."""
+    child, parent = node, module.parents.get(node)
+    while isinstance(parent, ast.expr):
+        if isinstance(parent, ast.Call) and isinstance(parent.func, ast.Name):
+            checks = parent.func.id in ("isinstance", "issubclass", "cast", "TypeVar")
+            if checks and child in parent.args:
+                return True
+        if isinstance(parent, (ast.Call, ast.Lambda)):
+            return False
+        child, parent = parent, module.parents.get(parent)
+    if isinstance(parent, ast.AnnAssign):
+        return parent.annotation is child
+    if isinstance(parent, (ast.FunctionDef, ast.AsyncFunctionDef)):
+        return parent.returns is child
+    return isinstance(parent, (ast.arg, ast.ExceptHandler))
+
+
+def _seeded(module: Module, names: Names) -> set[str]:
+    """Return the prefixes of shared generators that the module seeds itself."""
+    found = set()
+    for node in ast.walk(module.tree):
+        if isinstance(node, ast.Call) and not rules.unseeded(node):
+            name = names.of(node.func, module.scope_of(node))
+            found |= {prefix for prefix, seed in SEEDED_BY.items() if name == seed}
+    return found
+
+
+def _never_run(module: Module) -> Iterator[ast.stmt]:
+    """Yield what only runs when the file is started itself, and what is for type checkers."""
+    for node in module.tree.body:
+        if isinstance(node, ast.If):
+            text = ast.dump(node.test)
+            main = isinstance(node.test, ast.Compare) and "'__name__'" in text
+            if main or "'TYPE_CHECKING'" in text:
+                yield from node.body
+
+
+def _text(node: ast.expr) -> str:
+    text = ast.unparse(node)
+    return text if len(text) <= 40 else text[:39] + "…"

@@ -1,0 +1,199 @@
+"""What an expression stands for, by its full name, through aliases and the user's own modules."""
+
+from __future__ import annotations
+
+import ast
+import builtins
+from collections.abc import Iterator, Mapping
+
+from rsltrace.guard.audit.rules import RULES
+from rsltrace.guard.audit.scopes import Annotated, Binding, Imported, Module, Scope
+
+_DEPTH_MAX = 20
+_BUILTINS = frozenset(dir(builtins))
+_LOADERS = ("builtins.__import__", "importlib.import_module")
+
+
+class Names:
+    """Resolves expressions in a set of modules.
+
+    ``passed`` collects the aliases (``now = time.time``) that led to a name.
+    """
+
+    def __init__(self, modules: Mapping[str, Module]) -> None:
+        self._modules = modules
+        self.passed: set[ast.AST] = set()
+        self._asked: set[tuple[Scope, str]] = set()
+        """Names that are being resolved. What ``line = line.strip()`` says of ``line`` is nothing;
+        without this, a dozen such lines would take forever."""
+
+    def of(self, node: ast.expr, scope: Scope, depth: int = 0) -> str | None:
+        """Return the full name of what ``node`` stands for, or None if that is not known."""
+        if depth > _DEPTH_MAX:
+            return None
+        if isinstance(node, ast.Name):
+            return self._first(self.bindings(node, scope), node.id, depth, _place(node.id, scope))
+        if isinstance(node, ast.Attribute):
+            owner = scope.own_class
+            if owner is not None and _is_self(node.value):
+                found = owner.attributes.get(node.attr) or owner.names.get(node.attr)
+                if found:
+                    bound = ((one, owner) for one in found)
+                    return self._first(bound, f"self.{node.attr}", depth, owner)
+            base = self.of(node.value, scope, depth + 1)
+            return None if base is None else self._canonical(f"{base}.{node.attr}", depth + 1)
+        if isinstance(node, ast.Call):
+            return self._called(node, scope, depth)
+        if isinstance(node, ast.IfExp):
+            return self.of(node.body, scope, depth + 1) or self.of(node.orelse, scope, depth + 1)
+        if isinstance(node, ast.BoolOp):
+            for value in node.values:
+                found_name = self.of(value, scope, depth + 1)
+                if found_name is not None:
+                    return found_name
+        return None
+
+    def bindings(self, node: ast.Name, scope: Scope) -> Iterator[tuple[Binding, Scope]]:
+        """Yield what a name is bound to, innermost scope that knows it."""
+        place = _place(node.id, scope)
+        if place is not None:
+            for binding in place.names[node.id]:
+                yield binding, _evaluated_in(binding, place)
+            return
+        for star in scope.module.stars:
+            if f"{star}.{node.id}" in RULES or self._has(star, node.id):
+                yield Imported(f"{star}.{node.id}"), scope
+                return
+        if node.id in _BUILTINS:
+            yield Imported(f"builtins.{node.id}"), scope
+
+    def _has(self, module: str, name: str) -> bool:
+        loaded = self._modules.get(module)
+        return loaded is not None and name in loaded.top.names
+
+    def _first(
+        self,
+        bindings: Iterator[tuple[Binding, Scope]],
+        name: str,
+        depth: int,
+        place: Scope | None,
+    ) -> str | None:
+        """Return what a name of ``place`` (None: Python's own) stands for, as far as known."""
+        key = None if place is None else (place, name)
+        if key in self._asked:
+            return None
+        if key is not None:
+            self._asked.add(key)
+        try:
+            for binding, scope in bindings:
+                found = self._bound(binding, scope, depth)
+                if found is not None:
+                    return found
+            return None
+        finally:
+            if key is not None:
+                self._asked.remove(key)
+
+    def _bound(self, binding: Binding, scope: Scope, depth: int) -> str | None:
+        if isinstance(binding, Imported):
+            return self._canonical(binding.name, depth + 1)
+        if isinstance(binding, ast.ClassDef):
+            return f"{scope.module.name}.{_path(binding, scope.module)}"
+        if isinstance(binding, ast.expr):
+            if isinstance(binding, ast.Call) and not self._loads(binding, scope, depth):
+                return None  # what a call returns is not what is called
+            found = self.of(binding, scope, depth + 1)
+            if found is not None:
+                self.passed.add(binding)
+            return found
+        assert binding is None or isinstance(binding, Annotated)
+        return None
+
+    def _loads(self, node: ast.Call, scope: Scope, depth: int) -> bool:
+        name = self.of(node.func, scope, depth + 1)
+        return name in _LOADERS or name == "builtins.getattr"
+
+    def _called(self, node: ast.Call, scope: Scope, depth: int) -> str | None:
+        """Return what ``__import__("time")`` and ``getattr(time, "time")`` stand for."""
+        name = self.of(node.func, scope, depth + 1)
+        texts = [a.value if isinstance(a, ast.Constant) else None for a in node.args]
+        if name in _LOADERS and texts and isinstance(texts[0], str):
+            return texts[0]
+        if name == "builtins.getattr" and len(texts) > 1 and isinstance(texts[1], str):
+            base = self.of(node.args[0], scope, depth + 1)
+            return None if base is None else self._canonical(f"{base}.{texts[1]}", depth + 1)
+        return None
+
+    def _canonical(self, name: str, depth: int) -> str | None:
+        """Follow a name through the modules at hand: their imports, the bases of their classes."""
+        if depth > _DEPTH_MAX or name in RULES:
+            return name
+        parts = name.split(".")
+        for count in range(len(parts) - 1, 0, -1):
+            module = self._modules.get(".".join(parts[:count]))
+            if module is None:
+                continue
+            return self._inside(module, parts[count:], depth)
+        return name
+
+    def _inside(self, module: Module, rest: list[str], depth: int) -> str | None:
+        full = ".".join([module.name, *rest])
+        if full in self._modules:
+            return full
+        scope = module.top
+        for position, part in enumerate(rest):
+            found = scope.names.get(part)
+            if not found:
+                inherited = self._inherited(scope, rest[position:], depth)
+                return inherited or (full if scope.kind == "module" else None)
+            classes = [one for one in found if isinstance(one, ast.ClassDef)]
+            if classes:
+                scope = module.scopes[classes[0]]
+                continue
+            bound = ((one, _evaluated_in(one, scope)) for one in found)
+            name = self._first(bound, part, depth + 1, scope)
+            if name is None:
+                return None
+            return self._canonical(".".join([name, *rest[position + 1 :]]), depth + 1)
+        return full
+
+    def _inherited(self, scope: Scope, rest: list[str], depth: int) -> str | None:
+        if not isinstance(scope.node, ast.ClassDef) or scope.parent is None:
+            return None
+        for base in scope.node.bases:
+            name = self.of(base, scope.parent, depth + 1)
+            found = self._canonical(".".join([name, *rest]), depth + 1) if name else None
+            if found is not None:
+                return found
+        return None
+
+
+def _path(node: ast.ClassDef, module: Module) -> str:
+    parts = [node.name]
+    place = module.parents.get(node)
+    while place is not None:
+        if isinstance(place, ast.ClassDef):
+            parts.insert(0, place.name)
+        place = module.parents.get(place)
+    return ".".join(parts)
+
+
+def _place(name: str, scope: Scope) -> Scope | None:
+    """Return the innermost scope around an expression that knows a name."""
+    place: Scope | None = scope
+    while place is not None:
+        if (place is scope or place.kind != "class") and name in place.names:
+            return place
+        place = place.parent
+    return None
+
+
+def _evaluated_in(binding: Binding, scope: Scope) -> Scope:
+    """Return the scope of an expression bound in ``scope``: a default is of the outer one."""
+    if isinstance(binding, ast.expr) and binding in scope.module.parents:
+        return scope.module.scope_of(binding)
+    return scope
+
+
+def _is_self(node: ast.expr) -> bool:
+    return isinstance(node, ast.Name) and node.id in ("self", "cls")

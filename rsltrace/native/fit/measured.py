@@ -1,0 +1,282 @@
+"""What a native run says of its links, its callbacks and its executors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.checks.latency.figures import Durations
+from rsltrace.errors import TraceError
+from rsltrace.native.fit.measurement import Execution, Executor, Link, Measured
+from rsltrace.trace.format import METADATA_NATIVE
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.native import (
+    CUT_AFTER_NS,
+    event_columns,
+    is_native,
+    missing_numbers,
+    senders_of,
+    timings,
+)
+from rsltrace.trace.reader import Trace
+
+Rows = npt.NDArray[np.void]
+Flags = npt.NDArray[np.bool_]
+
+STEP_NS = 10_000_000
+"""A system clock that moves by more than this against the steady one was set."""
+_WINDOW = 5
+"""Two clocks are read one after the other, and anything may come in between: medians of so many."""
+
+_TAKES_TIME = (
+    EventKind.TIMER,
+    EventKind.SUBSCRIPTION,
+    EventKind.SERVICE,
+    EventKind.CLIENT,
+    EventKind.ACTION,
+    EventKind.GUARD_CONDITION,
+)
+_TAKES_NONE = (EventKind.CONSTRUCT, EventKind.RESUME, EventKind.TASK)
+"""What runs on executors, too, but has no execution time in a job."""
+_EXCHANGES = (int(EventKind.SERVICE), int(EventKind.CLIENT))
+
+
+def measured(trace: Trace) -> Measured:
+    """Return what a native run says.
+
+    :raises TraceError: the trace is damaged, simulated, or has no callbacks.
+    """
+    if not is_native(trace):
+        raise TraceError(
+            f"{trace.name} is of a simulated run, whose delays and execution times its job says; "
+            "observe a real one: rsltrace record --native job.yaml -o native.mcap"
+        )
+    rows = timings(trace)
+    events = event_columns(trace)
+    if not len(rows) or not np.isin(events["kind"], _TAKES_TIME).any():
+        raise TraceError(f"{trace.name} has no callbacks: there is nothing to measure")
+    return _Run(trace, rows, events).measured()
+
+
+@dataclass
+class _Run:
+    """A native run in columns, each of shape (events,)."""
+
+    trace: Trace
+    rows: Rows
+    events: Rows
+    nodes: dict[int, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for entity in self.trace.entities.values():
+            self.nodes[entity.id] = self.trace.node_of(entity).name if entity.node else ""
+        rows = self.rows
+        self.steady, self.wall = rows["steady"].astype(np.int64), rows["wall"].astype(np.int64)
+        self.source, self.ready = rows["source"].astype(np.int64), rows["ready"].astype(np.int64)
+        self.ends = self.steady + rows["duration"].astype(np.int64)
+        self.begin_ns = self._begin()
+        self.senders = senders_of(self.trace, self.events)
+        last = len(rows) - 1
+        self.steps = [
+            np.sort(self.wall[[first, min(after, last)]])
+            for first, after in clock_steps(self.wall - self.steady)
+        ]
+
+    def _begin(self) -> int:
+        """Return when the run began as a simulated one does, with timers that are made then: a
+        period before the first of them was due (else when all nodes were there), steady."""
+        kinds = self.events["kind"]
+        for place in np.flatnonzero(kinds == int(EventKind.TIMER))[:1].tolist():
+            period = self.trace.entity(int(self.events["entity"][place])).detail.get("period_ns")
+            if isinstance(period, int) and self.ready[place]:
+                due = self.steady[place] + self.ready[place] - self.wall[place]
+                return int(due) - period
+        made = self.ends[kinds == int(EventKind.CONSTRUCT)]
+        return int(made.max()) if len(made) else int(self.steady[0])
+
+    def measured(self) -> Measured:
+        executor_of, executors = self._executors()
+        kinds = self.events["kind"]
+        received = np.isin(kinds, (int(EventKind.SUBSCRIPTION), *_EXCHANGES))
+        return Measured(
+            tuple(self._links()),
+            tuple(self._executions(executor_of)),
+            executors,
+            tuple(self._idle()),
+            int((received & (self.source != 0) & (self.senders < 0)).sum()),
+            int((kinds == int(EventKind.TASK)).sum()),
+            len(self.steps),
+            self._policy(),
+        )
+
+    def _policy(self) -> str | None:
+        native = self.trace.metadata(METADATA_NATIVE)
+        single = native.get("executor", "").startswith("SingleThreadedExecutor")
+        return native.get("policy") or ("rclpy" if single else None)
+
+    # -- links -----------------------------------------------------------------------------------
+
+    def _links(self) -> Iterator[Link]:
+        kinds, known = self.events["kind"], (self.source != 0) & (self.ready != 0)
+        groups: dict[tuple[str, str | None, str, bool], list[int]] = {}
+        for place in np.flatnonzero(known).tolist():
+            kind, number = int(kinds[place]), int(self.events["entity"][place])
+            topic = self.trace.entity(number).name
+            if kind in _EXCHANGES:
+                groups.setdefault((topic, None, "", True), []).append(place)
+            elif kind == EventKind.SUBSCRIPTION:
+                sender = int(self.senders[place])
+                name = self.nodes.get(sender) if sender >= 0 else None
+                groups.setdefault((topic, name, self.nodes[number], False), []).append(place)
+        for (topic, sender_name, receiver, is_service), places in sorted(
+            groups.items(), key=lambda item: tuple(map(str, item[0]))
+        ):
+            yield self._link(topic, sender_name, receiver, is_service, np.array(places))
+
+    def _link(
+        self,
+        topic: str,
+        sender: str | None,
+        receiver: str,
+        is_service: bool,
+        places: npt.NDArray[np.intp],
+    ) -> Link:
+        source, ready = self.source[places], self.ready[places]
+        delays, waits = ready - source, self.wall[places] - ready
+        stepped = np.zeros(len(places), dtype=bool)
+        for low, high in self.steps:
+            stepped |= (source <= high) & (self.wall[places] >= low)
+        negative = ~stepped & (delays < 0)
+        good = ~stepped & ~negative
+        missing = None
+        if not is_service and sender is not None:
+            numbers, who = self.rows["sequence"][places], self.senders[places]
+            missing = missing_numbers(numbers, who)
+        return Link(
+            topic,
+            sender,
+            receiver,
+            is_service,
+            (self.steady[places] + source - self.wall[places] - self.begin_ns)[good],
+            delays[good],
+            np.maximum(waits[good], 0),
+            int(negative.sum()),
+            int(stepped.sum()),
+            missing,
+        )
+
+    # -- callbacks -------------------------------------------------------------------------------
+
+    def _executions(self, executor_of: npt.NDArray[np.int64]) -> Iterator[Execution]:
+        kinds = self.events["kind"]
+        overhead, tails = self._overhead(executor_of), self._tails()
+        groups: dict[tuple[str, str], list[int]] = {}
+        for place in np.flatnonzero(np.isin(kinds, _TAKES_TIME)).tolist():
+            number = int(self.events["entity"][place])
+            entity = self.trace.entity(number)
+            if number and entity.kind is not EntityKind.NODE and entity.name:
+                groups.setdefault((self.nodes[number], entity.name), []).append(place)
+        for (node, name), listed in sorted(groups.items()):
+            places = np.array(listed)
+            runs = self.rows["duration"][places].astype(np.int64)
+            suspended = (self.events["flags"][places] & int(EventFlag.SUSPENDED)) != 0
+            cut = suspended & (runs >= CUT_AFTER_NS)
+            known = tails[places][tails[places] >= 0]
+            yield Execution(
+                node,
+                name,
+                EventKind(int(kinds[places[0]])).name.lower(),
+                self.steady[places] - overhead[places] - self.begin_ns,
+                runs,
+                runs + overhead[places],
+                int((suspended & ~cut).sum()),
+                int(cut.sum()),
+                int(np.median(known)) if len(known) else 0,
+            )
+
+    def _overhead(self, executor_of: npt.NDArray[np.int64]) -> Durations:
+        """Return how long each event's executor took for it before it began: since its input was
+        there, and since the event before it had ended; 0 where that is unknown."""
+        before = np.zeros(len(self.rows), dtype=np.int64)
+        ready = self.steady + self.ready - self.wall
+        for executor in np.unique(executor_of).tolist():
+            mine = np.flatnonzero(executor_of == executor)
+            ends = np.sort(self.ends[mine])
+            starts = self.steady[mine]
+            last = np.searchsorted(ends, starts, side="right") - 1
+            free = np.where(last >= 0, ends[np.maximum(last, 0)], np.iinfo(np.int64).min)
+            before[mine] = starts - np.maximum(np.minimum(ready[mine], starts), free)
+        for low, high in self.steps:
+            before[(self.ready <= high) & (self.wall >= low)] = 0
+        before[self.ready == 0] = 0
+        return before
+
+    def _tails(self) -> Durations:
+        """Return for each event the time from the last of its messages that somebody received to
+        its end; -1 if nobody did."""
+        tails = np.full(len(self.rows), -1, dtype=np.int64)
+        causes = self.events["cause_event"]
+        known = (self.source != 0) & (causes < np.arange(len(causes)))
+        of = causes[known].astype(np.int64)
+        left = np.full(len(self.rows), np.iinfo(np.int64).min)
+        np.maximum.at(left, of, self.source[known] - self.wall[of])
+        sent = left > np.iinfo(np.int64).min
+        lasted = self.rows["duration"].astype(np.int64)
+        tails[sent] = np.clip(lasted[sent] - left[sent], 0, lasted[sent])
+        return tails
+
+    def _executors(self) -> tuple[npt.NDArray[np.int64], tuple[Executor, ...]]:
+        """Return which executor each event ran on, by number, and the executors with their nodes.
+
+        What shares a thread with something shares its executor; threads of a multi-threaded one
+        share its nodes.
+        """
+        threads = self.rows["thread"].astype(np.int64)
+        leader: dict[object, object] = {}
+
+        def find(one: object) -> object:
+            while leader.setdefault(one, one) != one:
+                one = leader[one]
+            return one
+
+        on_executor = np.isin(self.events["kind"], (*_TAKES_TIME, *_TAKES_NONE))
+        pairs = np.unique(np.stack((self.events["entity"], threads))[:, on_executor], axis=1).T
+        shared = {(self.nodes.get(number, ""), thread) for number, thread in pairs.tolist()}
+        for node, thread in sorted(shared):
+            if node:
+                leader[find(node)] = find(thread)
+        places = {thread: find(thread) for thread in np.unique(threads).tolist()}
+        numbers = {one: number for number, one in enumerate(dict.fromkeys(places.values()))}
+        by_thread = {thread: numbers[one] for thread, one in places.items()}
+        at_work = set(threads[np.isin(self.events["kind"], _TAKES_TIME)].tolist())
+        found = []
+        for number in numbers.values():
+            nodes = {node for node, thread in shared if node and by_thread[thread] == number}
+            own = {thread for thread in at_work if by_thread[thread] == number}
+            if nodes:
+                found.append(Executor(tuple(sorted(nodes)), max(len(own), 1)))
+        return np.array([by_thread[thread] for thread in threads.tolist()]), tuple(found)
+
+    def _idle(self) -> Iterator[tuple[str, str]]:
+        ran = set(np.unique(self.events["entity"]).tolist())
+        kinds = (EntityKind.TIMER, EntityKind.SUBSCRIPTION)
+        for entity in self.trace.entities.values():
+            if entity.kind in kinds and entity.id not in ran:
+                yield self.nodes[entity.id], entity.name
+
+
+def clock_steps(offsets: Durations) -> list[tuple[int, int]]:
+    """Return between which readings a clock was set, as pairs of their places.
+
+    ``offsets`` is by how much it was ahead of the steady clock, in ns, shape (readings,).
+    """
+    if len(offsets) < 2 * _WINDOW:
+        return []
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(offsets, _WINDOW), axis=1)
+    moved = np.abs(smooth[_WINDOW:] - smooth[:-_WINDOW]) > STEP_NS
+    begins = np.flatnonzero(moved & ~np.concatenate(([False], moved[:-1])))
+    return [(int(place), int(place) + 2 * _WINDOW) for place in begins]

@@ -1,0 +1,100 @@
+"""What is analyzed: callbacks as parts of chains, on executors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import NamedTuple
+
+from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
+
+ONCE_NS = 1 << 61
+"""The period of what came once."""
+
+
+class Order(Enum):
+    """What is known of the order in which an executor runs what is ready."""
+
+    ANY = "any order"
+    """It is never idle while something is ready, and finishes what it has begun."""
+    PRIORITY = "priorities"
+    """The most urgent first (``Callback.urgency``, the lower the more)."""
+    WAIT_SET = "wait set"
+    """Timers first, then what polling points have found."""
+    POLLED = "wait set with polled timers"
+    """What polling points have found, timers as well."""
+
+
+@dataclass(frozen=True, slots=True)
+class Executor:
+    """An executor with one thread. ``above`` are those that interrupt it whenever they have
+    something to do: of the same processor, with real-time priorities that are not lower."""
+
+    order: Order = Order.ANY
+    supply: Supply = PROCESSOR
+    above: frozenset[str] = frozenset()
+
+
+class Callback(NamedTuple):
+    """A callback: its node and entity, which of those of that name it is; its kind."""
+
+    node: str
+    kind: str
+    name: str
+    ordinal: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.node} {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A callback as a part of a chain (a tree of them: what comes of a task are its children).
+
+    ``executor`` is None where it is on one that is not analyzed. ``arrivals`` are those of a task
+    that nothing has caused; of others ``parent`` is the index of the task that they come of,
+    ``link_ns`` the longest that messages take (None: no bound), and ``count`` how many come
+    of one run. ``place`` says which of those that a polling point has found runs first.
+    """
+
+    callback: Callback
+    executor: str | None
+    wcet_ns: int
+    arrivals: Arrivals | None = None
+    parent: int | None = None
+    link_ns: int | None = 0
+    count: int = 1
+    urgency: float = 0.0
+    place: tuple[int, ...] = ()
+
+    @property
+    def is_timer(self) -> bool:
+        """Whether it is a timer's callback."""
+        return self.callback.kind == "timer"
+
+
+@dataclass(frozen=True, slots=True)
+class System:
+    """Tasks, parents before children, and executors by name.
+
+    ``varying`` are callbacks whose urgency is not always the same.
+    """
+
+    tasks: tuple[Task, ...]
+    executors: dict[str, Executor] = field(default_factory=dict)
+    varying: frozenset[Callback] = frozenset()
+
+    def executor_of(self, task: Task) -> Executor | None:
+        """Return the executor of a task, None if it is not analyzed."""
+        return None if task.executor is None else self.executors.get(task.executor, Executor())
+
+    def arrivals(self, task: Task) -> Arrivals:
+        """Return how often the chain of a task is released."""
+        if task.parent is not None:
+            return self.arrivals(self.tasks[task.parent])
+        assert task.arrivals is not None, "what has no parent has arrivals"
+        return task.arrivals
+
+    def count(self, task: Task) -> int:
+        """Return how many of a task come of one release of its chain, at most."""
+        return task.count * (1 if task.parent is None else self.count(self.tasks[task.parent]))

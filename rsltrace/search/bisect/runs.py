@@ -1,0 +1,85 @@
+"""Running a job at a revision: in a process of its own, with the code of the worktree."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.child_processes import OWN_FOLDER, Processes, rsltrace_command
+from rsltrace.search.bisect.repository import Repository
+from rsltrace.search.bisect.worktree import Worktree
+from rsltrace.search.perturb import (
+    Recorded,
+    Surroundings,
+    can_fix_addresses,
+    record_words,
+    recorded,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Runner:
+    """Runs a job in a worktree; ``arguments`` are those of ``rsltrace record``, with paths there.
+
+    ``cwd`` is the present folder, as seen there.
+    """
+
+    repository: Repository
+    worktree: Worktree
+    arguments: tuple[str, ...]
+    processes: Processes
+    timeout_s: float | None = None
+
+    def run(self, name: str) -> Recorded:
+        """Run what is in the worktree; the trace gets a name of its own."""
+        cwd = self.folder
+        cwd.mkdir(parents=True, exist_ok=True)
+        path = self.worktree.folder / f"{name}.mcap"
+        command = rsltrace_command(record_words(self.arguments, path))
+        if can_fix_addresses():
+            command = ["setarch", "-R", *command]
+        done = self.processes.run(
+            command, cwd=cwd, env=self._environment(), timeout_s=self.timeout_s
+        )
+        return recorded(Surroundings(0, {}), path, done)
+
+    @property
+    def folder(self) -> Path:
+        """The present folder, in the worktree or as seen from there."""
+        return self.worktree.path(Path.cwd())
+
+    def _environment(self) -> Mapping[str, str]:
+        given = os.environ.get("PYTHONPATH")
+        folders = map(str, map(self.worktree.path, python_folders(self.repository)))
+        path = [*folders, *([given] if given else [])]
+        return {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join(path),
+            "PYTHONHASHSEED": "0",
+            # Sources of the same length within the same second: bytecode would be another's.
+            "PYTHONDONTWRITEBYTECODE": "1",
+        }
+
+
+def python_folders(repository: Repository) -> list[Path]:
+    """Return the folders of a checkout on Python's path, of packages that are installed in place
+    (``pip install -e``): those of a revision stand for them."""
+    found = []
+    for entry in dict.fromkeys([*sys.path, *_known_to_finders()]):
+        path = Path(entry or ".").resolve()
+        if path == OWN_FOLDER or not path.is_relative_to(repository.top):
+            continue  # this program itself is the same at every revision
+        if not path.is_relative_to(Path(sys.prefix).resolve()) and repository.has_tracked(path):
+            found.append(path)
+    return found
+
+
+def _known_to_finders() -> Iterator[str]:
+    """Yield the folders of packages that setuptools' finders know, rather than Python's path."""
+    for finder in sys.meta_path:
+        module = sys.modules.get(getattr(finder, "__module__", ""))
+        for place in getattr(module, "MAPPING", {}).values():
+            yield os.path.dirname(place)

@@ -1,0 +1,234 @@
+"""The search: both ends first, then the revisions between them that ``git bisect`` chooses."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from rsltrace.errors import BisectError
+from rsltrace.search.bisect.judges import Check
+from rsltrace.search.bisect.repository import Commit
+from rsltrace.search.bisect.runs import Runner
+from rsltrace.search.perturb import Recorded
+
+_FIRST = re.compile(r"^([0-9a-f]{40,64}) is the first bad commit$", re.MULTILINE)
+_COMMIT = re.compile("[0-9a-f]{40,64}")
+_ANY_OF = "The first bad commit could be any of:"
+_LEFT = re.compile(r"^Bisecting: (\d+) revisions? left .*\(roughly (\d+) steps?\)", re.MULTILINE)
+_ERROR = "rsltrace: error: "
+_TIMEOUT_MIN_S = 120.0
+_TIMEOUT_FACTOR = 30
+
+
+class Answer(Enum):
+    """What a revision is, in git's words."""
+
+    GOOD = "good"
+    BAD = "bad"
+    SKIP = "skip"
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A revision that was run. ``why`` says why it is skipped."""
+
+    commit: Commit
+    run: Recorded
+    answer: Answer
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search found.
+
+    ``first`` is the first changed commit; None if it is one of ``candidates``, of which all but the
+    last were skipped. ``before`` and ``after`` are the runs to compare: of the revision before the
+    change and of the first one that has it. ``tried`` is all that was run, in order.
+    """
+
+    first: Commit | None
+    candidates: tuple[Commit, ...]
+    before: Tried
+    after: Tried
+    tried: tuple[Tried, ...]
+    notes: tuple[str, ...]
+
+
+class Search:
+    """A search between two commits. ``check`` None: by the digest.
+
+    ``on_try`` is told each revision that was run, ``on_note`` what else there is to know.
+    """
+
+    def __init__(
+        self,
+        runner: Runner,
+        good: Commit,
+        bad: Commit,
+        check: Check | None,
+        *,
+        first_parent: bool = False,
+        on_try: Callable[[Tried], object] = lambda tried: None,
+        on_note: Callable[[str], object] = lambda note: None,
+    ) -> None:
+        self._runner = runner
+        self._good, self._bad = good, bad
+        self._check = check
+        self._first_parent = first_parent
+        self._on_try, self._on_note = on_try, on_note
+        self._tried: dict[str, Tried] = {}
+        self._notes: list[str] = []
+        self._failure_counts = False
+        """Whether a run in which a node raises is one like others: so it is at an end."""
+
+    def find(self) -> Found:
+        """Search.
+
+        :raises BisectError: an end does not run or is not what it is said to be, or a job is not
+            deterministic there.
+        """
+        good, bad = self._ends()
+        tree = self._runner.worktree
+        words = ["start", *(["--first-parent"] if self._first_parent else [])]
+        said = tree.bisect(*words, bad.commit.id, good.commit.id, "--")
+        while True:
+            if (first := _FIRST.search(said)) is not None:
+                return self._found([first[1]])
+            if _ANY_OF in said:
+                listed = said.split(_ANY_OF, 1)[1].split("\n")
+                return self._found([line for line in listed if _COMMIT.fullmatch(line)])
+            if (left := _LEFT.search(said)) is not None:
+                self._on_note(f"revisions left after this one: {left[1]}, runs: about {left[2]}")
+            elif "merge base must be tested" in said:
+                self._on_note(
+                    "neither end comes from the other: the commit where they diverge is run"
+                )
+            said = tree.bisect(self._at(tree.head).answer.value)
+
+    # -- the ends --------------------------------------------------------------------------------
+
+    def _ends(self) -> tuple[Tried, Tried]:
+        good, bad = self._end(self._good, "good"), self._end(self._bad, "bad")
+        self._failure_counts = bool(good.failure or bad.failure)
+        if self._check is None and good.outcome == bad.outcome:
+            raise BisectError(
+                f"{self._good.short} and {self._bad.short} do the same ({good.events} events, "
+                f"digest {good.digest}): there is no change between them to be found; a change "
+                "that no digest shows may be found with --check or --run"
+            )
+        self._digest = good.outcome
+        ends = []
+        for commit, run, wanted in (
+            (self._good, good, Answer.GOOD),
+            (self._bad, bad, Answer.BAD),
+        ):
+            again = self._run(commit, "again")
+            if again.outcome != run.outcome:
+                raise BisectError(
+                    f"the job is not deterministic at {commit}: two runs of it have the digests "
+                    f"{run.digest or '-'} and {again.digest or '-'}; rsltrace verify there says why"
+                )
+            ends.append(self._tell(self._judged(commit, run)))
+            self._expect(ends[-1], wanted)
+        return ends[0], ends[1]
+
+    def _end(self, commit: Commit, name: str) -> Recorded:
+        begin = time.monotonic()
+        run = self._run(commit)
+        if self._runner.timeout_s is None:
+            timeout_s = max(_TIMEOUT_MIN_S, _TIMEOUT_FACTOR * (time.monotonic() - begin))
+            self._runner = replace(self._runner, timeout_s=timeout_s)
+        if not run.digest:
+            raise BisectError(f"the {name} revision ({commit}) does not run: {self._why(run)}")
+        return run
+
+    def _expect(self, tried: Tried, wanted: Answer) -> None:
+        if tried.answer is wanted:
+            return
+        assert self._check is not None
+        if tried.answer is Answer.SKIP:
+            raise BisectError(f"{wanted.value} revision {tried.commit}: {tried.why}")
+        does = "fails" if wanted is Answer.GOOD else "holds"
+        raise BisectError(
+            f"{self._check.words!r} {does} at {tried.commit}, which is said to be {wanted.value}"
+        )
+
+    # -- one revision ----------------------------------------------------------------------------
+
+    def _at(self, commit_id: str) -> Tried:
+        """Run and judge the revision that is in the worktree, unless that has been done."""
+        if commit_id in self._tried:
+            return self._tried[commit_id]
+        commit = self._runner.repository.commit(commit_id)
+        run = self._run(commit)
+        return self._tell(self._judged(commit, run))
+
+    def _judged(self, commit: Commit, run: Recorded) -> Tried:
+        if not run.digest or (run.failure and not self._failure_counts):
+            return Tried(commit, run, Answer.SKIP, self._why(run))
+        if self._check is not None:
+            try:
+                holds = self._check.judge(run.path, self._runner.folder)
+            except BisectError as error:
+                return Tried(commit, run, Answer.SKIP, str(error))
+            return Tried(commit, run, Answer.GOOD if holds else Answer.BAD)
+        if run.outcome == self._digest:
+            return Tried(commit, run, Answer.GOOD)
+        seen = any(run.outcome == known.run.outcome for known in self._tried.values())
+        if not seen and commit != self._bad:
+            again = self._run(commit, "again")
+            if again.outcome != run.outcome:
+                why = f"not deterministic: digests {run.digest} and {again.digest or '-'}"
+                return Tried(commit, run, Answer.SKIP, why)
+        return Tried(commit, run, Answer.BAD)
+
+    def _run(self, commit: Commit, more: str = "") -> Recorded:
+        tree = self._runner.worktree
+        tree.check_out(commit.id)
+        if missing := tree.missing_submodules():
+            self._note(f"submodules are not checked out: {', '.join(missing)}")
+        return self._runner.run("-".join(filter(None, (commit.id, more))))
+
+    def _tell(self, tried: Tried) -> Tried:
+        self._tried[tried.commit.id] = tried
+        self._on_try(tried)
+        return tried
+
+    def _why(self, run: Recorded) -> str:
+        """Return why a run is none, in the words of whoever knows it best."""
+        said = [line for line in run.errors.splitlines() if line.startswith(_ERROR)]
+        why = run.failure if run.digest or not said else said[-1].removeprefix(_ERROR)
+        return why.replace(f"{self._runner.worktree.tree}/", "")
+
+    def _note(self, text: str) -> None:
+        if text not in self._notes:
+            self._notes.append(text)
+            self._on_note(text)
+
+    # -- the answer ------------------------------------------------------------------------------
+
+    def _found(self, ids: list[str]) -> Found:
+        candidates = self._runner.repository.in_order(ids, self._good, self._bad)
+        first = candidates[0] if len(candidates) == 1 else None
+        known = [one for one in self._tried.values() if one.answer is Answer.BAD]
+        after = next((one for one in known if one.commit.id in ids), known[0])
+        return Found(
+            first,
+            tuple(candidates),
+            self._before(first),
+            after,
+            tuple(self._tried.values()),
+            tuple(self._notes),
+        )
+
+    def _before(self, first: Commit | None) -> Tried:
+        """Return the run to compare with: of the commit's parent, if that runs."""
+        if first is not None:
+            found = self._at(first.parents[0])
+            if found.answer is not Answer.SKIP:
+                return found
+        return [one for one in self._tried.values() if one.answer is Answer.GOOD][-1]

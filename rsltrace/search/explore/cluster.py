@@ -1,0 +1,268 @@
+"""Trials on the workers of a Dask cluster, beyond one machine.
+
+Every worker of Dask gets the files of the job once, under their hash, and runs trials in processes
+of rsltrace's own (``workers.Worker``), as many at a time as it has threads. Rows come back; the
+trace of a run that failed is fetched if it is one of those that are kept.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from rsltrace._version import __version__
+from rsltrace.errors import ExploreError
+from rsltrace.search.explore.bundle import Bundle, bundle_of
+from rsltrace.search.explore.kept_traces import KeptTraces
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
+from rsltrace.search.explore.workers import Worker
+
+try:
+    from distributed import Client, Future, KilledWorker, WorkerPlugin, get_worker
+    from distributed.comm.core import CommClosedError
+except ImportError:
+    raise ExploreError(
+        "a cluster needs Dask: pip install 'rsltrace[explore]', here and on the workers"
+    ) from None
+
+CONFIGURED = "dask"
+"""Stands for the scheduler that Dask's own configuration names (DASK_SCHEDULER_ADDRESS)."""
+
+_CONNECT_S = 30
+_TRIES_MAX = 3
+_AHEAD = 2
+"""Tasks that a worker's thread has waiting, so that it need not wait for us."""
+
+
+class _Place(WorkerPlugin):  # type: ignore[misc]
+    """What a worker of Dask has of a job: its files, and processes that run its trials."""
+
+    idempotent = True
+
+    def __init__(self, bundle: Bundle, *, pins: bool) -> None:
+        self.bundle = bundle
+        self.name = f"rsltrace-{bundle.hash}-{pins}"
+        self._pins = pins
+
+    def setup(self, worker: Any) -> None:
+        """Unpack the files."""
+        self.folder = Path(worker.local_directory) / f"{self.name}-{os.getpid()}"
+        shutil.rmtree(self.folder, ignore_errors=True)
+        self.bundle.unpack(self.folder)
+        self.traces = self.folder.with_name(f"{self.folder.name}.traces")
+        self.traces.mkdir(exist_ok=True)
+        self._source = self.bundle.source(self.folder)
+        self._idle: queue.SimpleQueue[Worker] = queue.SimpleQueue()
+
+    def teardown(self, worker: Any) -> None:
+        """End the processes, and delete the files."""
+        with suppress(queue.Empty):
+            while True:
+                self._idle.get_nowait().close()
+        for folder in (self.folder, self.traces):
+            shutil.rmtree(folder, ignore_errors=True)
+
+    def run(self, trial: Trial, wants: Wants, timeout_s: float | None, name: str) -> TrialResult:
+        """Run a trial in a process that is idle, or a new one."""
+        try:
+            one = self._idle.get_nowait()
+        except queue.Empty:
+            one = Worker(self._source, pins=self._pins)
+        try:
+            found = one.run(trial, self.traces / name, wants, timeout_s)
+        except BaseException:
+            one.close()
+            raise
+        self._idle.put(one)
+        return found
+
+
+def _run(
+    place: str, trial: Mapping[str, Any], wants: Mapping[str, Any], timeout_s: float | None
+) -> tuple[dict[str, Any], str]:
+    """Run a trial: the task. Returns the result's values, and the worker's address."""
+    worker = get_worker()
+    held: _Place = worker.plugins[place]
+    name = f"{trial['number']:06d}.mcap"
+    found = held.run(Trial(**trial), Wants(**wants), timeout_s, name)
+    return found.as_values(), str(worker.address)
+
+
+def _take_trace(path: str, read: bool) -> bytes:
+    """Take a trace away from the worker, or only delete it."""
+    data = Path(path).read_bytes() if read else b""
+    Path(path).unlink(missing_ok=True)
+    return data
+
+
+def _version() -> str:
+    return __version__
+
+
+class Cluster:
+    """The workers of a cluster, as ``workers.Workers`` has those of this machine: ``submit`` while
+    ``idle``, ``results`` waits for the next ones. A context manager."""
+
+    def __init__(self, source: JobSource, address: str, *, pins: bool = True) -> None:
+        """``address``: of a scheduler (``tcp://host:8786``), the path of a scheduler file, or
+        ``dask`` for what Dask's configuration says.
+
+        :raises JobError: the job is wrong.
+        :raises ExploreError: a file of it cannot be read.
+        """
+        self._place = _Place(bundle_of(source), pins=pins)
+        self._address = address
+        self._futures: dict[Future, tuple[Trial, Path]] = {}
+        self._kept = KeptTraces()
+        self._client: Client | None = None
+
+    def __enter__(self) -> Cluster:
+        """Connect, and send the job's files to the workers there are.
+
+        :raises ExploreError: nobody answers, or a worker cannot run the job.
+        """
+        try:
+            self._client = _connected(self._address)
+            self._client.wait_for_workers(1, timeout=_CONNECT_S)
+            self._check_versions()
+            self._client.register_plugin(self._place)
+        except ExploreError:
+            self.__exit__()
+            raise
+        except Exception as error:
+            self.__exit__()
+            said = str(error) or type(error).__name__
+            raise ExploreError(f"the cluster {self._address} cannot be used: {said}") from None
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        client, self._client = self._client, None
+        if client is None:
+            return
+        with suppress(Exception):
+            client.cancel(list(self._futures), force=True)
+        with suppress(Exception):
+            client.unregister_worker_plugin(self._place.name)
+        client.close()
+
+    def _check_versions(self) -> None:
+        """See that the workers have this rsltrace; one that cannot import it does not answer."""
+        assert self._client is not None
+        answers = self._client.run(_version, on_error="return")
+        for address, answer in answers.items():
+            if isinstance(answer, BaseException):
+                raise ExploreError(
+                    f"the worker {address} cannot run rsltrace ({type(answer).__name__}: {answer}):"
+                    f" pip install 'rsltrace[ros,explore]=={__version__}' there"
+                )
+            if answer != __version__:
+                raise ExploreError(
+                    f"the worker {address} has rsltrace {answer}, and here is {__version__}: runs "
+                    "of one search need one version"
+                )
+
+    @property
+    def threads(self) -> int:
+        """How many trials the cluster runs at a time, now."""
+        assert self._client is not None
+        return sum(self._client.nthreads().values())
+
+    @property
+    def idle(self) -> int:
+        """How many more trials can be begun."""
+        return max(_AHEAD * self.threads - self.busy, 0)
+
+    @property
+    def busy(self) -> int:
+        """How many trials are under way."""
+        return len(self._futures)
+
+    def submit(
+        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+    ) -> None:
+        """Have a worker run a trial. One that dies meanwhile is replaced by another."""
+        assert self._client is not None
+        words = (self._place.name, asdict(trial), asdict(wants), timeout_s)
+        future = self._client.submit(_run, *words, pure=False, retries=_TRIES_MAX - 1)
+        self._futures[future] = (trial, trace)
+
+    def results(self, wait_s: float | None = None) -> Iterator[TrialResult]:
+        """Wait until something has come, ``wait_s`` at most; yield the results of what is over.
+
+        :raises ExploreError: a run could not be made, or the cluster has gone.
+        """
+        ready = self._ready(wait_s)
+        for future in ready:
+            trial, trace = self._futures.pop(future)
+            yield self._result(future, trial, trace)
+
+    def _ready(self, wait_s: float | None) -> list[Future]:
+        if not self._futures:
+            return []
+        end_s = None if wait_s is None else time.monotonic() + wait_s
+        while True:
+            assert self._client is not None
+            if self._client.status not in ("running", "connecting"):
+                raise ExploreError(f"the cluster {self._address} has gone")
+            found = [one for one in self._futures if one.done()]
+            if found or (end_s is not None and time.monotonic() >= end_s):
+                return found
+            time.sleep(0.02)
+
+    def _result(self, future: Future, trial: Trial, trace: Path) -> TrialResult:
+        try:
+            values, address = future.result()
+        except KilledWorker:
+            text = "the workers that ran it have died, one after the other"
+            return TrialResult(trial, failure=Failure(CRASH, text, "crash of the worker"))
+        except ExploreError:
+            raise
+        except Exception as error:
+            raise ExploreError(
+                f"trial {trial.number} could not be run on {self._address}: "
+                f"{type(error).__name__}: {error}"
+            ) from None
+        finally:
+            future.release()
+        return self._with_trace(result_of(values), address, trace)
+
+    def _with_trace(self, found: TrialResult, address: str, trace: Path) -> TrialResult:
+        """Fetch the trace of a run if it may be kept, else have it deleted."""
+        number, failure = found.trial.number, found.failure
+        wanted = failure is None or self._kept.add(failure.key, number) != number
+        if found.trace is None:
+            return found
+        assert self._client is not None
+        try:
+            answer = self._client.run(_take_trace, found.trace, wanted, workers=[address])
+        except (OSError, CommClosedError, ValueError):  # the worker has gone: the run repeats it
+            return replace(found, trace=None)
+        if not wanted:
+            return replace(found, trace=None)
+        trace.write_bytes(answer[address])
+        return replace(found, trace=str(trace))
+
+
+def _connected(address: str) -> Client:
+    if address == CONFIGURED:
+        from dask import config
+
+        if not config.get("scheduler-address", None):
+            raise ExploreError(
+                "Dask's configuration names no scheduler: set DASK_SCHEDULER_ADDRESS, or give its "
+                "address"
+            )
+        return Client(timeout=_CONNECT_S)
+    if address.endswith(".json"):
+        if not Path(address).is_file():
+            raise ExploreError(f"there is no scheduler file {address}")
+        return Client(scheduler_file=address, timeout=_CONNECT_S)
+    return Client(address, timeout=_CONNECT_S)

@@ -1,0 +1,228 @@
+"""Runs that begin alike: a process makes the beginning once, and each run goes on in a copy of it.
+
+A worker has one such process for runs in other orders and one for those with faults. It stands
+still after the prefix, between two time steps, and is asked for copies; what cannot be copied, or
+differs before that (which the copy finds), is run from the beginning, and the answer says why.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import time
+import warnings
+from collections.abc import Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.forking import die_with_parent, end_process, fork_beside, open_descriptors, why_not
+from rsltrace.line_protocol import Lines
+from rsltrace.search.explore.copies import answer_and_end, source_of, take_ends
+from rsltrace.search.explore.trial import Trial
+
+if TYPE_CHECKING:
+    from rsltrace.run.session import Session
+    from rsltrace.search.explore.outcome import Wants
+    from rsltrace.search.explore.steps import Watch
+
+_IN_COMMON: dict[str, Mapping[str, Any]] = {
+    "policy": {"policy": {"departures": []}},
+    "faults": {},
+}
+"""The overlay of the run that those with one of these begin like."""
+
+
+class Prefixes:
+    """The processes of one worker that stand at the end of a prefix."""
+
+    def __init__(self) -> None:
+        self._all: dict[str, _Prefix] = {}
+
+    def fork(self, task: dict[str, Any], tell: int, say: int) -> tuple[int | None, str]:
+        """Begin a trial in a copy of the process that has made its prefix, which answers at
+        ``tell``; return its id, or None and why there is none."""
+        kinds = list(task["trial"]["overlay"])
+        if len(kinds) != 1 or kinds[0] not in _IN_COMMON:
+            return None, "what is set for it counts from the beginning" if kinds else ""
+        prefix = self._all.get(kinds[0])
+        if prefix is None:
+            prefix = self._all[kinds[0]] = _Prefix(task, _IN_COMMON[kinds[0]])
+        return prefix.fork(task, tell, say)
+
+
+class _Prefix:
+    """The worker's side of one such process."""
+
+    def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any]) -> None:
+        ours, theirs = socket.socketpair()
+        worker = os.getpid()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # the threads beside do nothing
+            self._pid = os.fork()
+        if self._pid == 0:
+            os.setsid()
+            die_with_parent(worker)
+            ours.close()
+            _stand(task, overlay, Lines(theirs), worker)
+        theirs.close()
+        self._lines = Lines(ours)
+        self._lines.move_high()
+        timeout_s = task.get("timeout_s")
+        self._end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        answer = self._receive()
+        self._why = str(answer.get("why", ""))
+        if self._why:
+            self._end()
+
+    def fork(self, task: dict[str, Any], tell: int, say: int) -> tuple[int | None, str]:
+        if self._why:
+            return None, self._why
+        timeout_s = task.get("timeout_s")
+        self._end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        with suppress(OSError):  # it has died meanwhile: there is no answer
+            self._lines.send(task, tell, say)
+        answer = self._receive()
+        if "gone" in answer:
+            self._why = answer["why"]
+            self._end()
+        return answer.get("pid"), str(answer.get("why", ""))
+
+    def _receive(self) -> dict[str, Any]:
+        poll = select.poll()
+        poll.register(self._lines.fileno(), select.POLLIN)
+        try:
+            while (message := self._lines.next()) is None and not self._lines.ended:
+                left_ms = None
+                if self._end_s is not None:
+                    left_ms = max(self._end_s - time.monotonic(), 0) * 1000
+                if not poll.poll(left_ms):
+                    return {"gone": True, "why": "the part in common takes too long"}
+                self._lines.read()
+        except DebugError as error:
+            return {"gone": True, "why": str(error)}
+        return message or {"gone": True, "why": "the process that made the part in common has died"}
+
+    def _end(self) -> None:
+        self._lines.close()
+        with suppress(ProcessLookupError):
+            os.killpg(self._pid, signal.SIGKILL)
+        with suppress(ChildProcessError):
+            os.waitpid(self._pid, 0)
+
+
+# -- in the process itself -------------------------------------------------------------------------
+
+
+def _stand(task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worker: int) -> None:
+    """Make the prefix, and copies of this process from then on. Never returns."""
+    from rsltrace.guard.guard import engage
+
+    lines.move_high()
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os.close(nowhere)
+    kept = [number for number, _, _ in open_descriptors()]
+    try:
+        with ExitStack() as stack:
+            try:
+                standing = _Standing(task, overlay, stack)
+            except Exception as error:  # a run from the beginning says more of it
+                lines.send({"why": f"the part in common cannot be made: {error}"})
+                return
+            why = standing.why or why_not(kept, frozenset(), standing.session.inner_pairs())
+            if why:
+                lines.send({"why": why})
+                return
+            lines.send({"ready": True})
+            while True:
+                with engage(None):
+                    request = lines.receive()
+                    if request is None:
+                        return
+                    if not standing.serve(request, lines, worker):
+                        continue
+                standing.make(request)
+    finally:
+        end_process(0)
+
+
+class _Standing:
+    """A run that stands still after its prefix."""
+
+    def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any], stack: ExitStack) -> None:
+        from rsltrace.run.branching import run_up_to, why_never
+        from rsltrace.run.process import end_with_run, kept_process
+        from rsltrace.run.session import Session
+        from rsltrace.search.explore.outcome import Wants
+        from rsltrace.search.explore.steps import Watch
+        from rsltrace.trace.writer import TraceWriter
+
+        end_with_run()
+        self._stack = stack
+        self._source = source_of(task)
+        wants = Wants(**task["wants"])
+        job = self._source.job(Trial(0, overlay))
+        self.why = why_never(job)
+        writer = TraceWriter(None, force=True, events_per_segment=job.record.segment_events)
+        stack.enter_context(kept_process())
+        self.session: Session = Session(job, None, force=True, writer=writer)
+        self.session.may_become = True
+        stack.enter_context(self.session)
+        self._watch: Watch = Watch(self.session, steps=wants.steps, fork_ns=wants.fork_ns)
+        if not self.why and not run_up_to(self.session, self.session.start_ns + wants.fork_ns):
+            self.why = "the part in common ends before that"
+        self._answer_at = -1
+
+    def serve(self, task: dict[str, Any], lines: Lines, worker: int) -> bool:
+        """Answer a request with a copy of this process, if there can be one. True in the copy.
+
+        Nothing else is done here: garbage is not collected any more, and would be there in every
+        copy.
+        """
+        tell, say = task["with"]
+        try:
+            pairs = self.session.inner_pairs()
+            pid = fork_beside(worker, pairs)
+            if pid:
+                lines.send({"pid": pid})
+                return False
+            os.setsid()
+            lines.close()
+            self._answer_at = take_ends(tell, say)
+            self.session.changes_process(os.getpid(), pairs)
+            return True
+        except RsltraceError as error:
+            lines.send({"why": str(error)})
+            return False
+        finally:
+            os.close(tell)
+            os.close(say)
+
+    def make(self, task: dict[str, Any]) -> None:
+        """Go on as the run of a trial, and end this process. Never returns."""
+        from rsltrace.search.explore.outcome import Wants
+
+        answer_and_end(lambda: self._made(task, Wants(**task["wants"])), self._answer_at)
+
+    def _made(self, task: dict[str, Any], wants: Wants) -> dict[str, Any]:
+        from rsltrace.run.branching import why_not as why_no_branch
+        from rsltrace.search.explore.outcome import result_of_run
+
+        began = time.perf_counter()
+        trial = Trial(**task["trial"])
+        job = self._source.job(trial)
+        why = why_no_branch(self.session, job)
+        if why:
+            return {"why": why}
+        self.session.becomes(job)
+        self.session.settle(Path(task["trace"]))
+        self.session.go_on()
+        ran = self.session.finish()
+        self._stack.close()
+        result = result_of_run(job, trial, ran, self._watch, wants, began)
+        return {"result": replace(result, is_forked=True).as_values()}

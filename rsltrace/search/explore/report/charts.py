@@ -1,0 +1,141 @@
+"""Small pictures as SVG elements: a histogram, points over a setting, what came with the runs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
+from xml.etree.ElementTree import Element, SubElement
+
+from rsltrace.trace.model.printable import printable
+
+WIDTH, HEIGHT = 420, 180
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34
+_BINS = 24
+_POINTS_MAX = 1500
+_ASIDE = 17
+"""Points over a text lie side by side in so many places."""
+
+Points = Sequence[tuple[float, float, bool]]
+"""x, y, and whether the run failed."""
+
+
+class _Chart:
+    """A picture with two axes."""
+
+    def __init__(self, x: tuple[float, float], y: tuple[float, float], says: str) -> None:
+        self._x, self._y = _wide(x), _wide(y)
+        box = f"0 0 {WIDTH} {HEIGHT}"
+        self.element = Element(
+            "svg", {"viewBox": box, "role": "img", "aria-label": printable(says)}
+        )
+        SubElement(self.element, "title").text = printable(says)
+
+    def at(self, x: float, y: float) -> tuple[float, float]:
+        """Return where a point is drawn."""
+        left, right = self._x
+        low, high = self._y
+        across = (x - left) / (right - left) * (WIDTH - _LEFT - _RIGHT)
+        up = (y - low) / (high - low) * (HEIGHT - _TOP - _BOTTOM)
+        return round(_LEFT + across, 1), round(HEIGHT - _BOTTOM - up, 1)
+
+    def axes(self, name: str, below: Sequence[tuple[float, str]] = ()) -> None:
+        """Draw the axes; ``below`` names places on the x axis, else its ends are."""
+        floor, wall = HEIGHT - _BOTTOM, _LEFT
+        self._line(wall, floor, WIDTH - _RIGHT, floor)
+        self._line(wall, floor, wall, _TOP)
+        for value in self._y:
+            self._text(wall - 5, self.at(self._x[0], value)[1] + 4, number(value), "end")
+        for value, said in below:
+            self._text(self.at(value, self._y[0])[0], floor + 14, said, "middle")
+        if not below:
+            for value, anchor in zip(self._x, ("start", "end"), strict=True):
+                self._text(self.at(value, self._y[0])[0], floor + 14, number(value), anchor)
+        self._text((wall + WIDTH) / 2, HEIGHT - 4, name, "middle")
+
+    def bar(self, x: float, width: float, y: float, height: float, kind: str) -> None:
+        """Draw a bar."""
+        left, top = self.at(x, y + height)
+        right, floor = self.at(x + width, y)
+        size = {"width": f"{max(right - left - 1, 0.5):.1f}", "height": f"{floor - top:.1f}"}
+        place = {"x": f"{left:g}", "y": f"{top:g}", "class": kind, **size}
+        SubElement(self.element, "rect", place)
+
+    def point(self, x: float, y: float, kind: str) -> None:
+        """Draw a point."""
+        across, down = self.at(x, y)
+        place = {"cx": f"{across:g}", "cy": f"{down:g}", "r": "2.5", "class": kind}
+        SubElement(self.element, "circle", place)
+
+    def path(self, points: Iterable[tuple[float, float]], kind: str) -> None:
+        """Draw a line through points."""
+        drawn = " ".join("{:g},{:g}".format(*self.at(x, y)) for x, y in points)
+        SubElement(self.element, "polyline", {"points": drawn, "class": kind})
+
+    def _line(self, x1: float, y1: float, x2: float, y2: float) -> None:
+        ends = {"x1": f"{x1:g}", "y1": f"{y1:g}", "x2": f"{x2:g}", "y2": f"{y2:g}"}
+        SubElement(self.element, "line", ends)
+
+    def _text(self, x: float, y: float, text: str, anchor: str) -> None:
+        place = {"x": f"{x:g}", "y": f"{y:g}", "text-anchor": anchor}
+        SubElement(self.element, "text", place).text = printable(text)
+
+
+def histogram(values: Sequence[tuple[float, bool]], name: str) -> Element:
+    """Draw how often a metric has which value; runs that failed stand on top of the others."""
+    low, high = _wide((min(v for v, _ in values), max(v for v, _ in values)))
+    counts = [[0, 0] for _ in range(_BINS)]
+    for value, failed in values:
+        counts[min(int((value - low) / (high - low) * _BINS), _BINS - 1)][failed] += 1
+    most = max(map(sum, counts))
+    chart = _Chart((low, high), (0, most), f"how often {name} has which value")
+    width = (high - low) / _BINS
+    for index, (good, bad) in enumerate(counts):
+        if good:
+            chart.bar(low + index * width, width, 0, good, "good")
+        if bad:
+            chart.bar(low + index * width, width, good, bad, "bad")
+    chart.axes(name)
+    return chart.element
+
+
+def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()) -> Element:
+    """Draw a metric over a setting; ``places`` are the texts that x counts from 0."""
+    points = [one for one in points if math.isfinite(one[0]) and math.isfinite(one[1])]
+    x = (min(p[0] for p in points), max(p[0] for p in points))
+    y = (min(p[1] for p in points), max(p[1] for p in points))
+    if places:
+        x = (-0.5, len(places) - 0.5)
+    chart = _Chart(x, y, f"{y_name} over {x_name}")
+    step = max(1, len(points) // _POINTS_MAX)
+    for kind, failed in (("good", False), ("bad", True)):
+        for index, (across, up, bad) in enumerate(points[::step]):
+            aside = (index % _ASIDE / _ASIDE - 0.5) / 3 if places else 0.0
+            if bad is failed:
+                chart.point(across + aside, up, kind)
+    chart.axes(
+        f"{y_name} over {x_name}", [(float(index), said) for index, said in enumerate(places)]
+    )
+    return chart.element
+
+
+def progress(new: Sequence[bool], failed: Sequence[bool]) -> Element:
+    """Draw, over the runs, how many have done something new and how many have failed."""
+    chart = _Chart((0, len(new)), (0, max(sum(new), sum(failed), 1)), "what came with the runs")
+    for flags, kind in ((new, "good"), (failed, "bad")):
+        step = max(1, len(flags) // 400)
+        totals = [(0, 0), *enumerate(accumulate(map(int, flags)), 1)]
+        chart.path([*totals[::step], totals[-1]], kind)
+    chart.axes("runs")
+    return chart.element
+
+
+def number(value: float) -> str:
+    """Return a number in few digits."""
+    return f"{value:.3g}"
+
+
+def _wide(ends: tuple[float, float]) -> tuple[float, float]:
+    """Return two numbers that differ."""
+    low, high = ends
+    return (low, high) if high > low else (low - 0.5, high + 0.5)

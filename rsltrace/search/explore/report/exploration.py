@@ -1,0 +1,156 @@
+"""The results of a search, put in order: its failures by cause, the settings of its runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rsltrace.search.explore.trial import Failure, Trial, TrialResult, overrides_of
+
+_COMMAND_MAX = 400
+_AT_LINE = re.compile(r" at (?P<file>[^:\s]+):(?P<line>\d+)")
+
+NO_CHECKS = (
+    "the job has no checks: only exceptions, deadlocks, livelocks, crashes and runs that do not "
+    "end in time were looked for. What has to be true of every run goes into the job, as in "
+    "checks: [never: log error] (docs/checks.md)"
+)
+"""What somebody has to know of a search in which nothing else could fail."""
+
+Value = float | str
+
+
+@dataclass(frozen=True, slots=True)
+class Reduced:
+    """A failing run made small: its folder, and the one difference that decides."""
+
+    folder: str
+    decides: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Exploration:
+    """A search that has ended, or stopped.
+
+    ``job`` is the job file as it was named, ``arguments`` what else a command needs to mean the
+    same job (``--set``, ``--launch``). ``coverage`` says in sentences what was tried and what was
+    not, ``units`` has the units of metrics, ``reduced`` the runs made small by their failure's key.
+    ``checks`` is how many checks the job has.
+    """
+
+    job: str
+    results: Sequence[TrialResult]
+    strategy: str = ""
+    arguments: Sequence[str] = ()
+    coverage: Sequence[str] = ()
+    wall_s: float = 0.0
+    units: Mapping[str, str] = field(default_factory=dict)
+    reduced: Mapping[str, Reduced] = field(default_factory=dict)
+    checks: int = 0
+
+    @property
+    def caution(self) -> str:
+        """What was not looked for, in a sentence; empty if the job says what has to be true."""
+        return "" if self.checks else NO_CHECKS
+
+    @property
+    def failed(self) -> list[TrialResult]:
+        """The runs that failed."""
+        return [one for one in self.results if one.failure is not None]
+
+    @property
+    def digests(self) -> int:
+        """How many runs did what no other did."""
+        return len({one.digest for one in self.results if one.digest})
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Failures of one cause: a check, or a line where an exception is raised.
+
+    ``first`` is the run with the lowest number, ``shortest`` that with the fewest events.
+    """
+
+    key: str
+    failure: Failure
+    runs: Sequence[TrialResult]
+    reduced: Reduced | None = None
+
+    @property
+    def first(self) -> TrialResult:
+        """The run that showed it first."""
+        return self.runs[0]
+
+    @property
+    def shortest(self) -> TrialResult:
+        """The run that shows it in the fewest events, one with a trace if there is any."""
+        return min(self.runs, key=lambda one: (one.trace is None, one.events, one.trial.number))
+
+    @property
+    def place(self) -> tuple[str, int] | None:
+        """File (as seen from the job) and line that the failure names."""
+        found = _AT_LINE.search(self.key)
+        return None if found is None else (found["file"], int(found["line"]))
+
+
+def causes(explored: Exploration) -> list[Cause]:
+    """Return the failures of a search by cause, the most frequent first."""
+    groups: dict[str, list[TrialResult]] = {}
+    for one in sorted(explored.failed, key=lambda one: one.trial.number):
+        assert one.failure is not None
+        groups.setdefault(one.failure.key, []).append(one)
+    found = []
+    for key, runs in groups.items():
+        failure = runs[0].failure
+        assert failure is not None
+        found.append(Cause(key, failure, runs, explored.reduced.get(key)))
+    return sorted(found, key=lambda cause: (-len(cause.runs), cause.first.trial.number))
+
+
+def settings(trial: Trial) -> dict[str, Value]:
+    """Return what a trial sets that a metric could depend on: what was varied, and its fault."""
+    given: dict[str, Value] = {}
+    for path, value in trial.overlay.get("set", {}).items():
+        given[path] = _value(value)
+    faults = [_fault(one) for one in trial.overlay.get("faults", ())]
+    if faults:
+        given["fault"] = ", ".join(faults)
+    return given
+
+
+def _value(value: Any) -> Value:
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        return float(value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _fault(fault: Mapping[str, Any]) -> str:
+    kind = next(iter(fault), "")
+    return f"{kind} {fault.get(kind)}"
+
+
+def repeat_command(explored: Exploration, result: TrialResult) -> str | None:
+    """Return the command that makes a run again, None if it would be too long to read."""
+    words = ["rsltrace", "record", explored.job, *explored.arguments]
+    for _, override in overrides_of(result.trial):
+        path, _, value = override.partition("=")
+        if path == "seed":
+            words += ["--seed", value]
+        else:
+            words += ["--set", override]
+    command = shlex.join(words)
+    return command if len(command) <= _COMMAND_MAX else None
+
+
+def view_command(result: TrialResult) -> str | None:
+    """Return the command that shows where a run failed, None if its trace was not kept."""
+    if result.trace is None:
+        return None
+    words = ["rsltrace", "view", result.trace]
+    if result.failure is not None and result.failure.event is not None:
+        words += ["--at", str(result.failure.event)]
+    return shlex.join(words)

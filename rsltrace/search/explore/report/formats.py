@@ -1,0 +1,163 @@
+"""A search for machines: JSON, JUnit for CI servers, annotations for GitHub."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
+
+from rsltrace.errors import ExploreError
+from rsltrace.search.explore.report.effects import effects
+from rsltrace.search.explore.report.exploration import (
+    Cause,
+    Exploration,
+    causes,
+    repeat_command,
+    settings,
+    view_command,
+)
+from rsltrace.trace.model.printable import printable, printable_lines
+
+
+def json_values(explored: Exploration) -> dict[str, Any]:
+    """Return a search as JSON values: its numbers, its failures by cause, what matters."""
+    return {
+        "job": explored.job,
+        "strategy": explored.strategy,
+        "runs": len(explored.results),
+        "failed": len(explored.failed),
+        "checks": explored.checks,
+        "caution": explored.caution,
+        "digests": explored.digests,
+        "wall_s": round(explored.wall_s, 3),
+        "coverage": list(explored.coverage),
+        "causes": [_cause_values(explored, cause) for cause in causes(explored)],
+        "effects": _effect_values(explored),
+    }
+
+
+def json_text(explored: Exploration) -> str:
+    """Return a search as one line of JSON."""
+    return json.dumps(json_values(explored))
+
+
+def _cause_values(explored: Exploration, cause: Cause) -> dict[str, Any]:
+    shown = cause.shortest
+    reduced = cause.reduced
+    return {
+        "key": cause.key,
+        "kind": cause.failure.kind,
+        "text": cause.failure.text,
+        "runs": len(cause.runs),
+        "first_run": cause.first.trial.number,
+        "why": cause.first.trial.why,
+        "overlay": dict(cause.first.trial.overlay),
+        "digest": cause.first.digest,
+        "event": cause.first.failure.event if cause.first.failure else None,
+        "trace": shown.trace,
+        "repeat": repeat_command(explored, shown),
+        "view": view_command(shown),
+        "reduced": None if reduced is None else reduced.folder,
+        "decides": None if reduced is None else reduced.decides,
+    }
+
+
+def _effect_values(explored: Exploration) -> list[dict[str, Any]]:
+    if not any(settings(one.trial) for one in explored.results):
+        return []
+    try:
+        found = effects(explored.results)
+    except ExploreError:  # without scipy; the page says so
+        return []
+    return [
+        {
+            "setting": one.setting,
+            "outcome": one.outcome,
+            "strength": one.strength,
+            "sign": one.sign,
+            "p": one.p,
+            "runs": one.runs,
+        }
+        for one in found
+    ]
+
+
+def junit_text(explored: Exploration) -> str:
+    """Return a search as JUnit XML: a test that failed for each cause, one that passed if none."""
+    found = causes(explored)
+    count = str(max(len(found), 1))
+    numbers = {"tests": count, "failures": str(len(found)), "errors": "0"}
+    time = f"{explored.wall_s:.3f}"
+    suites = Element("testsuites", {"name": "rsltrace explore", **numbers, "time": time})
+    suite = SubElement(suites, "testsuite", {"name": _text(explored.job), **numbers, "time": time})
+    for cause in found:
+        case = _case(suite, explored, f"{cause.failure.kind}: {cause.key}")
+        said = f"{len(cause.runs)} of {len(explored.results)} runs: {cause.failure.text}"
+        kind = {"type": cause.failure.kind, "message": _text(said)}
+        SubElement(case, "failure", kind).text = printable_lines(_details(explored, cause))
+    if not found:
+        case = _case(suite, explored, f"{len(explored.results)} runs")
+        if explored.caution:
+            SubElement(case, "system-out").text = explored.caution
+    indent(suites)
+    return '<?xml version="1.0" encoding="utf-8"?>\n' + tostring(suites, encoding="unicode")
+
+
+def _case(suite: Element, explored: Exploration, name: str) -> Element:
+    return SubElement(suite, "testcase", {"classname": _text(explored.job), "name": _text(name)})
+
+
+def _details(explored: Exploration, cause: Cause) -> str:
+    lines = [cause.failure.text]
+    if cause.reduced is not None:
+        lines += [cause.reduced.decides, f"made small in {cause.reduced.folder}"]
+    shown = cause.shortest
+    lines += [line for line in (repeat_command(explored, shown), view_command(shown)) if line]
+    return "\n".join(filter(None, lines))
+
+
+def github_text(explored: Exploration) -> str:
+    """Return a search as workflow commands of GitHub Actions: an error for each cause, at the line
+    it names or else at the job, and a notice where there is none."""
+    found = causes(explored)
+    if not found:
+        name = _property(_from_here(explored.job))
+        said = f"{len(explored.results)} runs, none failed"
+        said += f"; {explored.caution}" if explored.caution else ""
+        return f"::notice file={name}::{_escaped(said)}"
+    lines = []
+    for cause in found:
+        file, line = _place(explored, cause)
+        where = f"file={_property(file)}" + (f",line={line}" if line else "")
+        title = _property(f"{cause.failure.kind}: {cause.key}")
+        said = f"{len(cause.runs)} of {len(explored.results)} runs\n{_details(explored, cause)}"
+        lines.append(f"::error {where},title={title}::{_escaped(said)}")
+    return "\n".join(lines)
+
+
+def _place(explored: Exploration, cause: Cause) -> tuple[str, int | None]:
+    if cause.place is None:
+        return _from_here(explored.job), None
+    file, line = cause.place
+    return _from_here(os.path.join(os.path.dirname(explored.job), file)), line
+
+
+def _from_here(path: str) -> str:
+    """Return a path as GitHub wants it: from the folder of the checkout."""
+    shown = os.path.relpath(path)
+    return Path(os.path.abspath(path) if shown.startswith("..") else shown).as_posix()
+
+
+def _text(text: str) -> str:
+    return printable(text)
+
+
+def _escaped(text: str) -> str:
+    text = printable_lines(text)
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _escaped(printable(text)).replace(":", "%3A").replace(",", "%2C")

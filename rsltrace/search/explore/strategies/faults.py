@@ -1,0 +1,161 @@
+"""Faults: single messages lost, late or twice, what bags play changed, swapped or stale, and nodes
+that crash, hang or start again."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+import numpy as np
+
+from rsltrace.errors import ExploreError
+from rsltrace.job import Job
+from rsltrace.job.dump import plain_part
+from rsltrace.run.plans.bags import PLAYER
+from rsltrace.search.explore.strategies.bag_changes import Played, is_played, played_in
+from rsltrace.search.explore.strategies.strategy import Proposal
+from rsltrace.search.explore.trial import TrialResult
+from rsltrace.simulation.chance.network import QUIET_TOPICS
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.reader import Trace
+
+_MOST = 3
+_SHORTEST_NS = 1_000_000
+_OF_MESSAGES = ("drop", "delay", "duplicate")
+
+
+class FaultWalk:
+    """Up to three random faults a run, beside those of the job: of what there is in the plain run.
+
+    Order and seed are the job's.
+    """
+
+    behaviours = False
+    steps = False
+
+    def __init__(self, job: Job, seed: int = 0, *, fork_ns: int = -1) -> None:
+        """``fork_ns``: the simulated time up to which nothing is disturbed."""
+        self._own = [plain_part(fault) for fault in job.faults]
+        self._seed = seed
+        self._fork_ns = fork_ns
+        self._topics: dict[str, range] = {}
+        """Of each topic the messages that may be disturbed."""
+        self._played: dict[str, Played] = {}
+        """Of each topic that a bag plays what it could play instead."""
+        self._progress = job.progress
+        self._nodes: dict[str, bool] = {}
+        self._events = range(1)
+        self._longest_ns = 1
+        self._kinds: Counter[str] = Counter()
+        self._tried = 0
+
+    def begin(self, plain: TrialResult) -> None:
+        """See which nodes and messages there are, and when the nodes are all made."""
+        if plain.trace is None:
+            raise ExploreError("the run of the job as it is has no trace: nothing to disturb")
+        with Trace.open(plain.trace) as trace:
+            self._longest_ns = max(trace.end_ns - trace.start_ns, 2 * _SHORTEST_NS)
+            first, first_output = _first_after(trace, self._fork_ns)
+            self._events = range(first, max(trace.ended_after or trace.event_count, 1))
+            before, after = _sent(trace, first_output)
+            names: dict[str, tuple[int, int]] = {}
+            played: dict[str, tuple[int, int]] = {}
+            for entity in trace.entities.values():
+                if entity.kind is EntityKind.NODE and entity.name != f"/{PLAYER}":
+                    self._nodes[entity.name] = bool(entity.type)  # others have a real process
+                elif before[entity.id] + after[entity.id] and entity.name not in QUIET_TOPICS:
+                    one, two = names.get(entity.name, (0, 0))
+                    names[entity.name] = one + before[entity.id], two + after[entity.id]
+                    if is_played(trace, entity) and entity.name != self._progress:
+                        one, two = played.get(entity.name, (0, 0))
+                        played[entity.name] = one + before[entity.id], two + after[entity.id]
+            self._played = played_in(trace, _to_come(played))
+        self._topics = _to_come(names)
+        if not self._events:
+            raise ExploreError("the run of the job as it is ends before runs would be forked")
+        if not self._nodes and not self._topics:
+            raise ExploreError("there are neither nodes nor messages that could be disturbed")
+
+    def propose(self, number: int) -> Proposal | None:
+        draw = Stream(self._seed, f"faults\0{number}")
+        faults = [self._fault(draw) for _ in range(1 + draw.below(_MOST))]
+        self._count(faults)
+        why = "; ".join(", ".join(f"{k} {v}" for k, v in fault.items()) for fault in faults)
+        return Proposal({"faults": [*self._own, *faults]}, why)
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        """Learn nothing."""
+        return None
+
+    def recall(self, result: TrialResult) -> None:
+        self._count(result.trial.overlay.get("faults", [])[len(self._own) :])
+
+    def coverage(self) -> list[str]:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self._kinds.items()))
+        return [
+            f"faults: {self._tried} runs with up to {_MOST} each ({kinds}), among "
+            f"{sum(map(len, self._topics.values()))} messages of {len(self._topics)} topics and "
+            f"{len(self._nodes)} nodes"
+        ]
+
+    def _count(self, faults: list[dict[str, Any]]) -> None:
+        self._tried += 1
+        self._kinds.update(next(iter(fault)) for fault in faults)
+
+    def _fault(self, draw: Stream) -> dict[str, Any]:
+        if self._topics and (not self._nodes or draw.below(2)):
+            topic = list(self._topics)[draw.below(len(self._topics))]
+            if topic in self._played and draw.below(3):
+                return self._played[topic].fault(topic, draw)
+            kind = _OF_MESSAGES[draw.below(len(_OF_MESSAGES))]
+            messages = self._topics[topic]
+            fault = {kind: topic, "message": messages[draw.below(len(messages))]}
+            return fault if kind == "drop" else {**fault, "by": self._time(draw)}
+        node = list(self._nodes)[draw.below(len(self._nodes))]
+        kinds = ("crash", "restart", "hang") if self._nodes[node] else ("crash", "restart")
+        kind = kinds[draw.below(len(kinds))]
+        fault = {kind: node, "event": self._events[draw.below(len(self._events))]}
+        return fault if kind == "crash" else {**fault, "for": self._time(draw)}
+
+    def _time(self, draw: Stream) -> str:
+        """Draw how long something lasts, evenly in its logarithm, in whole milliseconds."""
+        ratio = self._longest_ns / _SHORTEST_NS
+        return f"{max(round(math.exp(draw.uniform() * math.log(ratio))), 1)}ms"
+
+
+def _to_come(counts: dict[str, tuple[int, int]]) -> dict[str, range]:
+    """Return the numbers of a topic's messages that follow those before; nothing where none do."""
+    return {name: range(1 + one, 1 + one + two) for name, (one, two) in counts.items() if two}
+
+
+def _first_after(trace: Trace, fork_ns: int) -> tuple[int, int]:
+    """Return which event is the first after a time since the start of the run, and how many outputs
+    there are before."""
+    if fork_ns < 0:
+        return 0, 0
+    events = outputs = 0
+    for rows in trace.events():
+        stamps = rows["stamp"]
+        count = int(np.searchsorted(stamps, trace.start_ns + fork_ns, side="right"))
+        events += count
+        outputs += int(rows["outputs"][:count].sum())
+        if count < len(stamps):
+            break
+    return events, outputs
+
+
+def _sent(trace: Trace, first_output: int) -> tuple[Counter[int], Counter[int]]:
+    """Return how many messages each publisher has sent among the first outputs, and after them."""
+    sent: tuple[Counter[int], Counter[int]] = Counter(), Counter()
+    seen = 0
+    for rows in trace.outputs():
+        place = min(max(first_output - seen, 0), len(rows))
+        for counter, some in zip(sent, (rows[:place], rows[place:]), strict=True):
+            wanted = some["entity"][some["kind"] == OutputKind.MESSAGE]
+            numbers, counts = np.unique(wanted, return_counts=True)
+            counter.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+        seen += len(rows)
+    return sent

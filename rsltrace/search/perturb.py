@@ -1,0 +1,297 @@
+"""Recording a job in a process of its own whose surroundings are unlike those of any other.
+
+Whatever may differ from run to run and machine to machine without anybody noticing is made to
+differ: a job whose digest stays the same does not depend on it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from rsltrace.adapters.workspace.cache import same_place
+from rsltrace.child_processes import Done, Processes
+from rsltrace.guard.pin import THREADS
+
+HASH_SEED = "hash seed"
+FOLDER = "working directory"
+LOCALE = "locale"
+TIME_ZONE = "time zone"
+HEAP = "allocation noise"
+ADDRESSES = "address space"
+LOAD = "CPU load"
+THREAD_COUNT = "thread counts"
+KERNEL = "BLAS core type"
+CORE_TYPE = "OPENBLAS_CORETYPE"
+KINDS = (
+    HASH_SEED,
+    FOLDER,
+    LOCALE,
+    TIME_ZONE,
+    HEAP,
+    ADDRESSES,
+    LOAD,
+    THREAD_COUNT,
+    KERNEL,
+)
+
+_LOCALES = ("C", "C.UTF-8", "de_DE.UTF-8", "tr_TR.UTF-8", "POSIX", "ja_JP.UTF-8")
+_ZONES = ("UTC", "Asia/Kathmandu", "America/St_Johns", "Pacific/Apia", "XYZ+5:17")
+_KERNELS = {"sse3": "Nehalem", "avx": "Sandybridge", "avx2": "Haswell", "avx512f": "SkylakeX"}
+"""By a flag of the processor, the oldest core type of OpenBLAS that uses it."""
+
+_RESULT_MAX = 1 << 20
+"""How far from the end of what a run has printed its result can begin."""
+
+# What a process does to its heap before anything else, so that fresh memory is never zero and
+# addresses are others.
+_NOISE = """
+import sys
+del sys.path[0]
+import random as r, runpy
+g = r.Random(int(sys.argv.pop(1)))
+n = [bytes([g.randrange(1, 256)]) * g.randrange(8, 5000) for _ in range(g.randrange(500, 4000))]
+o = [object() for _ in range(g.randrange(20000))]
+del n[::2], o[::3], g, r
+sys.argv = ['rsltrace'] + sys.argv[1:]
+runpy.run_module('rsltrace', run_name='__main__')
+"""
+
+# Starts without the present folder among those that Python looks for modules in.
+_PLAIN = """
+import sys
+del sys.path[0]
+import runpy
+sys.argv[0] = 'rsltrace'
+runpy.run_module('rsltrace', run_name='__main__')
+"""
+
+# Keeps a processor busy as long as whoever started it is there.
+_BUSY = """
+import os
+parent = os.getppid()
+while os.getppid() == parent:
+    for _ in range(1000000):
+        pass
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Surroundings:
+    """How one process is set up; ``values`` has a text for every kind that is perturbed."""
+
+    number: int
+    values: Mapping[str, str]
+    alone: str = ""
+    """What sets a run apart from others of its number: the only kind that is perturbed."""
+
+    def only(self, kind: str) -> Surroundings:
+        """Return these surroundings with nothing but one kind perturbed."""
+        return Surroundings(self.number, {kind: self.values[kind]}, kind)
+
+    def __str__(self) -> str:
+        if not self.values:
+            return "nothing perturbed"
+        return ", ".join(f"{kind} {value}".rstrip() for kind, value in self.values.items())
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What came of one run.
+
+    ``digest`` is empty if the process did not get to the end of a trace. ``failure`` says what went
+    wrong, if anything did; ``errors`` is all that it wrote to stderr.
+    """
+
+    surroundings: Surroundings
+    path: Path
+    digest: str
+    events: int
+    exit_code: int
+    failure: str
+    errors: str
+
+    @property
+    def outcome(self) -> tuple[str, int]:
+        """What must be the same in every run."""
+        return self.digest, self.exit_code
+
+
+def surroundings(number: int, seed: int = 0) -> Surroundings:
+    """Return the surroundings of run ``number``; run 0 has nothing perturbed.
+
+    What differs between any two processes (hash seed, address space) is fixed where it is not
+    perturbed, so that a difference has a cause.
+    """
+    if number == 0:
+        return Surroundings(0, {})
+    chance = random.Random(f"{seed} {number}")
+    values = {
+        HASH_SEED: str(chance.randrange(2**32)),
+        FOLDER: "x" * chance.randrange(1, 60),
+        LOCALE: chance.choice(_LOCALES),
+        TIME_ZONE: chance.choice(_ZONES),
+        HEAP: str(chance.randrange(2**32)),
+        LOAD: chance.choice(("one more process, nice 5", "one more process")),
+        THREAD_COUNT: str(chance.choice((1, 2, 3, 4, 8))),
+    }
+    if can_fix_addresses():
+        values[ADDRESSES] = "random"
+    kernels = core_types()
+    if len(kernels) > 1 and not os.environ.get(CORE_TYPE):  # else the user has chosen one
+        values[KERNEL] = chance.choice(kernels)
+    return Surroundings(number, values)
+
+
+def core_types() -> tuple[str, ...]:
+    """Return the core types of OpenBLAS that this processor can be."""
+    try:
+        after = Path("/proc/cpuinfo").read_text().split("flags", 1)[1]
+        flags = set(after.split("\n", 1)[0].split())
+    except (OSError, IndexError):
+        return ()
+    return tuple(kernel for flag, kernel in _KERNELS.items() if flag in flags | {"sse3"})
+
+
+@lru_cache
+def can_fix_addresses() -> bool:
+    """Return whether a program can be started with fixed addresses; containers may forbid it."""
+    setarch = shutil.which("setarch")
+    if setarch is None:
+        return False
+    done = subprocess.run([setarch, "-R", "true"], capture_output=True, check=False)
+    return done.returncode == 0
+
+
+def record_in(
+    around: Surroundings,
+    arguments: Sequence[str],
+    folder: Path,
+    *,
+    path: Path | None = None,
+    processes: Processes | None = None,
+    timeout_s: float | None = None,
+) -> Recorded:
+    """Record in a process with these surroundings; ``arguments`` are those of ``rsltrace record``.
+
+    The trace goes to ``path``, or below ``folder`` under a name of its own. Paths in ``arguments``
+    must be absolute.
+    """
+    path = path or folder / f"{_name(around)}.mcap"
+    words = record_words(arguments, path)
+    done = run_in(around, words, folder, processes=processes, timeout_s=timeout_s)
+    return recorded(around, path, done)
+
+
+def run_in(
+    around: Surroundings,
+    words: Sequence[str],
+    folder: Path,
+    *,
+    processes: Processes | None = None,
+    timeout_s: float | None = None,
+) -> Done:
+    """Run ``rsltrace`` in a process with these surroundings. Paths in ``words`` are absolute."""
+    values = around.values
+    cwd = _working_folder(folder / f"{_name(around)}.cwd", values.get(FOLDER))
+    home = folder / f"{_name(around)}.home"
+    home.mkdir(exist_ok=True)
+    command = [sys.executable, "-c"]
+    command += [_NOISE, values[HEAP]] if HEAP in values else [_PLAIN]
+    command += words
+    if "nice" in values.get(LOAD, "") and shutil.which("nice"):
+        command = ["nice", "-n", "5", *command]
+    if ADDRESSES not in values and can_fix_addresses():
+        command = ["setarch", "-R", *command]
+    started = processes or Processes()
+    load = started.beside([sys.executable, "-c", _BUSY]) if LOAD in values else nullcontext()
+    with load:
+        return started.run(command, cwd=cwd, env=_environment(values, home), timeout_s=timeout_s)
+
+
+def _working_folder(place: Path, name: str | None) -> Path:
+    """Make a folder in which relative paths lead where they lead in the present one.
+
+    It is in ``place``. What lies in the present folder and in the one above is there as links;
+    files that a run makes beside them are its own.
+    """
+    here = Path.cwd()
+    cwd = place / (name or here.name or "here")
+    cwd.mkdir(parents=True, exist_ok=True)
+    for folder, mirror in ((here, cwd), (here.parent, place)):
+        with suppress(PermissionError):
+            for entry in folder.iterdir():
+                with suppress(FileExistsError):
+                    (mirror / entry.name).symlink_to(entry)
+    return cwd
+
+
+def _name(around: Surroundings) -> str:
+    return "-".join(("run", str(around.number), *around.alone.split()))
+
+
+def record_words(arguments: Sequence[str], path: Path) -> list[str]:
+    """Return the words of a command whose output ``recorded`` reads."""
+    return ["record", *arguments, "-o", str(path), "--force", "--quiet", "--json"]
+
+
+def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
+    """Return what came of a run, from what its process has printed."""
+    result = _result_in(done.output)
+    try:
+        digest, events = str(result["digest"]), int(result["events"])
+        failure = str(result["error"] or "")
+        path = Path(result["path"])  # a trace that was there stays if no run comes about
+    except (ValueError, KeyError, TypeError):
+        digest, events, failure = "", 0, ""
+    if done.timed_out:
+        digest, failure = "", "it took too long and was killed (see --timeout)"
+    elif done.exit_code < 0:
+        digest, failure = "", f"it was killed by {signal.Signals(-done.exit_code).name}"
+    elif not digest and not failure:
+        failure = f"it ended with exit status {done.exit_code} and no trace"
+    return Recorded(around, path, digest, events, done.exit_code, failure, done.errors)
+
+
+def _result_in(output: str) -> dict[str, Any]:
+    """Return the JSON object that ``record --json`` has printed, which may stand in the middle of a
+    line: nodes print there, too (a prompt, say)."""
+    end = output[-_RESULT_MAX:]
+    for found in reversed(list(re.finditer(r'\{"', end))):
+        try:
+            value, _ = json.JSONDecoder().raw_decode(end, found.start())
+        except ValueError:
+            continue
+        if "digest" in value and "events" in value:
+            return dict(value)
+    return {}
+
+
+def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
+    env = {**os.environ, **same_place()}
+    env["PYTHONHASHSEED"] = values.get(HASH_SEED, "0")
+    if FOLDER in values:
+        env["HOME"] = str(home)
+    if LOCALE in values:
+        env.update(LC_ALL=values[LOCALE], LANG=values[LOCALE])
+    if TIME_ZONE in values:
+        env["TZ"] = values[TIME_ZONE]
+    if HEAP in values:
+        env["PADDING"] = "p" * (int(values[HEAP]) % 4000)
+    if THREAD_COUNT in values:
+        env.update(dict.fromkeys(THREADS, values[THREAD_COUNT]))
+    if KERNEL in values:
+        env[CORE_TYPE] = values[KERNEL]
+    return env

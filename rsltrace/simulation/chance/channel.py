@@ -1,0 +1,187 @@
+"""One way from a sender to a receiver: how long a message takes, whether it arrives, in what order.
+
+``Model`` describes, ``Channel`` is one link's state in a run. Each purpose (delay, drop, burst,
+duplicate, the delay of the copy) has a stream of its own, so that switching one on does not change
+what others draw.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rsltrace.simulation.chance.distribution import Constant, Distribution
+from rsltrace.simulation.chance.stream import Stream
+
+LOST_DROP = -1
+LOST_BURST = -2
+LOST_OUTAGE = -3
+
+_ATTEMPTS_MAX = 1000
+"""A reliable link gives a message up after losing it this many times in a row."""
+
+
+@dataclass(frozen=True, slots=True)
+class Burst:
+    """Loss in bursts, after Gilbert and Elliott: a chain of a good and a bad state.
+
+    Probabilities per message: of going from good to bad and back, and of a loss in each state.
+    """
+
+    good_to_bad: float
+    bad_to_good: float
+    loss_bad: float = 1.0
+    loss_good: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """What happens to the messages of a link. ``None`` for a delay of nothing.
+
+    ``retransmit_ns`` is what each loss costs on a reliable link. ``keep_order``: a message never
+    overtakes an earlier one of its link.
+    """
+
+    delay: Distribution | None = None
+    drop: float = 0.0
+    burst: Burst | None = None
+    duplicate: float = 0.0
+    keep_order: bool = True
+    retransmit_ns: int = 10_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Outage:
+    """Nothing gets through from ``from_ns`` up to, not including, ``to_ns`` of simulated time."""
+
+    from_ns: int
+    to_ns: int
+
+
+NO_MODEL = Model()
+
+
+class Channel:
+    """The messages of one link, in the order in which they are sent.
+
+    ``transmit`` returns the delay in ns, or one of the ``LOST_…`` codes. After it ``duplicate_ns``
+    is the delay of a second copy, or -1; ``held_until_ns`` is the end of the outage through which
+    a reliable link held the message back, or -1. ``plain`` is the sampler of a link that does
+    nothing but delay, for callers in a hurry; ``keep_order`` is then theirs to see to.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        *,
+        seed: int,
+        name: str,
+        start_ns: int,
+        reliable: bool,
+        outages: tuple[Outage, ...] = (),
+    ) -> None:
+        delay = model.delay or Constant(0)
+        self.name = name
+        self.duplicate_ns = -1
+        self.held_until_ns = -1
+        self._model = model
+        self._reliable = reliable
+        self.outages = _joined(outages)
+        self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
+        self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
+        self._drop = Stream(seed, f"{name}\0drop").uniform
+        self._burst = Stream(seed, f"{name}\0burst").uniform
+        self._duplicate = Stream(seed, f"{name}\0duplicate").uniform
+        self._bad = False
+        self._last_ns = -1
+        self.keep_order = model.keep_order
+        lossy = model.drop > 0.0 or model.burst is not None or model.duplicate > 0.0
+        self.plain = None if lossy or outages else self._delay
+
+    def transmit(self, now_ns: int) -> int:
+        """Send one message at ``now_ns``."""
+        if self.plain is not None:
+            delay_ns = self.plain(now_ns)
+        else:
+            delay_ns = self._troubled(now_ns)
+            if delay_ns < 0:
+                return delay_ns
+        if self.keep_order:
+            delay_ns = max(delay_ns, self._last_ns - now_ns)
+            self._last_ns = now_ns + delay_ns
+            if self.duplicate_ns >= 0:
+                # The copy follows its message, in front of the next one.
+                self.duplicate_ns = max(delay_ns, self.duplicate_ns)
+                self._last_ns = now_ns + self.duplicate_ns
+        return delay_ns
+
+    def hold_back(self, until_ns: int) -> None:
+        """Let nothing arrive before ``until_ns`` where the order is kept: something was late."""
+        self._last_ns = max(self._last_ns, until_ns)
+
+    def _troubled(self, now_ns: int) -> int:
+        """Return the delay over a link that may lose, duplicate or be cut off.
+
+        What is lost has its delay drawn, too, so that losses leave the delays of others alone.
+        """
+        self.duplicate_ns = self.held_until_ns = -1
+        waited_ns = 0
+        for _ in range(_ATTEMPTS_MAX):
+            sent_ns = now_ns + waited_ns
+            end_ns = self.cut_off_until(sent_ns)
+            if end_ns is not None:
+                if not self._reliable:
+                    self._delay(sent_ns)
+                    return LOST_OUTAGE
+                self.held_until_ns = end_ns
+                waited_ns = end_ns - now_ns
+                sent_ns = end_ns
+            lost = self._lost()
+            if not lost:
+                break
+            if not self._reliable:
+                self._delay(sent_ns)
+                return lost
+            waited_ns += self._model.retransmit_ns
+        else:
+            self._delay(sent_ns)
+            return lost
+        model = self._model
+        if model.duplicate > 0.0 and self._duplicate() < model.duplicate:
+            self.duplicate_ns = waited_ns + self._copy(sent_ns)
+        return waited_ns + self._delay(sent_ns)
+
+    def _lost(self) -> int:
+        """Draw whether an attempt is lost; return the code of the loss, or 0."""
+        model = self._model
+        burst = model.burst
+        if burst is not None:
+            draw = self._burst()
+            if self._bad:
+                self._bad = draw >= burst.bad_to_good
+            else:
+                self._bad = draw < burst.good_to_bad
+            loss = burst.loss_bad if self._bad else burst.loss_good
+            if loss >= 1.0 or (loss > 0.0 and self._burst() < loss):
+                return LOST_BURST
+        if model.drop > 0.0 and self._drop() < model.drop:
+            return LOST_DROP
+        return 0
+
+    def cut_off_until(self, now_ns: int) -> int | None:
+        """Return the end of the outage at ``now_ns``, or None."""
+        for outage in self.outages:
+            if outage.from_ns <= now_ns < outage.to_ns:
+                return outage.to_ns
+        return None
+
+
+def _joined(outages: Sequence[Outage]) -> tuple[Outage, ...]:
+    """Return outages in order, those that overlap or touch as one."""
+    found: list[Outage] = []
+    for outage in sorted(outages, key=lambda outage: outage.from_ns):
+        if found and outage.from_ns <= found[-1].to_ns:
+            found[-1] = Outage(found[-1].from_ns, max(found[-1].to_ns, outage.to_ns))
+        else:
+            found.append(outage)
+    return tuple(found)

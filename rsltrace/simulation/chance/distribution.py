@@ -1,0 +1,203 @@
+"""What a delay or an execution time may be: frozen values that describe, and samplers that draw.
+
+All parameters are nanoseconds unless said otherwise. ``sampler`` binds a description to a stream
+and to the start of the run; what it returns is called with the present time and gives nanoseconds,
+never negative.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from math import sqrt
+from typing import TYPE_CHECKING, Protocol
+
+from rsltrace.simulation.chance.exact import exp, log
+from rsltrace.simulation.chance.normal import quantile
+
+if TYPE_CHECKING:
+    from rsltrace.simulation.chance.stream import Stream
+
+Sampler = Callable[[int], int]
+
+LONGEST_NS = 1 << 55
+"""More than 400 days. What is drawn from a long tail ends here: it is as good as never, and
+simulated time, like ROS's own, ends at 2**63 ns."""
+
+
+class Distribution(Protocol):
+    """How long something takes."""
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        """Return a function of the present time (ns) that draws the next value (ns)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Constant:
+    """Always the same."""
+
+    value_ns: int
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        value_ns = self.value_ns
+        return lambda now_ns: value_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Uniform:
+    """Evenly between two bounds, both included."""
+
+    min_ns: int
+    max_ns: int
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        values = stream.whole_numbers(self.min_ns, self.max_ns - self.min_ns + 1)
+        # No Python function, since this is the usual jitter. The present time goes where ``next``
+        # takes what to return at the end, and there is none.
+        return partial(next, values)
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Normal with mean and standard deviation before truncation; negative draws are drawn again."""
+
+    mean_ns: int
+    sd_ns: int
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        uniform, mean, sd = stream.uniform, float(self.mean_ns), float(self.sd_ns)
+
+        def draw(now_ns: int) -> int:
+            while True:
+                value = mean + sd * quantile(uniform())
+                if value >= 0.0:
+                    return int(min(value, LONGEST_NS) + 0.5)
+
+        return draw
+
+
+@dataclass(frozen=True, slots=True)
+class Lognormal:
+    """The logarithm of value / ``median_ns`` is normal with standard deviation ``sigma``."""
+
+    median_ns: float
+    sigma: float
+
+    @classmethod
+    def of_moments(cls, mean_ns: float, sd_ns: float) -> Lognormal:
+        """Return the one with this mean and standard deviation."""
+        square = (sd_ns / mean_ns) * (sd_ns / mean_ns)
+        spread = 1.0 + square
+        if square < 1e-12:  # of which the sum keeps too little: log(1 + x) is x there
+            return cls(mean_ns, sqrt(square))
+        return cls(mean_ns / sqrt(spread), sqrt(log(spread)))
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        uniform, median, sigma = stream.uniform, self.median_ns, self.sigma
+        return lambda now_ns: int(min(median * exp(sigma * quantile(uniform())), LONGEST_NS) + 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class Gamma:
+    """Gamma with ``shape`` and ``scale_ns``: mean shape * scale, variance shape * scale**2.
+
+    Drawn by the method of Marsaglia and Tsang (ACM TOMS 26, 2000), which takes about one normal
+    and one uniform number.
+    """
+
+    shape: float
+    scale_ns: float
+
+    @classmethod
+    def of_moments(cls, mean_ns: float, sd_ns: float) -> Gamma:
+        """Return the one with this mean and standard deviation."""
+        ratio = mean_ns / sd_ns
+        return cls(ratio * ratio, sd_ns / ratio)
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        uniform, scale, small = stream.uniform, self.scale_ns, self.shape < 1.0
+        power = 1.0 / self.shape
+        d = (self.shape + 1.0 if small else self.shape) - 1.0 / 3.0
+        c = 1.0 / sqrt(9.0 * d)
+
+        def draw(now_ns: int) -> int:
+            while True:
+                x = quantile(uniform())
+                v = 1.0 + c * x
+                if v <= 0.0:
+                    continue
+                v = v * v * v
+                if log(uniform()) < 0.5 * x * x + d - d * v + d * log(v):
+                    break
+            value = d * v * scale
+            if small:  # a gamma of shape + 1, times a uniform to the power of 1 / shape
+                value *= exp(max(log(uniform()) * power, -700.0))
+            return int(min(value, LONGEST_NS) + 0.5)
+
+        return draw
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """One of some measured values, each as likely as the others."""
+
+    values_ns: tuple[int, ...]
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        below, values, count = stream.below, self.values_ns, len(self.values_ns)
+        return lambda now_ns: values[below(count)]
+
+
+@dataclass(frozen=True, slots=True)
+class Empirical:
+    """A table of quantiles: ``percent`` of all values, from 0 to 100, are at most ``values_ns``.
+
+    Between two lines of the table values are as likely as each other.
+    """
+
+    percent: tuple[float, ...]
+    values_ns: tuple[int, ...]
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        uniform, percent, values = stream.uniform, self.percent, self.values_ns
+
+        def draw(now_ns: int) -> int:
+            at = uniform() * 100.0
+            place = bisect_right(percent, at, 1, len(percent) - 1)
+            low, low_ns = percent[place - 1], values[place - 1]
+            part = (at - low) / (percent[place] - low)
+            return low_ns + int(part * (values[place] - low_ns) + 0.5)
+
+        return draw
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A value that changes over time: points (ns since the start of the run, value in ns).
+
+    Before the first point and after the last one, theirs holds. Between points the value is
+    interpolated, or with ``steps`` that of the point before.
+    """
+
+    points: tuple[tuple[int, int], ...]
+    steps: bool = False
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        times = [time_ns for time_ns, _ in self.points]
+        points, steps, last = self.points, self.steps, len(self.points) - 1
+
+        def value(now_ns: int) -> int:
+            since_ns = now_ns - start_ns
+            place = bisect_right(times, since_ns) - 1
+            if place < 0:
+                return points[0][1]
+            time_ns, value_ns = points[place]
+            if place == last or steps:
+                return value_ns
+            next_ns, next_value_ns = points[place + 1]
+            run_ns = next_ns - time_ns
+            return value_ns + (next_value_ns - value_ns) * (since_ns - time_ns) // run_ns
+
+        return value

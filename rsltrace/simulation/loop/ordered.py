@@ -1,0 +1,306 @@
+"""The loop of jobs that say who runs next: policies, simulated executors, execution times.
+
+It keeps the rules of ``loop.py`` except for the order: timers that are due are candidates beside
+what is ready, a policy chooses, and an executor all of whose workers are busy waits. A loop of its
+own, so that the plain one does not pay for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from heapq import heappop
+from typing import Any
+
+from rsltrace.errors import RunError
+from rsltrace.simulation.loop.choices import Choices
+from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
+from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy
+from rsltrace.simulation.loop.timer import TimerState
+
+
+@dataclass(eq=False)
+class Workers:
+    """A simulated executor: how many callbacks it can run at once, and how many are running."""
+
+    name: str
+    count: int = 1
+    running: int = 0
+
+    @property
+    def are_busy(self) -> bool:
+        """Whether each of them runs a callback."""
+        return self.running >= self.count
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What the loop has to know of something that may run.
+
+    ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
+    exclusive callback group, or None. To dispatch what is ``told`` only tells an executor of the
+    user's own of it.
+    """
+
+    candidate: Candidate
+    workers: Workers | None
+    exclusive: object | None
+    told: bool = False
+
+
+class Charge:
+    """How long the callback under way will have taken; the middleware adds to it."""
+
+    __slots__ = ("duration_ns",)
+
+    def __init__(self) -> None:
+        self.duration_ns = 0
+
+
+class _Waiting:
+    """Stands in for the plain loop's queues: what became ready, in order of arrival."""
+
+    def __init__(self, place: Callable[[Dispatchable], Place], runs: Callable[[Place], bool]):
+        self.places: list[Place] = []
+        self._place = place
+        self._runs = runs
+
+    def append(self, item: Dispatchable) -> None:
+        self.places.append(self._place(item))
+
+    def appendleft(self, item: Dispatchable) -> None:
+        self.insert(0, item)
+
+    def insert(self, index: int, item: Dispatchable) -> None:
+        self.places.insert(index, self._place(item))
+
+    def extend(self, items: Iterable[Dispatchable]) -> None:
+        for item in items:
+            self.append(item)
+
+    def popleft(self) -> Dispatchable:
+        item: Dispatchable = self.places.pop(0).candidate.item
+        return item
+
+    def pop(self) -> Dispatchable:
+        item: Dispatchable = self.places.pop().candidate.item
+        return item
+
+    def __getitem__(self, index: int) -> Dispatchable:
+        item: Dispatchable = self.places[index].candidate.item
+        return item
+
+    def runnable(self) -> Iterator[Place]:
+        return filter(self._runs, self.places)
+
+    def __bool__(self) -> bool:
+        return any(True for _ in self.runnable())
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+class OrderedLoop(EventLoop):
+    """An event loop with a policy. ``place`` describes what may run; the middleware sets it."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.policy: Policy = Fifo()
+        self.place: Callable[[Dispatchable], Place]
+        self.charge = Charge()
+        self.choices: Choices | None = None
+        """What the policy has chosen so far, where somebody wants to know."""
+        self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
+        """Told of every choice, of one alone, too, if somebody has to know."""
+        self.hold_until: Callable[[Sequence[Candidate], Moment], int | None] | None = None
+        """Says until when all that is ready has to wait, if somebody wants that; None: it need
+        not."""
+        self.on_lull: Callable[[], None] | None = None
+        """Told each time that nothing is left that could run, if somebody has to know."""
+        self.has_begun = False
+        """Whether it has run anything yet."""
+        self._forced: Place | None = None
+        self._held_until_ns = -1
+        self._held: dict[object, None] = {}
+        self._ready = _Waiting(lambda item: self.place(item), self._runs)
+        self._tasks = _Waiting(lambda item: self.place(item), self._runs)
+        self.ready = self._ready  # type: ignore[assignment]
+        self.tasks = self._tasks  # type: ignore[assignment]
+
+    def next_timer(self) -> TimerState | None:
+        """Return the timer that is due next; those that are overdue wait for a worker."""
+        due, after = self.timers.due(self.now_ns)
+        held = self._held_until_ns > self.now_ns
+        if not held and any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
+            return due[0]
+        return after
+
+    def run_step(self) -> None:
+        """Run everything that is due at the present time and finds a worker."""
+        self.has_begun = True
+        now_ns = self.now_ns
+        scheduled = self.scheduled
+        limit = self.events + self._livelock_limit
+        while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
+            release = heappop(scheduled)
+            receiver = release[3](release)
+            if receiver is not None:
+                self.ready.append(receiver)
+        while not self._interrupt:
+            place = self._next()
+            if place is not None:
+                self._dispatch(place)
+            else:
+                if self.on_lull is not None:
+                    self.on_lull()
+                if not self.idle or not self._run_idle():
+                    break
+            if self.events >= limit:
+                if self.now_ns == now_ns:
+                    self._livelock(now_ns)
+                now_ns = self.now_ns  # a callback has waited, and time has passed meanwhile
+                limit = self.events + self._livelock_limit
+
+    def _next(self) -> Place | None:
+        """Take out what runs next: tasks first, as rclpy has it, then what the policy chooses."""
+        forced, self._forced = self._forced, None
+        if forced is not None:
+            self._take_out(forced)
+            return forced
+        polls = self.polls
+        if polls:
+            self.hand_over()
+        tasks: list[Place] = []
+        for place in self._tasks.runnable():
+            if polls and place.candidate.kind == "task":
+                tasks.append(place)
+                continue
+            self._tasks.places.remove(place)
+            return place
+        places = tasks + self._waiting()
+        if not places:
+            return None
+        candidates = [place.candidate for place in places]
+        if self.hold_until is not None and self._holds(candidates):
+            return None
+        place = places[self.choose(candidates)]
+        self._take_out(place)
+        return place
+
+    def _holds(self, ready: list[Candidate]) -> bool:
+        """Whether what is ready is to wait, and then look again when it need not any more."""
+        assert self.hold_until is not None
+        until_ns = self.hold_until(ready, Moment(self.now_ns, self.events))
+        self._held_until_ns = -1 if until_ns is None else until_ns
+        if until_ns is None:
+            return False
+        self.schedule(until_ns, lambda: None)
+        return True
+
+    def runnable(self) -> list[Place]:
+        """Return all that could run now beside the event under way: tasks, what is ready, timers
+        that are due."""
+        return [*self._tasks.runnable(), *self._waiting()]
+
+    def starved(self) -> list[Place]:
+        """Return what is ready and has no worker, since all of its executor's are busy."""
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        every = [*self._tasks.places, *self._ready.places, *timers]
+        return [place for place in every if place.workers is not None and place.workers.are_busy]
+
+    def run_next(self, place: Place) -> None:
+        """Run one of ``runnable`` before anything else, once the event under way gives way."""
+        self._forced = place
+
+    @property
+    def polls(self) -> bool:  # type: ignore[override]
+        """Whether the policy is asked for what executors of the user's own run, and for tasks."""
+        from_ns: int | None = getattr(self.policy, "polls_from_ns", None)
+        return from_ns is not None and self.now_ns > from_ns
+
+    def hand_over(self) -> None:
+        """Tell executors of the user's own of all that is ready for them by now."""
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        for place in [*self._tasks.places, *self._ready.places, *timers]:
+            item: Dispatchable = place.candidate.item
+            if place.told and self.place(item).told:
+                self._take_out(place)
+                item.dispatch()
+
+    def forget(self, executor: str) -> None:
+        """Tell the policy that an executor begins anew, if it wants to know."""
+        forget = getattr(self.policy, "forget", None)
+        if forget is not None:
+            forget(executor)
+
+    def choose(self, ready: list[Candidate]) -> int:
+        """Have the policy choose; return the index of what it has chosen.
+
+        :raises RunError: if it cannot.
+        """
+        moment = Moment(self.now_ns, self.events)
+        choice = self._chosen(ready, moment)
+        if self.on_choice is not None:
+            self.on_choice(ready, choice, moment)
+        if self.choices is not None and len(ready) > 1:
+            self.choices.add(choice)
+        return choice
+
+    def _waiting(self) -> list[Place]:
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        return [*self._ready.runnable(), *filter(self._runs, timers)]
+
+    def _take_out(self, place: Place) -> None:
+        for queue in (self._ready.places, self._tasks.places):
+            for index, other in enumerate(queue):
+                if other is place:
+                    del queue[index]
+                    return
+
+    def _chosen(self, ready: list[Candidate], moment: Moment) -> int:
+        name = type(self.policy).__qualname__
+        try:
+            choice = self.policy.choose(ready, moment)
+        except RunError:
+            raise
+        except Exception as error:
+            raise RunError(
+                f"the policy {name} raised {type(error).__qualname__}: {error}"
+            ) from error
+        if not isinstance(choice, int) or not 0 <= choice < len(ready):
+            raise RunError(
+                f"the policy {name} chose {choice!r} of {len(ready)}: choose must return the index "
+                "of one of those that are ready"
+            )
+        return choice
+
+    def _runs(self, place: Place) -> bool:
+        workers = place.workers
+        if workers is not None and workers.are_busy:
+            return False
+        return place.exclusive is None or place.exclusive not in self._held
+
+    def _dispatch(self, place: Place) -> None:
+        """Run an event; its worker is busy until it is over, and for as long as it takes."""
+        workers = place.workers
+        item: Dispatchable = place.candidate.item
+        if workers is None:
+            item.dispatch()
+            return
+        charge = self.charge = Charge()
+        workers.running += 1
+        item.dispatch()  # comes back later in time if the callback has waited for something
+        if charge.duration_ns == 0:
+            workers.running -= 1
+            return
+        if place.exclusive is not None:
+            self._held[place.exclusive] = None
+
+        def over() -> None:
+            workers.running -= 1
+            self._held.pop(place.exclusive, None)
+
+        self.schedule(self.now_ns + charge.duration_ns, over)

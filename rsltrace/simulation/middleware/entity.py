@@ -1,0 +1,162 @@
+"""What participants and all that they make have in common (DDS: a domain entity)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Protocol
+
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.source_position import source_of
+from rsltrace.trace.model.entity import Entity, EntityKind
+
+
+@dataclass(frozen=True, slots=True)
+class Runnable:
+    """What a policy, simulated executors and execution times know of something that may run.
+
+    ``kind`` and ``name`` are what a policy sees, ``group`` is what keeps others from running at the
+    same time (a mutually exclusive callback group) with the names of its members. What has no
+    ``executor`` runs on none of the simulated ones. ``thread`` tells apart callbacks of one entity
+    that are under way at the same time, where threads are switched at lines, and numbers tasks.
+    What is ``told`` is left to an executor of the user's own.
+    """
+
+    kind: str
+    name: str
+    entity: int
+    node: Any = None
+    group: object | None = None
+    group_names: tuple[str, ...] = ()
+    period_ns: int | None = None
+    executor: bool = True
+    thread: int = 0
+    told: bool = False
+
+
+def on_no_executor(node: Any, name: str, kind: str = "thread", *, told: bool = False) -> Runnable:
+    """Describe what runs on none of the simulated executors: a thread, say."""
+    period_ns = None if node is None else node.shortest_period_ns()
+    return Runnable(kind, name, 0, node, period_ns=period_ns, executor=False, told=told)
+
+
+class Membership(Protocol):
+    """The graph, as a member sees it."""
+
+    def remove(self, member: Any) -> None:
+        """Forget a member."""
+
+    def services(self, service: str) -> list[Any]:
+        """Return the servers of a service in creation order."""
+
+
+class DomainEntity:
+    """Something with an id in the trace: a participant, an endpoint, a timer.
+
+    It is ``active`` while its participant is being run: only then does the loop hear of what comes
+    for it. ``node`` is its participant, None as long as that is not known.
+    """
+
+    kind: EntityKind
+    announced = True
+    """Whether the trace is told of the entity when it is created."""
+    begins_active = True
+    graph: Membership | None = None
+    """The graph it has joined."""
+
+    def __init__(self, dispatcher: Dispatcher, node: Any) -> None:
+        self.destroyed = False
+        self.dispatcher = dispatcher
+        self.node = node
+        self.active = self.begins_active
+        self.entity_id = dispatcher.entities.new_id()
+        self.created_ns = dispatcher.loop.now_ns
+        dispatcher.entities.pending.append(self)
+
+    def destroy(self) -> None:
+        """Leave the domain, unless that has been done."""
+        if not self.destroyed:
+            self.destroyed = True
+            self._destroy()
+
+    def _destroy(self) -> None:
+        """Give back what the entity holds; called once."""
+        if self.graph is not None:
+            self.graph.remove(self)
+
+    def settle(self) -> bool:
+        """Return whether the owner is known."""
+        return self.node is not None
+
+    # -- the trace, and who decides what runs --------------------------------------------------
+
+    def entity(self) -> Entity:
+        """Return the entity as the trace describes it."""
+        detail = self.trace_detail()
+        if source := source_of(self.user_callback()):
+            detail["source"] = source
+        if group := self.trace_group():
+            detail["group"] = group
+        return Entity(
+            id=self.entity_id,
+            node=self.node.entity_id if self.node is not None else 0,
+            kind=self.kind,
+            name=self.trace_name(),
+            type=self.trace_type(),
+            created_ns=self.created_ns,
+            detail=detail,
+        )
+
+    def trace_name(self) -> str:
+        """Return the topic, service or callback name."""
+        return ""
+
+    def trace_type(self) -> str:
+        """Return the interface type, or an empty string."""
+        return ""
+
+    def trace_detail(self) -> dict[str, object]:
+        """Return what only this kind of entity has."""
+        return {}
+
+    def trace_group(self) -> str:
+        """Return the callback group: ``exclusive 1``; "" for its node's default one, or none."""
+        return ""
+
+    def user_callback(self) -> object:
+        """Return the user's callable that its events run, None if there is none."""
+        return getattr(self, "callback", None)
+
+    def describe(self) -> str:
+        """Name the entity for people: ``/listener: subscription /chatter``."""
+        node = self.node.fully_qualified_name if self.node is not None else "(no node)"
+        return f"{node}: {self.kind.label} {self.trace_name()}"
+
+    def runnable(self) -> Runnable:
+        """Describe it to those who decide what runs next."""
+        kind = self.kind.label.replace(" ", "_")
+        return Runnable(kind, self.trace_name(), self.entity_id, self.node, period_ns=self.period())
+
+    def period(self) -> int | None:
+        """Return its own period in nanoseconds, or that of its participant's fastest timer."""
+        return None if self.node is None else self.node.shortest_period_ns()
+
+    def execution_name(self) -> tuple[str, str]:
+        """Return (kind, name) by which execution times are given."""
+        return self.kind.label, self.trace_name()
+
+
+def callback_name(callback: Callable[..., Any] | Any) -> str:
+    """Name a callback as in ``Talker.on_timer``; never with an address in it."""
+    if callback is None:
+        return ""
+    if isinstance(callback, partial):
+        return f"partial({callback_name(callback.func)})"
+    try:  # a callable object may answer anything: a mock does
+        name = callback.__qualname__
+        if isinstance(name, str):
+            return name
+    except Exception:
+        pass
+    return type(callback).__qualname__

@@ -1,0 +1,210 @@
+"""How an event is run and recorded.
+
+``Dispatcher.execute`` is the middle of everything: each event of a run passes through it once. Keep
+it small; what only some runs need is an observer (``observer.py``).
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from rsltrace.errors import OutputError
+from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
+from rsltrace.simulation.middleware.events.entity_book import EntityBook
+from rsltrace.simulation.middleware.events.event import Door, Event, OutsideEvent, Owner
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, overrides
+from rsltrace.simulation.middleware.events.outcome import Outcome
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.model.operation import pack_operation
+from rsltrace.trace.recorder import Recorder
+
+
+class Dispatcher:
+    """Runs the callbacks of one run, one event at a time, and records what comes of them.
+
+    ``recorder`` is None in a run that records nothing; ``unrecorded`` then counts the outputs of
+    the event under way. ``door`` speaks for what belongs to no participant (construction, mains).
+    ``resume_observers`` and ``node_observers`` are those to be told by whoever resumes a callback.
+    """
+
+    def __init__(self, loop: EventLoop) -> None:
+        self.loop = loop
+        self.event = Event()
+        self.entities = EntityBook()
+        self.outcome = Outcome()
+        self.recorder: Recorder | None = None
+        self.unrecorded = 0
+        self.door: Door
+        self._pending = self.entities.pending
+        self._observers: list[EventObserver] = []
+        self._before: tuple[EventObserver, ...] = ()
+        self._after: tuple[EventObserver, ...] = ()
+        self.resume_observers: tuple[EventObserver, ...] = ()
+        self.node_observers: tuple[EventObserver, ...] = ()
+
+    # -- who watches and steers --------------------------------------------------------------------
+
+    def record(self, recorder: Recorder | None) -> None:
+        """Record with ``recorder`` from now on; None: nothing any more."""
+        self.recorder = recorder
+        if recorder is not None:
+            recorder.tell([one.output for one in self._with("output")])
+
+    def add_observer(self, observer: EventObserver) -> None:
+        """Have an observer called from now on, among the others as its ``order`` says."""
+        assert all(one is not observer for one in self._observers), "it is there already"
+        self._observers.append(observer)
+        self._observers.sort(key=lambda one: one.order)  # stable
+        self._choose_observers()
+
+    def remove_observer(self, observer: EventObserver) -> None:
+        """Call an observer no longer, if it is called."""
+        self._observers = [one for one in self._observers if one is not observer]
+        self._choose_observers()
+
+    def _choose_observers(self) -> None:
+        """Find out for each hook who has one: what nobody wants to know costs nothing."""
+        self._before = self._with("before_event")[::-1]
+        self._after = self._with("after_event")
+        self.resume_observers = self._with("resumed")
+        self.node_observers = self._with("node_entered")
+        self.entities.observers = self._with("entity_created")
+        self.record(self.recorder)
+
+    def _with(self, hook: str) -> tuple[EventObserver, ...]:
+        return tuple(one for one in self._observers if overrides(one, hook))
+
+    def _is_to_happen(self, call: EventCall) -> bool:
+        """Ask observers before an event; the first that does not want it is the last one asked."""
+        return all(observer.before_event(call) for observer in self._before)
+
+    # -- events ------------------------------------------------------------------------------------
+
+    def execute(
+        self,
+        handle: Dispatchable,
+        entity: int,
+        node: Owner | None,
+        kind: int,
+        callback: Callable[..., object],
+        args: tuple[Any, ...],
+        cause_event: int,
+        cause_output: int,
+        input_hash: int,
+        is_decided: int = False,
+    ) -> None:
+        """Run one event: call ``callback(*args)`` and record what came of it. If it ``is_decided``,
+        observers have been asked."""
+        if self._before and not is_decided:
+            call = EventCall(
+                handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
+            )
+            if self._is_to_happen(call):
+                self.execute(*call.values(), True)
+            call.end()
+            return
+        event = self.event
+        event.handle = handle
+        event.entity = entity
+        event.node = node
+        event.kind = kind
+        event.cause_event = cause_event
+        event.cause_output = cause_output
+        event.input_hash = input_hash
+        try:
+            callback(*args)
+        except BaseException as error:
+            self._raised(error, handle)
+        self.end_event()
+        if event.on_end is not None:
+            on_end, event.on_end = event.on_end, None
+            on_end()
+
+    def _raised(self, error: BaseException, handle: Dispatchable) -> None:
+        """Let a door decide what becomes of an exception.
+
+        :raises OutputError: the trace cannot be written; no event may be lost quietly.
+        """
+        if isinstance(error, OutputError):
+            raise error
+        node = self.event.node
+        door: Door = self.door if node is None else node.door
+        door.raised(error, handle)
+
+    def end_event(self) -> None:
+        """Record the event under way, which may be a later part of the one ``execute`` began."""
+        if self._pending:
+            self.entities.settle(self.recorder)
+        event = self.event
+        loop = self.loop
+        recorder = self.recorder
+        node = event.node
+        state_hash = 0
+        if node is not None and node.state is not None:
+            state_hash = node.state.after_event()
+        if recorder is None:
+            self.unrecorded = 0
+        else:
+            recorder.end_event(
+                loop.now_ns,
+                event.kind,
+                event.flags,
+                event.entity,
+                event.cause_event,
+                event.cause_output,
+                event.input_hash,
+                state_hash,
+            )
+        loop.events += 1
+        event.flags = 0
+        event.quiet = False
+        if self._after:
+            for observer in self._after:
+                observer.after_event()
+
+    def run_outside(
+        self,
+        handle: OutsideEvent,
+        kind: EventKind,
+        entity: int,
+        node: Any,
+        body: Callable[[], Any],
+        cause: tuple[int, int] = (NO_EVENT, 0),
+    ) -> None:
+        """Run an event that is no entity's callback; most of them nothing in the run has caused."""
+        self.execute(handle, entity, node, kind, body, (), *cause, 0)
+
+    def in_callback(self) -> bool:
+        """Return whether the event under way is a callback's, not a main's or a thread's."""
+        return not isinstance(self.event.handle, OutsideEvent)
+
+    def has_outputs(self) -> bool:
+        """Return whether the event under way has had outputs."""
+        outputs = self.unrecorded if self.recorder is None else self.recorder.outputs
+        return bool(outputs or self._pending)
+
+    @contextlib.contextmanager
+    def outside_events(self) -> Iterator[None]:
+        """Run what belongs to no event (a stop function, finalizers): it cannot wait."""
+        handle, self.event.handle = self.event.handle, None
+        try:
+            yield
+        finally:
+            self.event.handle = handle
+
+    # -- outputs other than messages -----------------------------------------------------------
+
+    def note(self, kind: OutputKind, entity: int, operation: int = 0, value: int = 0) -> int:
+        """Add a small output (a timer changed, a task was made); return its position."""
+        if self.recorder is None:
+            self.unrecorded += 1
+            return 0
+        return self.recorder.output(kind, entity, hash64(pack_operation(operation, value)))
+
+    def draw(self, entity: int, draw: int) -> None:
+        """Write down what chance has decided, as an output of the event under way."""
+        if self.recorder is not None:
+            self.recorder.draw(entity, draw)

@@ -1,0 +1,150 @@
+"""A callback that raised: what it says, how it is recorded, and the plain way it ends a run.
+
+User exceptions can be anything: ``__str__`` may raise, and texts may hold what no file can.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from rsltrace.errors import NodeError, RunError
+from rsltrace.simulation.loop.loop import Dispatchable
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.model.event import EventFlag, OutputKind
+from rsltrace.trace.model.stamp import format_seconds
+
+_RAISED = int(EventFlag.RAISED)
+_OWN_FILES = (
+    os.path.join(Path(__file__).resolve().parents[3], ""),  # this package
+    "<serialize ",  # the code that is made for a message type
+    "<deserialize ",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Raised:
+    """An exception that came out of an event.
+
+    ``label`` names the event, ``node`` is the node's full name or empty, ``stamp_ns`` the simulated
+    time, ``traceback`` the user's frames and ``said`` the exception's own words as text.
+    """
+
+    error: BaseException
+    label: str
+    node: str
+    stamp_ns: int
+    traceback: str
+    said: str
+
+    @property
+    def kind(self) -> str:
+        """The name of the exception's class."""
+        return type(self.error).__qualname__
+
+    @property
+    def where(self) -> str:
+        """The event and its time, for an error message."""
+        return f"{self.label}, at simulated time {format_seconds(self.stamp_ns)} s"
+
+    def as_error(self, hint: str = "") -> NodeError:
+        """Return the error with which the run ends because of it."""
+        return NodeError(
+            f"{self.where} raised {self.kind}: {self.said}{hint}",
+            node=self.node,
+            entity=self.label,
+            stamp_ns=self.stamp_ns,
+            traceback_text=self.traceback,
+        )
+
+
+def described(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
+    """Return how the event under way has raised."""
+    node = dispatcher.event.node
+    return Raised(
+        error,
+        handle.describe(),
+        node.fully_qualified_name if node is not None else "",
+        dispatcher.loop.now_ns,
+        user_traceback(error),
+        text_of(error),
+    )
+
+
+def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
+    """Record that the event under way has raised, as one of its outputs; return how."""
+    event, recorder = dispatcher.event, dispatcher.recorder
+    event.flags |= _RAISED
+    raised = described(dispatcher, error, handle)
+    if recorder is not None:
+        content = hash64(f"{raised.kind}\0{raised.said}".encode())
+        recorder.detail(
+            OutputKind.EXCEPTION, event.entity, raised.stamp_ns, raised.traceback, content
+        )
+    return raised
+
+
+def end_run(dispatcher: Dispatcher, raised: Raised, error: RunError) -> None:
+    """End the run after the present event, because of what it has raised."""
+    dispatcher.outcome.error = error
+    error.__cause__ = raised.error
+    dispatcher.loop.stop(Stop(f"{raised.label} raised {raised.kind}", error.exit_code))
+
+
+class FailuresEndTheRun:
+    """The door of participants that have no other: what they raise ends the run."""
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        self._dispatcher = dispatcher
+
+    def raised(self, error: BaseException, handle: Dispatchable) -> None:
+        raised = note_raised(self._dispatcher, error, handle)
+        end_run(self._dispatcher, raised, raised.as_error())
+
+
+def text_of(error: BaseException) -> str:
+    """Return what an exception says, as text that can be written to any file."""
+    try:
+        return _writable(str(error))
+    except Exception:
+        return "(its text could not be made)"
+
+
+def _writable(text: str) -> str:
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
+def is_own_frame(frame: FrameType) -> bool:
+    """Say whether a frame is rsltrace's."""
+    return frame.f_code.co_filename.startswith(_OWN_FILES)
+
+
+def user_traceback(error: BaseException) -> str:
+    """Return the traceback without the frames of rsltrace, if there are others."""
+    with contextlib.suppress(Exception):
+        told = traceback.TracebackException(type(error), error, error.__traceback__, compact=True)
+        if not all(map(_is_own_line, told.stack)):
+            _leave_out_own(told)
+        return _writable("".join(told.format()))
+    return f"{type(error).__qualname__} (its text could not be made)"
+
+
+def _is_own_line(line: traceback.FrameSummary) -> bool:
+    return line.filename.startswith(_OWN_FILES)
+
+
+def _leave_out_own(told: traceback.TracebackException | None) -> None:
+    while told is not None:
+        told.stack = traceback.StackSummary.from_list(
+            [line for line in told.stack if not _is_own_line(line)]
+        )
+        for one in getattr(told, "exceptions", None) or ():  # of a group, from Python 3.11 on
+            _leave_out_own(one)
+        _leave_out_own(told.__context__)
+        told = told.__cause__

@@ -1,0 +1,343 @@
+"""Links with a model: messages, requests and responses that take time, get lost or come twice.
+
+A graph without models has no links, and its publications go straight into the queues.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.simulation.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
+from rsltrace.simulation.chance.network import NetworkPlan
+from rsltrace.simulation.loop.loop import ORDER_RELEASE, Release
+from rsltrace.simulation.middleware.entity import DomainEntity
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.faults import MessageFault, TopicFaults
+from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Qos, Reliability
+from rsltrace.simulation.middleware.qos.status import MESSAGE_LOST
+from rsltrace.simulation.middleware.qos.timing import RequestedLease, finite
+from rsltrace.simulation.middleware.quick_link import Send, direct_send, quick_send
+from rsltrace.simulation.middleware.receiver import Receiver
+from rsltrace.simulation.middleware.subscription import Delivery, Subscription
+from rsltrace.trace.model.draw import Draw, encode_draw
+
+# Canonical CDR, publishing event, which of its outputs, content hash, publication stamp (ns) and
+# number: what a Delivery has from [4] on.
+Message = tuple[bytes, int, int, int, int, int]
+
+_DELAY = encode_draw(Draw.DELAY)
+_LOST = {
+    LOST_DROP: encode_draw(Draw.DROP),
+    LOST_BURST: encode_draw(Draw.BURST),
+    LOST_OUTAGE: encode_draw(Draw.OUTAGE),
+}
+
+
+class Exchanges:
+    """The requests of one client to one server, or the responses."""
+
+    def __init__(self, dispatcher: Dispatcher, receiver: Receiver, channel: Channel | None) -> None:
+        self._dispatcher = dispatcher
+        self._receiver = receiver
+        self._entity = receiver.entity_id
+        self._channel = channel
+        self._plain = channel.plain if channel is not None and channel.keep_order else None
+        self._last_ns = 0
+
+    def send(self, exchange: Any) -> None:
+        """Send a request or response on its way."""
+        dispatcher = self._dispatcher
+        loop = dispatcher.loop
+        now_ns = loop.now_ns
+        arrival_ns = now_ns + dispatcher.event.busy_ns
+        channel = self._channel
+        if self._plain is not None:  # the usual case: some time, in order
+            delay_ns = self._plain(arrival_ns)
+            if arrival_ns + delay_ns < self._last_ns:
+                delay_ns = self._last_ns - arrival_ns
+            self._last_ns = arrival_ns = arrival_ns + delay_ns
+            dispatcher.draw(self._entity, _DELAY | delay_ns)
+        elif channel is not None:
+            delay_ns = channel.transmit(arrival_ns)
+            draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
+            dispatcher.draw(self._entity, draw)
+            if delay_ns < 0:
+                return
+            arrival_ns += delay_ns
+        if arrival_ns == now_ns:
+            self._arrive(exchange)
+        else:
+            loop.schedule_release(arrival_ns, self._released, exchange)
+
+    def _released(self, release: Release) -> Any:
+        if self._receiver.destroyed:
+            return None
+        return self._receiver.arrived(release[4])
+
+    def _arrive(self, exchange: Any) -> None:
+        if not self._receiver.destroyed:
+            self._receiver.deliver(exchange)
+
+
+class Link:
+    """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
+
+    What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
+    messages as its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last
+    message in order arrives.
+    """
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        offered: Qos,
+        subscription: Subscription,
+        channel: Channel | None,
+        faults: TopicFaults | None = None,
+    ) -> None:
+        self.subscription = subscription
+        self._faults = faults
+        self._loop = dispatcher.loop
+        self._dispatcher = dispatcher
+        self._channel = channel
+        self._held: deque[tuple[Message, list[int]]] = deque(maxlen=offered.keep)
+        self._lost = 0
+        self._behind_ns = 0
+        """When the last message arrives that a fault makes late: later ones come after it."""
+        self.last_ns = 0
+        self._receiver = subscription.entity_id
+        self._lifespan_ns = min(
+            limit if finite(limit) else INFINITE_NS
+            for limit in (offered.lifespan_ns, subscription.qos.lifespan_ns)
+        )
+        self._timed = self._lifespan_ns != INFINITE_NS or subscription.timed
+        self._lease: RequestedLease | None = None
+        lease_ns = subscription.qos.lease_ns
+        if finite(lease_ns):
+            events = subscription.events
+            self._lease = RequestedLease(self._loop, lease_ns, subscription.qos.liveliness, events)
+            for outage in channel.outages if channel is not None else ():
+                self._lease.cut_off(outage.from_ns, outage.to_ns)
+        self.send: Send = self._send
+        if self._timed or faults is not None:
+            return
+        if channel is None:
+            self.send = direct_send(dispatcher, self)
+        elif channel.plain and channel.keep_order:
+            self.send = quick_send(dispatcher, self, channel.plain)
+
+    def _send(
+        self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
+    ) -> None:
+        dispatcher = self._dispatcher
+        now_ns = self._loop.now_ns
+        arrival_ns = now_ns + dispatcher.event.busy_ns
+        message = (data, event, position, digest, stamp_ns, count)
+        channel = self._channel
+        fault = None
+        if self._faults is not None:
+            fault = self._faults.for_node(self.subscription.node.fully_qualified_name)
+        if fault is not None:
+            self._suffer(fault, message, arrival_ns)
+            return
+        if channel is not None:
+            delay_ns = channel.transmit(arrival_ns)
+            if delay_ns < 0:
+                dispatcher.draw(self._receiver, _LOST[delay_ns])
+                self._lost += 1
+                return
+            dispatcher.draw(self._receiver, encode_draw(Draw.DELAY, delay_ns))
+            arrivals_ns = [arrival_ns + delay_ns]
+            if channel.duplicate_ns >= 0:
+                copy_ns = arrival_ns + channel.duplicate_ns
+                dispatcher.draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+                arrivals_ns.append(copy_ns)
+            self.last_ns = max(self.last_ns, *arrivals_ns)
+            if channel.held_until_ns >= 0:
+                self._hold(message, arrivals_ns, channel.held_until_ns)
+                return
+            for arrival_ns in arrivals_ns:
+                self._bring(message, arrival_ns)
+            return
+        self._bring(message, max(arrival_ns, self._behind_ns))
+
+    def _suffer(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
+        """Send a message to which something happens that the job says.
+
+        The model of the link draws for it as for any other, so that those after it fare the same.
+        """
+        draw, channel = self._dispatcher.draw, self._channel
+        sent_ns += fault.late_ns
+        delay_ns = channel.transmit(sent_ns) if channel is not None else 0
+        if fault.is_lost or delay_ns < 0:
+            draw(self._receiver, _LOST[LOST_DROP if fault.is_lost else delay_ns])
+            self._lost += 1
+            return
+        arrivals_ns = [max(sent_ns + delay_ns, self._behind_ns)]
+        draw(self._receiver, encode_draw(Draw.DELAY, fault.late_ns + delay_ns))
+        if channel is not None and channel.duplicate_ns >= 0:
+            arrivals_ns.append(sent_ns + channel.duplicate_ns)
+        if fault.copy_ns >= 0:
+            arrivals_ns.append(arrivals_ns[-1] + fault.copy_ns)
+        now_ns = self._loop.now_ns
+        for copy_ns in arrivals_ns[1:]:
+            draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+        if channel is None:
+            self._behind_ns = arrivals_ns[-1]
+        else:
+            channel.hold_back(arrivals_ns[-1])
+            self.last_ns = max(self.last_ns, *arrivals_ns)
+        if channel is not None and channel.held_until_ns >= 0:
+            self._hold(message, arrivals_ns, channel.held_until_ns)
+            return
+        for arrival_ns in arrivals_ns:
+            self._bring(message, arrival_ns)
+
+    def _bring(self, message: Message, arrival_ns: int) -> None:
+        loop = self._loop
+        now_ns = loop.now_ns
+        if arrival_ns <= now_ns and not self.expects(self._arrive):
+            self._arrive((now_ns, ORDER_RELEASE, 0, self._arrive, *message))
+        else:
+            loop.schedule_release(arrival_ns, self._arrive, *message)
+
+    def expects(self, arrive: Callable[[Release], Any]) -> bool:
+        """Whether a message is due now that has not arrived yet: none must overtake it."""
+        scheduled, now_ns = self._loop.scheduled, self._loop.now_ns
+        return bool(scheduled and scheduled[0][0] <= now_ns) and any(
+            release[3] == arrive and release[0] <= now_ns for release in scheduled
+        )
+
+    def _arrive(self, release: Release) -> None:
+        subscription = self.subscription
+        if subscription.destroyed:
+            return
+        if self._lost:
+            lost, self._lost = self._lost, 0
+            subscription.events.add(MESSAGE_LOST, total=lost)
+        loop = self._loop
+        arrived: Delivery = (loop.now_ns, *release[1:])
+        if self._timed:
+            if self._lease is not None:
+                self._lease.seen()
+            if subscription.deadline is not None:
+                subscription.deadline.seen()
+            if self._lifespan_ns != INFINITE_NS:
+                stale_ns = arrived[8] + self._lifespan_ns
+                if stale_ns <= loop.now_ns:
+                    return
+                loop.schedule_release(stale_ns, self._expire, arrived)
+        subscription.deliver(arrived)
+
+    def _expire(self, release: Release) -> None:
+        """Drop a message that nobody has taken within its lifespan."""
+        queue = self.subscription.queue
+        for place, waiting in enumerate(queue):
+            if waiting is release[4]:
+                del queue[place]
+                return
+
+    def sign_of_life(self) -> None:
+        """Tell the subscription that its publisher is alive; takes no time, outages hide it."""
+        channel, now_ns = self._channel, self._loop.now_ns
+        hidden = channel is not None and channel.cut_off_until(now_ns) is not None
+        if self._lease is not None and not hidden:
+            self._lease.seen()
+
+    def acked_ns(self) -> int:
+        """Return when all that was sent so far has arrived, where that is acknowledged."""
+        if self.subscription.qos.reliability is not Reliability.RELIABLE:
+            return 0
+        return self.last_ns
+
+    def close(self) -> None:
+        """Forget the publisher, or the subscription: one of them goes."""
+        if self._lease is not None:
+            self._lease.gone()
+
+    def _hold(self, message: Message, arrivals_ns: list[int], until_ns: int) -> None:
+        if not self._held:
+            self._loop.schedule(until_ns, self._release)
+        elif len(self._held) == self._held.maxlen:
+            self._lost += 1
+            self.subscription.drop(len(self._held))
+        self._held.append((message, arrivals_ns))
+
+    def _release(self) -> None:
+        """Let go of what has waited through an outage."""
+        held = list(self._held)
+        self._held.clear()
+        loop = self._loop
+        for message, arrivals_ns in held:
+            for arrival_ns in arrivals_ns:
+                loop.schedule_release(max(arrival_ns, loop.now_ns), self._arrive, *message)
+
+
+class Network:
+    """Makes the links of one world, from the plan of its job."""
+
+    def __init__(self, dispatcher: Dispatcher, plan: NetworkPlan) -> None:
+        self._dispatcher = dispatcher
+        self._plan = plan
+        self._counts: dict[tuple[str, str, str], int] = {}
+        self._ends: dict[int, tuple[str, int]] = {}
+        self._requests: dict[tuple[int, int], Exchanges] = {}
+        self._responses: dict[tuple[int, int], Exchanges] = {}
+
+    def link(
+        self,
+        publisher: DomainEntity,
+        topic: str,
+        qos: Qos,
+        subscription: Subscription,
+        faults: TopicFaults | None,
+    ) -> Link:
+        """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
+        channel = self._plan.topic_channel(
+            topic,
+            self._end("publisher", topic, publisher),
+            self._end("subscription", topic, subscription),
+            reliable=subscription.qos.reliability is Reliability.RELIABLE,
+        )
+        return Link(self._dispatcher, qos, subscription, channel, faults)
+
+    def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
+        """Bring a request to the server."""
+        key = (client.entity_id, server.entity_id)
+        way = self._requests.get(key)
+        if way is None:
+            channel = self._service_channel(service, client, server, "request")
+            way = self._requests[key] = Exchanges(self._dispatcher, server, channel)
+        way.send(exchange)
+
+    def response(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
+        """Bring a response to the client."""
+        key = (client.entity_id, server.entity_id)
+        way = self._responses.get(key)
+        if way is None:
+            channel = self._service_channel(service, client, server, "response")
+            way = self._responses[key] = Exchanges(self._dispatcher, client, channel)
+        way.send(exchange)
+
+    def _service_channel(
+        self, service: str, client: Receiver, server: Receiver, what: str
+    ) -> Channel | None:
+        return self._plan.service_channel(
+            service,
+            self._end("client", service, client),
+            self._end("service", service, server),
+            what,
+        )
+
+    def _end(self, kind: str, name: str, endpoint: DomainEntity) -> tuple[str, int]:
+        """Return (node, how many such endpoints it has made before this one)."""
+        end = self._ends.get(endpoint.entity_id)
+        if end is None:
+            node = endpoint.node.fully_qualified_name
+            key = (kind, name, endpoint.node.key)
+            count = self._counts.get(key, 0)
+            self._counts[key] = count + 1
+            end = self._ends[endpoint.entity_id] = (node, endpoint.node.ordinal(count))
+        return end

@@ -1,0 +1,218 @@
+"""The graph of a world as plain values: who is there, who talks to whom, and who never will."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+
+from rsltrace.simulation.middleware.entity import DomainEntity
+from rsltrace.simulation.middleware.graph import Graph
+from rsltrace.simulation.middleware.participant import Participant
+from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible_policies
+from rsltrace.simulation.middleware.qos.timing import finite
+from rsltrace.simulation.middleware.subscription import Subscription
+from rsltrace.trace.model.built_in import NODE_SERVICES, NODE_TOPICS
+from rsltrace.trace.model.stamp import format_duration
+
+_ACTION = "/_action/"
+_CLOCK = "/clock"
+_TRANSFORMS = "/tf"
+_STATIC_TRANSFORMS = "/tf_static"
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """One end of a topic, service or action: the node, and (of a topic) its QoS in words."""
+
+    node: str
+    qos: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A topic, service or action with its ends. ``senders`` publish or call, ``receivers``
+    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policies) of the
+    pairs that do not connect."""
+
+    kind: str
+    name: str
+    type: str
+    senders: tuple[End, ...]
+    receivers: tuple[End, ...]
+    apart: tuple[tuple[End, End, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class NodeView:
+    """A node, its class, and its timers as (callback, period in ns)."""
+
+    name: str
+    type: str
+    timers: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
+    program that waits for work has)."""
+
+    nodes: tuple[NodeView, ...]
+    links: tuple[Link, ...]
+    waiting: tuple[str, ...] = ()
+    problems: tuple[str, ...] = field(default=())
+
+    def of_kind(self, kind: str) -> list[Link]:
+        """Return the links of one kind (``topic``, ``service``, ``action``), by name."""
+        return [link for link in self.links if link.kind == kind]
+
+
+def overview(
+    graph: Graph,
+    waiting: Iterable[str],
+    *,
+    everything: bool = False,
+    follows: Callable[[str], bool] = lambda node: False,
+) -> Overview:
+    """Return the present graph; ``everything`` with what every node has.
+
+    ``follows`` says whether ``/clock`` drives the time of a node; others listen to it in vain.
+    """
+    nodes = tuple(_node(node) for node in graph.nodes)
+    links = [*_topics(graph), *_services(graph), *_actions(graph)]
+    if not everything:
+        links = [link for link in links if not _is_everywhere(link)]
+    links.sort(key=lambda link: (link.kind, link.name))
+    moving = any(link.name == _TRANSFORMS and link.senders for link in links)
+    doubtful = [link for link in links if not (moving and _is_unheard_static(link))]
+    return Overview(
+        nodes,
+        tuple(links),
+        waiting=tuple(waiting),
+        problems=(
+            *_namesakes(nodes),
+            *(one for link in doubtful for one in _problems(link, follows)),
+        ),
+    )
+
+
+def _namesakes(nodes: Iterable[NodeView]) -> Iterator[str]:
+    """Yield the names that several nodes have: a mistake, most often."""
+    for name, count in Counter(node.name for node in nodes).items():
+        if count > 1:
+            yield (
+                f"{count} nodes are named {name}: their parameters, services and logs go by that "
+                "name; unless that is meant, give each a name of its own (name: or namespace:)"
+            )
+
+
+def _node(node: Participant) -> NodeView:
+    return NodeView(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
+
+
+def _topics(graph: Graph) -> Iterator[Link]:
+    for name, (type_name,) in graph.topic_names_and_types():
+        publishers, subscriptions = graph.publishers(name), graph.subscriptions(name)
+        yield Link(
+            "topic",
+            name,
+            type_name,
+            tuple(_end(publisher) for publisher in publishers),
+            tuple(_end(subscription) for subscription in subscriptions),
+            tuple(
+                (
+                    _end(publisher),
+                    _end(subscription),
+                    " and ".join(p.name.lower() for p in policies),
+                )
+                for publisher in publishers
+                for subscription in subscriptions
+                if (policies := incompatible_policies(publisher.qos, subscription.qos))
+            ),
+        )
+
+
+def _services(graph: Graph) -> Iterator[Link]:
+    for name, (type_name, *_) in graph.service_names_and_types():
+        yield Link(
+            "service",
+            name,
+            type_name,
+            tuple(End(_name_of(client)) for client in graph.clients(name)),
+            tuple(End(_name_of(server)) for server in graph.services(name)),
+        )
+
+
+def _actions(graph: Graph) -> Iterator[Link]:
+    ends: dict[tuple[str, str], tuple[list[End], list[End]]] = {}
+    for node in graph.nodes:
+        for action in node.actions:
+            key = (action.name, action.type_name)
+            ends.setdefault(key, ([], []))[0 if action.is_client else 1].append(
+                End(node.fully_qualified_name)
+            )
+    for (name, type_name), (clients, servers) in ends.items():
+        yield Link("action", name, type_name, tuple(clients), tuple(servers))
+
+
+def _end(endpoint: Publisher | Subscription) -> End:
+    qos = endpoint.qos
+    history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
+    words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
+    words.append(history)
+    if qos.liveliness is Liveliness.MANUAL_BY_TOPIC:
+        words.append("liveliness manual by topic")
+    limits = {"deadline": qos.deadline_ns, "lease": qos.lease_ns, "lifespan": qos.lifespan_ns}
+    words += [f"{name} {format_duration(ns)}" for name, ns in limits.items() if finite(ns)]
+    return End(_name_of(endpoint), ", ".join(words))
+
+
+def _name_of(endpoint: DomainEntity) -> str:
+    return "(no node)" if endpoint.node is None else str(endpoint.node.fully_qualified_name)
+
+
+def _is_everywhere(link: Link) -> bool:
+    """Say whether a link is one that rclpy makes for every node, or a part of an action."""
+    if _ACTION in link.name:
+        return True
+    if link.kind == "topic":
+        return link.name in NODE_TOPICS and not link.receivers
+    return link.kind == "service" and (
+        link.name.rpartition("/")[2] in NODE_SERVICES and not link.senders
+    )
+
+
+def _is_unheard_static(link: Link) -> bool:
+    """Say whether a link is what every listener of tf2 subscribes to besides ``/tf``, in vain."""
+    return link.name == _STATIC_TRANSFORMS and not link.senders
+
+
+def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:
+    for sender, receiver, policy in link.apart:
+        yield (
+            f"topic {link.name}: {sender.node} and {receiver.node} do not connect: {policy} "
+            f"({sender.node} offers {sender.qos}; {receiver.node} asks for {receiver.qos})"
+        )
+    if link.receivers and not link.senders and link.kind == "topic":
+        nodes = [end.node for end in link.receivers]
+        if link.name == _CLOCK:
+            waiting = [node for node in nodes if follows(node)]
+            if waiting:
+                yield (
+                    f"topic {_CLOCK}: {_who(waiting, 'goes by it', 'go by it')} (clocks: source: "
+                    "topic), and nobody publishes: ROS time stands still at 0"
+                )
+        elif link.name not in NODE_TOPICS:
+            yield (
+                f"topic {link.name}: {_who(nodes, 'subscribes', 'subscribe')}, and nobody publishes"
+            )
+    if link.senders and not link.receivers and link.kind != "topic":
+        who = _who([end.node for end in link.senders], "calls", "call")
+        yield f"{link.kind} {link.name}: {who}, and nobody serves"
+
+
+def _who(nodes: Iterable[str], one: str, several: str) -> str:
+    """Return ``/a subscribes`` or ``/a, /b and /c subscribe``."""
+    *names, last = dict.fromkeys(nodes)
+    return f"{', '.join(names)} and {last} {several}" if names else f"{last} {one}"

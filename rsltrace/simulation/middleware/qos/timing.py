@@ -1,0 +1,182 @@
+"""QoS that depends on time: deadlines, and the liveliness of publishers.
+
+A watch looks at the clock only when its time may be up, not at every message; and only where there
+is a callback that wants to know, so that a run without one can still end because nothing is left.
+What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` compares the two.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Liveliness, Qos
+from rsltrace.simulation.middleware.qos.status import (
+    DEADLINE_MISSED,
+    LIVELINESS_CHANGED,
+    LIVELINESS_LOST,
+    EndpointEvents,
+)
+
+
+class _Watch(ABC):
+    """Calls ``_up`` when nothing was seen for ``period_ns``."""
+
+    def __init__(self, loop: EventLoop, period_ns: int) -> None:
+        self._loop = loop
+        self._period_ns = period_ns
+        self._due_ns = -1
+        self._scheduled = False
+        self.over = False
+
+    def seen(self) -> None:
+        """Start anew: there was a message, or a sign of life."""
+        self._due_ns = self._loop.now_ns + self._period_ns
+        if not self._scheduled:
+            self._schedule()
+
+    def _schedule(self) -> None:
+        if self._wanted():
+            self._scheduled = True
+            self._loop.schedule(self._due_ns, self._look)
+
+    def _look(self) -> None:
+        self._scheduled = False
+        if self.over:
+            return
+        if self._loop.now_ns >= self._due_ns:
+            self._up()
+        elif self._due_ns > 0:
+            self._schedule()
+
+    @abstractmethod
+    def _wanted(self) -> bool:
+        """Return whether anybody listens."""
+
+    @abstractmethod
+    def _up(self) -> None:
+        """Say that the time is up."""
+
+
+class Deadline(_Watch):
+    """Counts the periods without a message, from the first message on."""
+
+    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
+        super().__init__(loop, period_ns)
+        self._events = events
+
+    def _wanted(self) -> bool:
+        return DEADLINE_MISSED in self._events.listeners
+
+    def _up(self) -> None:
+        self._events.add(DEADLINE_MISSED, total=1)
+        self._due_ns += self._period_ns
+        self._schedule()
+
+
+class OfferedLease(_Watch):
+    """Notices that a publisher with manual liveliness has not shown life in time."""
+
+    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
+        super().__init__(loop, period_ns)
+        self._events = events
+
+    def _wanted(self) -> bool:
+        return LIVELINESS_LOST in self._events.listeners
+
+    def _up(self) -> None:
+        self._events.add(LIVELINESS_LOST, total=1)
+
+
+class RequestedLease(_Watch):
+    """Whether a subscription holds one publisher for alive.
+
+    With automatic liveliness the publisher is alive as long as it exists and can be heard; with
+    manual liveliness from its first sign of life until the lease has passed without another.
+    """
+
+    def __init__(
+        self, loop: EventLoop, lease_ns: int, kind: Liveliness, events: EndpointEvents
+    ) -> None:
+        super().__init__(loop, lease_ns)
+        self._events = events
+        self._manual = kind is Liveliness.MANUAL_BY_TOPIC
+        self._alive: bool | None = None
+        if not self._manual:
+            self._becomes(True)
+
+    def seen(self) -> None:
+        if self._manual:
+            self._becomes(True)
+            super().seen()
+
+    def cut_off(self, from_ns: int, to_ns: int) -> None:
+        """Nothing is heard for some time, not even what automatic liveliness rests on."""
+        if not self._manual and to_ns - from_ns > self._period_ns:
+            at_ns = from_ns + self._period_ns
+            self._loop.schedule(at_ns, lambda: self._becomes(False))
+            self._loop.schedule(to_ns, lambda: self._becomes(True))
+
+    def gone(self) -> None:
+        """Forget the publisher."""
+        if self._alive is not None:
+            self._events.add(LIVELINESS_CHANGED, **{_NAME[self._alive]: -1})
+        self._alive = None
+        self.over = True
+
+    def _wanted(self) -> bool:
+        return LIVELINESS_CHANGED in self._events.listeners
+
+    def _up(self) -> None:
+        self._becomes(False)
+
+    def _becomes(self, alive: bool) -> None:
+        if alive is self._alive or self.over:
+            return
+        changes = {_NAME[alive]: 1}
+        if self._alive is not None:
+            changes[_NAME[self._alive]] = -1
+        self._alive = alive
+        self._events.add(LIVELINESS_CHANGED, **changes)
+
+
+_NAME = {True: "alive", False: "not_alive"}
+
+
+def finite(duration_ns: int) -> bool:
+    """Whether a QoS duration is a limit."""
+    return 0 < duration_ns < INFINITE_NS
+
+
+class Offers:
+    """What a publisher promises: its deadline, and its liveliness if that is manual."""
+
+    def __init__(self, loop: EventLoop, qos: Qos, events: EndpointEvents) -> None:
+        self._watches: list[_Watch] = []
+        self._lease: OfferedLease | None = None
+        if finite(qos.deadline_ns):
+            self._watches.append(Deadline(loop, qos.deadline_ns, events))
+        if qos.liveliness is Liveliness.MANUAL_BY_TOPIC and finite(qos.lease_ns):
+            self._lease = OfferedLease(loop, qos.lease_ns, events)
+            self._watches.append(self._lease)
+
+    @classmethod
+    def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> Offers | None:
+        """Return the promises of a profile, or None if it makes none."""
+        offers = cls(loop, qos, events)
+        return offers if offers._watches else None
+
+    def sent(self) -> None:
+        """A message was published."""
+        for watch in self._watches:
+            watch.seen()
+
+    def asserted(self) -> None:
+        """The publisher has said that it is alive."""
+        if self._lease is not None:
+            self._lease.seen()
+
+    def end(self) -> None:
+        """The publisher is gone."""
+        for watch in self._watches:
+            watch.over = True

@@ -1,0 +1,183 @@
+"""What an ordered loop has to know of what may run: names, periods, groups, simulated executors;
+and execution times, which keep workers busy and hold back what a callback sends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any, Protocol
+
+from rsltrace.simulation.chance.distribution import Distribution, Sampler
+from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.loop.ordered import OrderedLoop, Place, Workers
+from rsltrace.simulation.loop.policy import Candidate, Policy
+from rsltrace.simulation.middleware.entity import Runnable
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.events.event import OutsideEvent, Owner
+from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
+from rsltrace.simulation.middleware.participant import Participant
+from rsltrace.simulation.middleware.rates import Rates, follows_chains
+from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.model.event import EventKind
+
+_TAKES_TIME = frozenset(
+    map(
+        int,
+        (
+            EventKind.TIMER,
+            EventKind.SUBSCRIPTION,
+            EventKind.SERVICE,
+            EventKind.CLIENT,
+            EventKind.GUARD_CONDITION,
+            EventKind.TASK,
+            EventKind.QOS_EVENT,
+            EventKind.ACTION,
+        ),
+    )
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutorRule:
+    """An executor with ``workers`` for the nodes that one of the globs matches."""
+
+    nodes: tuple[str, ...]
+    workers: int
+
+
+@dataclass(frozen=True, slots=True)
+class ExecutionRule:
+    """How long callbacks take, for what the globs describe; ``entity`` None: the whole node."""
+
+    node: str
+    entity: str | None
+    duration: Distribution
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulingPlan:
+    """What a job says of order, executors and execution times. The first rule that fits counts.
+
+    Nodes without an executor have one of their own with one worker; ``occupies`` says whether
+    callbacks occupy workers at all.
+    """
+
+    policy: Policy
+    executors: tuple[ExecutorRule, ...] = ()
+    execution: tuple[ExecutionRule, ...] = ()
+    occupies: bool = False
+    seed: int = 0
+    start_ns: int = 0
+
+
+class Schedulable(Protocol):
+    """What is in a queue of the loop: it can say what a policy has to know of it."""
+
+    def runnable(self) -> Runnable:
+        """Return what there is to know."""
+
+
+class Scheduling:
+    """Describes to the loop what may run."""
+
+    def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        self._plan = plan
+        self._workers: dict[object, Workers] = {}
+        loop.policy = plan.policy
+        loop.place = self.place
+        self._rates: Rates | None = None
+        if follows_chains(plan.policy):
+            self._rates = Rates(dispatcher)
+        if plan.execution:
+            dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
+
+    # -- what may run --------------------------------------------------------------------------
+
+    def place(self, item: Schedulable | Any) -> Place:
+        """Describe something that may run."""
+        what: Runnable = item.runnable()
+        owner = what.node.fully_qualified_name if what.node is not None else ""
+        workers = self._workers_of(what)
+        candidate = Candidate(
+            owner,
+            what.name,
+            what.kind,
+            what.entity,
+            what.period_ns if self._rates is None else self._rates.period(item, what),
+            what.group_names,
+            item,
+            what.thread,
+            "" if workers is None else workers.name,
+        )
+        return Place(candidate, workers, what.group, what.told)
+
+    def _workers_of(self, what: Runnable) -> Workers | None:
+        """Return the simulated executor that something runs on, if it does on any."""
+        if not self._plan.occupies or what.node is None or not what.executor:
+            return None
+        name = what.node.fully_qualified_name
+        key: object = name
+        count = 1
+        for index, rule in enumerate(self._plan.executors):
+            if any(fnmatchcase(name, glob) for glob in rule.nodes):
+                key, count = index, rule.workers
+                break
+        workers = self._workers.get(key)
+        if workers is None:
+            workers = self._workers[key] = Workers(str(key), count)
+        return workers
+
+
+class ExecutionTimes(EventObserver):
+    """Gives callbacks their durations."""
+
+    order = ObserverOrder.EXECUTION_TIMES
+
+    def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        self._dispatcher = dispatcher
+        self._loop = loop
+        self._plan = plan
+        self._durations: dict[int, Sampler | None] = {}
+        self._counts: dict[tuple[str, str, str], int] = {}
+
+    def before_event(self, call: EventCall) -> bool:
+        """Draw how long the callback takes, and charge it with that when it is over."""
+        event, charge = self._dispatcher.event, self._loop.charge
+        duration = None
+        if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):
+            duration = self._duration_of(call.handle, call.entity, call.node)
+        duration_ns = 0 if duration is None else duration(self._loop.now_ns)
+        if duration is not None:
+            self._dispatcher.draw(call.entity, encode_draw(Draw.EXECUTION, duration_ns))
+        before, event.busy_ns = event.busy_ns, duration_ns
+
+        def ended() -> None:
+            event.busy_ns = before
+            event.took_ns = duration_ns
+            charge.duration_ns += duration_ns
+
+        call.on_end.append(ended)
+        return True
+
+    def _duration_of(self, handle: Any, entity: int, node: Owner | None) -> Sampler | None:
+        if entity in self._durations:
+            return self._durations[entity]
+        sampler = None
+        if node is not None:
+            owner = node.fully_qualified_name
+            kind, name = handle.execution_name()
+            assert isinstance(node, Participant), "nobody else's callbacks take time"
+            key = (node.key, kind, name)
+            self._counts[key] = self._counts.get(key, -1) + 1
+            ordinal = node.ordinal(self._counts[key])
+            for rule in self._plan.execution:
+                if fnmatchcase(owner, rule.node) and (
+                    rule.entity is None or fnmatchcase(name, rule.entity)
+                ):
+                    stream = Stream(
+                        self._plan.seed, f"execution\0{owner}\0{kind}\0{name}\0{ordinal}"
+                    )
+                    sampler = rule.duration.sampler(stream, self._plan.start_ns)
+                    break
+        self._durations[entity] = sampler
+        return sampler

@@ -1,0 +1,88 @@
+"""Subscriptions: what has been published waits in their queue until their callback runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.simulation.middleware.qos.policies import Qos
+from rsltrace.simulation.middleware.qos.status import EndpointEvents
+from rsltrace.simulation.middleware.qos.timing import Deadline, finite
+from rsltrace.simulation.middleware.receiver import Receiver
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
+
+SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
+
+# A message on its way, as the loop's releases are: reception stamp (ns), order and place in the
+# loop's queue, who is called; then canonical CDR, index of the publishing event, which of its
+# outputs, content hash, publication stamp (ns), publication number.
+Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
+
+
+class Subscription(Receiver):
+    """Receives a topic; ``callback`` is called with each message's bytes.
+
+    A full queue drops its oldest message. ``qos`` is resolved, ``publishers`` are the connected
+    ones; ``timed`` says whether its QoS looks at the clock.
+    """
+
+    kind = EntityKind.SUBSCRIPTION
+    origin = slice(5, 8)
+
+    def __init__(
+        self,
+        dispatcher: Dispatcher,
+        node: Any,
+        topic: str,
+        type: MessageType,
+        qos: Qos,
+        callback: Callable[[bytes], object] | None = None,
+    ) -> None:
+        super().__init__(dispatcher, node)
+        self.topic = topic
+        self.type = type
+        self.qos = qos
+        self.callback = callback
+        self.keep = qos.keep
+        self.queue: deque[Delivery] = deque(maxlen=qos.keep)
+        self.timed = any(map(finite, (qos.deadline_ns, qos.lifespan_ns, qos.lease_ns)))
+        self.publishers: list[DomainEntity] = []
+        self.events = EndpointEvents()
+        self.deadline: Deadline | None = None
+        if finite(qos.deadline_ns):
+            self.deadline = Deadline(dispatcher.loop, qos.deadline_ns, self.events)
+
+    @property
+    def type_name(self) -> str:
+        """The name of its type."""
+        return self.type.name
+
+    def dispatch(self) -> None:
+        """Take the oldest message and run the callback with it."""
+        if not self.may_run():
+            return
+        assert self.callback is not None
+        data, *cause = self.queue.popleft()[4:8]
+        self.dispatcher.execute(
+            self, self.entity_id, self.node, SUBSCRIPTION, self.callback, (data,), *cause
+        )
+
+    def trace_name(self) -> str:
+        return self.topic
+
+    def trace_type(self) -> str:
+        return self.type.name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"callback": callback_name(self.user_callback()), "qos": self.qos.summary()}
+
+    def _destroy(self) -> None:
+        super()._destroy()
+        self.queue.clear()
+        if self.deadline is not None:
+            self.deadline.over = True

@@ -1,0 +1,158 @@
+"""The inside of a chunk: decompressed within limits, checked, and cut into messages."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+from operator import itemgetter
+from typing import NamedTuple
+
+from mcap.opcode import Opcode
+
+from rsltrace.trace.mcap.checksum import crc32
+from rsltrace.trace.mcap.limits import CHUNK_BYTES_MAX
+from rsltrace.trace.mcap.records import (
+    MESSAGE,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    Damaged,
+    Span,
+    records_in,
+)
+from rsltrace.trace.mcap.source import ByteSource
+
+PUBLISH_TIME_BYTES = 8
+
+_CHUNK_HEAD = struct.Struct("<BQQQQII")
+"""Opcode, length, first and last log time, size and CRC unpacked, length of the compression."""
+
+_U64 = struct.Struct("<Q")
+_HEAD_BYTES = RECORD_HEAD.size
+_MESSAGE_BYTES_MIN = MESSAGE_HEAD.size
+
+
+class MessageView(NamedTuple):
+    """A message in a chunk: header fields, and where its data lies in the chunk's records."""
+
+    channel_id: int
+    sequence: int
+    log_time: int
+    start: int
+    end: int
+
+
+def read_chunk(
+    source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
+) -> bytes:
+    """Return the records of the chunk at ``span``. Raises Damaged.
+
+    What is larger than ``size_max`` is refused before anything is unpacked. MCAP lets a writer
+    leave the CRC out by writing 0, and add fields to the end of a record; ``strict`` does not.
+    """
+    if span.length < _CHUNK_HEAD.size:
+        raise Damaged(f"its length is given as {span.length}")
+    record = source.read_at(*span)
+    opcode, length, _, _, size, crc, text = _CHUNK_HEAD.unpack_from(record)
+    if opcode != Opcode.CHUNK or length + _HEAD_BYTES != span.length:
+        raise Damaged("there is no chunk where the index says")
+    data_at = _CHUNK_HEAD.size + text + _U64.size
+    data_end = data_at
+    if data_at <= span.length:
+        data_end += _U64.unpack_from(record, data_at - _U64.size)[0]
+    if data_end > span.length or (strict and data_end != span.length):
+        raise Damaged("the chunk's bytes do not end where its record does")
+    if size > size_max:
+        raise Damaged(f"a chunk of {size} bytes, where at most {size_max} can be")
+    data = memoryview(record)[data_at:data_end]
+    records = _unpacked(data, record[_CHUNK_HEAD.size : data_at - _U64.size], size)
+    if len(records) != size:
+        raise Damaged(f"the chunk holds {len(records)} bytes where {size} are promised")
+    if (crc or strict) and crc32(records) != crc:
+        raise Damaged("the chunk's CRC does not match its content")
+    return records
+
+
+def _unpacked(data: memoryview, compression: bytes, size: int) -> bytes:
+    if compression == b"":
+        return bytes(data)
+    if compression == b"zstd":
+        return _unzstd(data, size)
+    if compression == b"lz4":
+        return _unlz4(data, size)
+    name = compression.decode("utf-8", "replace")
+    raise Damaged(f"the compression {name!r} is unknown (not zstd or lz4)")
+
+
+def _unzstd(data: memoryview, size: int) -> bytes:
+    import zstandard
+
+    try:
+        # The frame may claim any size; it must not be believed before memory is taken.
+        claimed = zstandard.frame_content_size(data)
+        if claimed > size:
+            raise Damaged(f"the chunk holds {claimed} bytes where {size} are promised")
+        if size == 0:
+            return b""
+        return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise Damaged(f"the chunk cannot be decompressed ({error})") from None
+
+
+def _unlz4(data: memoryview, size: int) -> bytes:
+    import lz4.frame  # type: ignore[import-untyped]
+
+    try:
+        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (RuntimeError, EOFError, MemoryError) as error:
+        raise Damaged(f"the chunk cannot be decompressed ({error})") from None
+
+
+def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
+    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none, or if it
+    is of another channel."""
+    if offset + _MESSAGE_BYTES_MIN > len(records):
+        raise Damaged(f"no message fits at {offset} of the chunk")
+    opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
+    end = offset + _HEAD_BYTES + length
+    if opcode != MESSAGE or length < _MESSAGE_BYTES_MIN - _HEAD_BYTES or end > len(records):
+        raise Damaged(f"there is no whole message at {offset} of the chunk")
+    if channel_id != of_channel:
+        raise Damaged(f"the message at {offset} is of another channel than the index says")
+    return MessageView(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
+
+
+def cut_messages(
+    records: bytes, wanted: Mapping[int, int], first_ns: int, *, with_publish_time: bool = False
+) -> list[tuple[int, int, bytes]]:
+    """Return (log time, number, data) of the wanted messages of a chunk by time, equal times as
+    they stand.
+
+    ``wanted`` maps channel ids to numbers; ``with_publish_time`` puts it in front of the data,
+    8 bytes, little-endian. Raises Damaged when a record is cut off.
+    """
+    # The publish time is the last field before the data.
+    data_at = _MESSAGE_BYTES_MIN - (PUBLISH_TIME_BYTES if with_publish_time else 0)
+    messages: list[tuple[int, int, bytes]] = []
+    unpack, number_of, shortest = MESSAGE_HEAD.unpack_from, wanted.get, _MESSAGE_BYTES_MIN
+    at, end, previous_ns, ordered = 0, len(records), first_ns, True
+    while at + shortest <= end:
+        opcode, length, channel, _, stamp_ns, _ = unpack(records, at)
+        following = at + _HEAD_BYTES + length
+        if opcode != MESSAGE:
+            at = following
+            continue
+        if following > end or following - at < shortest:
+            raise Damaged("a message runs past the end of its chunk")
+        number = number_of(channel)
+        if number is not None and stamp_ns >= first_ns:
+            messages.append((stamp_ns, number, records[at + data_at : following]))
+            if stamp_ns < previous_ns:
+                ordered = False
+            previous_ns = stamp_ns
+        at = following
+    # What is left can only be records of other kinds, shorter than any message.
+    if at > end or any(opcode == MESSAGE for opcode, _, _ in records_in(records[at:])):
+        raise Damaged("a record runs past the end of its chunk")
+    if not ordered:
+        messages.sort(key=itemgetter(0))
+    return messages

@@ -1,0 +1,144 @@
+"""Where the bytes of a file come from: the one narrow place between readers and storage.
+
+Readers ask for ranges and nothing else, so a source that fetches ranges over the network can take
+the file's place.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from pathlib import Path
+from typing import Protocol
+
+from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.trace.model.regular_file import not_regular
+
+
+class ByteSource(Protocol):
+    """Random access to bytes that do not change. ``name`` is what error messages call it."""
+
+    @property
+    def name(self) -> str:
+        """A path, or an address without what is secret in it."""
+        ...
+
+    @property
+    def size(self) -> int:
+        """Length in bytes."""
+        ...
+
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were fetched from the storage so far."""
+        ...
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether reading all of it would take long."""
+        ...
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """Return exactly ``length`` bytes from ``offset``. Raises an error if it cannot."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the storage; a second call does nothing."""
+        ...
+
+
+def beyond_end(source: ByteSource, offset: int, length: int) -> str:
+    """Return what is wrong with a range that is not in the file, "" if it is."""
+    if offset + length <= source.size:
+        return ""
+    return (
+        f"{source.name}: {length} bytes at offset {offset} reach beyond the end of the file "
+        f"({source.size} bytes); the file is damaged"
+    )
+
+
+class FileSource:
+    """A file on disk."""
+
+    is_remote = False
+
+    def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
+        """Open ``path``. Raises ``error``, as all methods do, if it cannot be read as a file."""
+        self._path = path
+        self._error = error
+        self._lock = threading.Lock()
+        self._bytes_read = 0
+        try:
+            kind = not_regular(path)
+            if kind == "a folder":
+                raise error(f"{path} is a folder; {_folder_hint(path)}")
+            if kind:
+                raise error(
+                    f"{path} is {kind}; it is read out of order, so save it to a file first"
+                )
+            self._file = open(path, "rb", buffering=0)  # noqa: SIM115  # closed by close()
+        except FileNotFoundError as reason:
+            raise error(f"{path} does not exist") from reason
+        except OSError as reason:
+            raise error(f"{path} cannot be read: {reason.strerror or reason}") from reason
+        self._size = os.fstat(self._file.fileno()).st_size
+
+    @property
+    def name(self) -> str:
+        """The path as it was given."""
+        return str(self._path)
+
+    @property
+    def size(self) -> int:
+        """Length in bytes when the file was opened."""
+        return self._size
+
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were read from the file so far."""
+        return self._bytes_read
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """Return ``length`` bytes from ``offset``."""
+        if problem := beyond_end(self, offset, length):
+            raise self._error(problem)
+        try:
+            data = self._read(offset, length)
+        except (OSError, ValueError) as reason:
+            raise self._error(
+                f"{self._path} cannot be read at offset {offset}: {reason}"
+            ) from reason
+        self._bytes_read += len(data)
+        if len(data) < length:
+            raise self._error(f"{self._path} became shorter while it was read; open it again")
+        return data
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _read(self, offset: int, length: int) -> bytes:
+        pieces = []
+        while length:
+            if sys.platform == "win32":
+                with self._lock:
+                    self._file.seek(offset)
+                    piece = self._file.read(length)
+            else:
+                # Does not move a file position, which a forked process would share.
+                piece = os.pread(self._file.fileno(), length, offset)
+            if not piece:
+                break
+            pieces.append(piece)
+            offset += len(piece)
+            length -= len(piece)
+        return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+def _folder_hint(path: Path) -> str:
+    if (path / "metadata.yaml").exists():
+        return (
+            "it holds a rosbag2 recording; a trace is one .mcap file that `rsltrace record` wrote"
+        )
+    return "name the .mcap file in it"

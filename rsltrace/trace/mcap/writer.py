@@ -1,0 +1,293 @@
+"""An MCAP file being written, record by record, with its summary at the end.
+
+This layer knows MCAP and the disk but not what a trace is: that is ``writer``.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import struct
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import zstandard
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
+
+from rsltrace.errors import OutputError
+from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
+from rsltrace.trace.mcap.chunk_body import ChunkBody
+from rsltrace.trace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
+from rsltrace.trace.mcap.sink import Sink
+from rsltrace.trace.mcap.summary_writer import SummaryBuilder, record_bytes
+
+CHANNELS_MAX = 2**16 - 1
+_U64 = struct.Struct("<Q")
+_ZSTD_LEVEL = 1
+"""Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
+
+_SAMPLES = 32
+_SAMPLE_BYTES = 16 << 10
+_PAYS = 0.8
+"""Of each large message so many pieces are compressed to see what it gives."""
+
+_TRUSTED = 15
+"""So many large messages of a topic are not looked at after one that did not get smaller."""
+
+_ROWS = zstandard.ZstdCompressionParameters.from_level(
+    _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
+)
+"""For rows of one size, which resemble the rows just before them: with a small table of what was
+seen, which stays in the processor's nearest cache, they take four fifths of the time and no more
+room."""
+
+
+class McapWriter:
+    """Writes records in order. Every method raises OutputError when the disk refuses.
+
+    ``progress`` says in words what was written so far, for that message.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        force: bool,
+        compression: str,
+        profile: str,
+        library: str,
+        progress: Callable[[], str],
+    ) -> None:
+        self._prepare(compression, progress)
+        self._sink = Sink(path, force=force)
+        try:
+            self._write(MAGIC + record_bytes(Header(profile, library)))
+        except OutputError:
+            self.abort()
+            raise
+
+    def _prepare(self, compression: str, progress: Callable[[], str]) -> None:
+        if compression not in ("zstd", ""):
+            raise ValueError(f"compression is 'zstd' or '', not {compression!r}")
+        self._compression = compression
+        self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self._row_compressor = zstandard.ZstdCompressor(compression_params=_ROWS)
+        self._trusted: dict[tuple[int, ...], int] = {}
+        self._progress = progress
+        self._summary = SummaryBuilder()
+        self._schema_ids: dict[tuple[str, str], int] = {}
+        self._failure: OutputError | None = None
+
+    def trust_as(self, other: McapWriter) -> None:
+        """Know of the topics' large messages what another writer knows: what has been packed by it
+        comes before what is packed here."""
+        self._trusted = dict(other._trusted)
+
+    @property
+    def place(self) -> Path:
+        """Where the file is: beside the one that it replaces, until it is finished."""
+        return self._sink.place
+
+    @property
+    def kept(self) -> str:
+        """What to say of the file that it should have replaced and has not; else ""."""
+        return self._sink.kept
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far."""
+        return self._sink.offset
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file was finished or given up."""
+        return self._sink.closed
+
+    @property
+    def start_ns(self) -> int:
+        """Smallest log time of all messages so far (0: none)."""
+        return self._summary.start_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Largest log time of all messages so far (0: none)."""
+        return self._summary.end_ns
+
+    @property
+    def channels(self) -> list[tuple[Channel, str, int]]:
+        """Each channel with the name of its type and its number of messages."""
+        counts = self._summary.message_counts
+        names = {schema.id: schema.name for schema in self._summary.schemas}
+        return [(c, names[c.schema_id], counts.get(c.id, 0)) for c in self._summary.channels]
+
+    def channel(
+        self, topic: str, type_name: str, schema_text: str, metadata: Mapping[str, str]
+    ) -> int:
+        """Write a channel, and its schema unless an equal one is there. Returns its id."""
+        channel_id = len(self._summary.channels) + 1
+        if channel_id > CHANNELS_MAX:
+            raise OutputError(
+                f"{self._sink.path}: {topic} is one topic too many: a trace has room for "
+                f"{CHANNELS_MAX}; leave topics out (record: in the job)"
+            )
+        schema_id = self._schema_ids.get((type_name, schema_text))
+        if schema_id is None:
+            schema_id = len(self._schema_ids) + 1
+            schema = Schema(schema_id, schema_text.encode(), SCHEMA_ENCODING, type_name)
+            self._write(record_bytes(schema))
+            self._schema_ids[type_name, schema_text] = schema_id
+            self._summary.schemas.append(schema)
+        channel = Channel(channel_id, topic, MESSAGE_ENCODING, dict(metadata), schema_id)
+        self._write(record_bytes(channel))
+        self._summary.channels.append(channel)
+        return channel_id
+
+    def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        record = record_bytes(Metadata(name=name, metadata=dict(mapping)))
+        self._summary.add_metadata(name, offset=self._sink.offset, length=len(record))
+        self._write(record)
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Write an attachment. Its times are 0: dates would make files of equal runs differ."""
+        record = record_bytes(
+            Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        )
+        offset = self._sink.offset
+        self._summary.add_attachment(
+            name, media_type, size=len(data), offset=offset, length=len(record)
+        )
+        self._write(record)
+
+    def chunk(self, body: ChunkBody) -> tuple[int, int]:
+        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
+        return self.packed_chunk(body, *self.packed(body))
+
+    def packed_chunk(
+        self, body: ChunkBody, compression: str, data: tuple[bytes, ...], crc: int
+    ) -> tuple[int, int]:
+        """Write a chunk whose data are there as ``packed`` returns them."""
+        size = sum(map(len, data))
+        head = record_bytes(
+            Chunk(
+                compression=compression,
+                data=b"",
+                message_end_time=body.end_ns,
+                message_start_time=body.start_ns,
+                uncompressed_crc=crc,
+                uncompressed_size=body.size,
+            )
+        )
+        # The data are written as they are, not copied behind their head first.
+        head = head[:1] + _U64.pack(len(head) - 9 + size) + head[9:-8] + _U64.pack(size)
+        offset, length = self._sink.offset, len(head) + size
+        indexes = b"".join(index for _, _, index in body.indexes)
+        whole: int | None = None
+        if not compression:  # the data have been summed already
+            whole = joined_crc(crc32(head), crc, size)
+            whole = joined_crc(whole, crc32(indexes), len(indexes))
+        self._write(head, *data, indexes, crc=whole)
+        self._summary.add_chunk(
+            body,
+            offset=offset,
+            length=length,
+            compression=compression,
+            compressed_size=size,
+        )
+        return offset, length
+
+    def packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...], int]:
+        """Return the compression of a chunk, its data in parts, and their CRC-32 as they were."""
+        return *self._packed(body), crc_of(body.parts)
+
+    def _packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...]]:
+        """Return the compression of a chunk, and its data in parts.
+
+        Compressing what does not get smaller takes as long as writing it; of large messages a
+        sample tells, and of its topic's next ones too. It is a function of their bytes, so equal
+        runs give equal files.
+        """
+        if not self._compression:
+            return "", body.parts
+        if len(body.parts) > 1:
+            channels = tuple(channel for channel, _, _ in body.indexes)
+            trusted = self._trusted.get(channels, 0)
+            if trusted or not self._pays(body.parts):
+                self._trusted[channels] = trusted - 1 if trusted else _TRUSTED
+                return "", body.parts
+        packer = self._row_compressor if body.rows else self._compressor
+        return self._compression, (packer.compress(body.records),)
+
+    def _pays(self, parts: tuple[bytes, ...]) -> bool:
+        total = packed = 0
+        for part in parts:
+            step = max(len(part) // _SAMPLES, _SAMPLE_BYTES)
+            for at in range(0, len(part), step):
+                sample = part[at : at + _SAMPLE_BYTES]
+                total += len(sample)
+                packed += len(self._compressor.compress(sample))
+        return packed < _PAYS * total
+
+    def finish(self, *, replace: bool = True) -> None:
+        """Write the end of the file, make sure that it is there, and close it.
+
+        With ``replace``, it takes the place of the file that was there.
+        """
+        self._write(record_bytes(DataEnd(self._sink.crc)))
+        self._write(self._summary.tail(self._sink.offset) + MAGIC)
+        try:
+            self._sink.finish(replace=replace)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def abort(self) -> None:
+        """Close the file as it is. What was written stays readable."""
+        try:
+            self._sink.close()
+        except OSError:
+            pass  # there is nothing left to save, and the error that led here is the one to show
+
+    def poison(self) -> None:
+        """Refuse all further records, because one was left half written or half noted.
+
+        An exception out of a signal handler (KeyboardInterrupt) can come between any two steps of
+        a write. Going on would put a whole record after a half one; an interrupted file is better.
+        """
+        if self._failure is None:
+            self._failure = OutputError(
+                f"writing the trace {self._sink.place} was interrupted in the middle of a segment; "
+                "what was written before is readable up to its last whole segment"
+            )
+
+    def _write(self, *parts: bytes, crc: int | None = None) -> None:
+        if self._failure is not None:
+            raise self._failure  # after a gap in the file, nothing more may follow
+        try:
+            self._sink.write(*parts, crc=crc)
+        except OSError as error:
+            raise self._failed(error) from error
+        except OutputError as error:
+            self._failure = error
+            raise
+        except BaseException:
+            self.poison()
+            raise
+
+    def _failed(self, error: OSError) -> OutputError:
+        code = errno.errorcode.get(error.errno or 0, "unknown")
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        hint = _HINTS.get(error.errno or 0, "check the disk, or choose another place with -o")
+        kept = self.kept and f"; {self.kept}"
+        self._failure = OutputError(
+            f"cannot go on writing the trace {self.place}: {reason} ({code}) after "
+            f"{self._sink.offset} bytes, {self._progress()}; what was written is readable up to "
+            f"its last whole segment{kept}; {hint}"
+        )
+        return self._failure
+
+
+_HINTS = {
+    errno.ENOSPC: "free some space or choose another disk with -o",
+    errno.EDQUOT: "your disk quota is used up: free some space or choose another disk with -o",
+    errno.EFBIG: "the file reached its size limit (ulimit -f, or the file system's)",
+}

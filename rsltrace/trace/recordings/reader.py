@@ -1,0 +1,270 @@
+"""A rosbag2 recording as one stream of messages in time order, whatever it is stored in."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import takewhile
+from pathlib import Path
+from types import TracebackType
+
+from rsltrace.errors import BagError
+from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
+from rsltrace.trace.mcap.limits import MESSAGE_BYTES_MAX
+from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.recordings.files import ZSTD_MAGIC, BagFiles, open_files
+from rsltrace.trace.recordings.merge import Message, Piece, merge
+from rsltrace.trace.recordings.select import select_topics, unmatched
+from rsltrace.trace.recordings.storage import Extent, Storage, StoredTopic
+from rsltrace.trace.recordings.topic import BagTopic
+
+STAMP_NS_MAX = 2**63 - 1
+
+
+class Bag:
+    """An open recording; a context manager. Made by ``open_bag``.
+
+    ``path`` is what was opened, ``storage_id`` ``"mcap"`` or ``"sqlite3"``, ``topics`` the selected
+    topics in the order of the recording. ``recording_start_ns`` and ``recording_end_ns`` are the
+    log times of the first and last message of the whole recording; ``start_ns`` is that of the
+    first message that plays. Log times are integer nanoseconds. ``notes`` say what is missing from
+    the recording, ``skipped`` are the topics that never play, ``excluded_nothing`` the globs of
+    ``exclude`` that fit no topic.
+    """
+
+    path: Path
+    notes: tuple[str, ...]
+    skipped: tuple[str, ...]
+    excluded_nothing: tuple[str, ...]
+    storage_id: str
+    topics: tuple[BagTopic, ...]
+    recording_start_ns: int
+    recording_end_ns: int
+    start_ns: int
+
+    def __init__(
+        self,
+        path: Path,
+        files: BagFiles,
+        topics: Sequence[str],
+        exclude: Sequence[str],
+        start_offset_ns: int,
+        duration_ns: int | None,
+        skip: Callable[[StoredTopic], bool] | None,
+    ) -> None:
+        self.path = path
+        self.notes = tuple(files.notes)
+        self._skip = skip
+        self.storage_id = files.storage_id
+        self._files = files
+        filled = [storage for storage in files.storages if storage.message_count]
+        if not filled:
+            empty = "the bag is empty: it holds no messages"
+            if files.storages and all(storage.cut_off for storage in files.storages):
+                empty = "the recording was cut off before its first whole chunk"
+            notes = "".join(f"\n  {note}" for note in files.notes)
+            raise BagError(f"{path}: {empty}{notes}")
+        self.recording_start_ns = min(storage.start_ns for storage in filled)
+        self.recording_end_ns = max(storage.end_ns for storage in filled)
+        if self.recording_start_ns < 0 or self.recording_end_ns > STAMP_NS_MAX:
+            raise BagError(
+                f"{path}: log times are not within 0 to 2^63 - 1 nanoseconds; the recorder's clock "
+                "or the file is broken"
+            )
+        self._first_ns = self.recording_start_ns + start_offset_ns
+        self._last_ns = None if duration_ns is None else self._first_ns + duration_ns
+        self._select(topics, exclude)
+        self._zstd = files.compressed_messages
+        if self._zstd is None:
+            first = next(self.messages(), None)
+            # No CDR message starts with these bytes, and a single file does not tell otherwise.
+            self._zstd = first is not None and first[2].startswith(ZSTD_MAGIC)
+        first = next(self.messages(), None)
+        if first is None:
+            length = format_duration(self.recording_end_ns - self.recording_start_ns)
+            raise BagError(
+                f"{path}: nothing to play: no message on the selected topics"
+                + (
+                    f" from {format_duration(start_offset_ns)} after the start on (the bag is "
+                    f"{length} long)"
+                    if start_offset_ns
+                    else f" ({', '.join(topic.name for topic in self.topics)})"
+                )
+            )
+        self.start_ns = first[0]
+
+    def messages(self) -> Iterator[Message]:
+        """Yield (log time in ns, index in ``topics``, CDR bytes) in the order of (time, place).
+
+        Lazy, with the memory of the chunks that overlap in time; several iterators may run at
+        once. Raises ``BagError`` on reaching a damaged part.
+        """
+        pieces: list[Piece] = []
+        for storage, wanted in zip(self._files.storages, self._wanted, strict=True):
+            for extent in storage.extents(wanted, self._first_ns):
+                read = partial(self._read, storage, extent, wanted)
+                pieces.append(Piece(extent.start_ns, len(pieces), read))
+        messages = merge(pieces)
+        last_ns = self._last_ns
+        if last_ns is None:
+            return messages
+        return takewhile(lambda message: message[0] <= last_ns, messages)
+
+    def with_publish_time(self) -> Iterator[Message]:
+        """Yield what ``messages`` does, with the publish time in front of the bytes (8 of them,
+        little-endian). Raises ``BagError`` if the recording does not keep it."""
+        if self.storage_id != "mcap":
+            raise BagError(
+                f"{self.path}: a {self.storage_id} recording does not keep when messages were "
+                "published: play it by log_time or header_stamp"
+            )
+        for storage in self._files.storages:
+            storage.with_publish_time = True
+        try:
+            yield from self.messages()
+        finally:
+            for storage in self._files.storages:
+                storage.with_publish_time = False
+
+    @cached_property
+    def end_ns(self) -> int:
+        """Log time of the last message that plays, in nanoseconds."""
+        if self._last_ns is not None:
+            return max(stamp_ns for stamp_ns, _, _ in self.messages())
+        ends = [
+            storage.last_ns(wanted, self._first_ns)
+            for storage, wanted in zip(self._files.storages, self._wanted, strict=True)
+        ]
+        return max(end_ns for end_ns in ends if end_ns is not None)
+
+    @cached_property
+    def message_count(self) -> int:
+        """How many messages play. After a start offset the skipped part is read to count it."""
+        return sum(
+            storage.count(wanted, self._first_ns)
+            for storage, wanted in zip(self._files.storages, self._wanted, strict=True)
+        )
+
+    def close(self) -> None:
+        """Close the recording. Iterators of messages end with it."""
+        self._files.close()
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _select(self, globs: Sequence[str], exclude: Sequence[str]) -> None:
+        """Make ``topics`` and, per storage file, the map from its topic ids to their indices."""
+        everything = [topic for storage in self._files.storages for topic in storage.topics]
+        skipped = [topic for topic in everything if self._skip is not None and self._skip(topic)]
+        self.skipped = tuple(dict.fromkeys(topic.name for topic in skipped))
+        self.excluded_nothing = unmatched(exclude, [topic.name for topic in everything])
+        names = [topic.name for topic in everything if topic.name not in self.skipped]
+        selected = select_topics(names, globs, exclude, str(self.path))
+        merged: dict[tuple[str, str, str], BagTopic] = {}
+        ids: list[dict[int, tuple[str, str, str]]] = []
+        for storage in self._files.storages:
+            ids.append({})
+            for stored in storage.topics:
+                if stored.name not in selected:
+                    continue
+                key = (stored.name, stored.type_name, stored.serialization_format)
+                ids[-1][stored.id] = key
+                new = self._topic(stored)
+                merged[key] = _joined(merged[key], new) if key in merged else new
+        self.topics = tuple(merged.values())
+        for topic in self.topics:
+            if topic.serialization_format != "cdr":
+                raise BagError(
+                    f"{self.path}: topic {topic.name} is encoded as "
+                    f"{topic.serialization_format!r}; only ROS 2's 'cdr' can play: exclude it"
+                )
+        index = {key: number for number, key in enumerate(merged)}
+        self._wanted = [{i: index[key] for i, key in by_id.items()} for by_id in ids]
+
+    def _topic(self, stored: StoredTopic) -> BagTopic:
+        names = (stored.name, stored.type_name)
+        offered, type_hash = self._files.topics.get(names, ((), ""))
+        return BagTopic(
+            *names,
+            serialization_format=stored.serialization_format,
+            offered_qos=stored.offered_qos or offered,
+            message_count=stored.message_count,
+            schema_text=stored.schema_text,
+            schema_encoding=stored.schema_encoding,
+            type_hash=stored.type_hash or type_hash,
+        )
+
+    def _read(self, storage: Storage, extent: Extent, wanted: dict[int, int]) -> Iterator[Message]:
+        messages = storage.read(extent, wanted, self._first_ns)
+        if not self._zstd:
+            return messages
+        return self._decompressed(messages, PUBLISH_TIME_BYTES * storage.with_publish_time)
+
+    def _decompressed(self, messages: Iterator[Message], head: int) -> Iterator[Message]:
+        """Yield messages with what follows the first ``head`` bytes decompressed."""
+        import zstandard
+
+        decompressor = zstandard.ZstdDecompressor()
+        for stamp_ns, topic, data in messages:
+            try:
+                if zstandard.frame_content_size(data[head:]) > MESSAGE_BYTES_MAX:
+                    raise zstandard.ZstdError(f"it has more than {MESSAGE_BYTES_MAX} bytes")
+                yield stamp_ns, topic, data[:head] + decompressor.decompress(data[head:])
+            except zstandard.ZstdError as error:
+                raise BagError(
+                    f"{self.path}: a message on {self.topics[topic].name} at {stamp_ns} ns cannot "
+                    f"be decompressed ({error})"
+                ) from None
+
+
+def _joined(one: BagTopic, other: BagTopic) -> BagTopic:
+    """Join what two channels, or two files of a split bag, say about one topic."""
+    new_qos = tuple(qos for qos in other.offered_qos if qos not in one.offered_qos)
+    schema = one if one.schema_text else other
+    return replace(
+        one,
+        offered_qos=one.offered_qos + new_qos,
+        message_count=one.message_count + other.message_count,
+        schema_text=schema.schema_text,
+        schema_encoding=schema.schema_encoding,
+        type_hash=one.type_hash or other.type_hash,
+    )
+
+
+def open_bag(
+    path: str | os.PathLike[str],
+    *,
+    topics: Sequence[str] = (),
+    exclude: Sequence[str] = (),
+    start_offset_ns: int = 0,
+    duration_ns: int | None = None,
+    recover: bool = False,
+    skip: Callable[[StoredTopic], bool] | None = None,
+) -> Bag:
+    """Open a rosbag2 recording: a folder with metadata.yaml, or one ``.mcap`` or ``.db3`` file.
+
+    ``topics`` and ``exclude`` are globs (``*`` matches ``/`` too; no ``topics`` means all);
+    ``start_offset_ns`` counts from the first message of the whole recording, ``duration_ns`` from
+    there. ``recover`` takes what is there of an incomplete recording (cut off, without
+    metadata.yaml) and says in ``notes`` what is not. ``skip`` picks topics that never play; their
+    names are in ``skipped``. Raises ``BagError`` naming the file and what to do: nothing there, not
+    a bag, empty, cut off, damaged, of another encoding, or nothing selected.
+    """
+    if start_offset_ns < 0:
+        raise BagError(f"{path}: the start offset must not be negative, got {start_offset_ns} ns")
+    files = open_files(Path(path), recover=recover)
+    try:
+        return Bag(Path(path), files, topics, exclude, start_offset_ns, duration_ns, skip)
+    except BaseException:
+        files.close()
+        raise

@@ -1,0 +1,142 @@
+"""The code of callbacks and of outputs, on this machine: traces name files as they are imported."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.model.draw import is_switch
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventKind, Output, OutputKind
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.logs import log_record
+
+ELSEWHERE = "elsewhere"
+"""Beside the places from which an output may have come: it was not looked at."""
+_SENT = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST))
+_LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKind.ACTION))
+"""Kinds of events that may run another function than the callback of their entity."""
+_PLACES_SHOWN = 3
+
+
+def code_place(trace: Trace, event: Event) -> str:
+    """Return the one place of ``code_places``, "" if there is none or there are several."""
+    places = code_places(trace, event)
+    return places[0] if len(places) == 1 else ""
+
+
+def code_places(trace: Trace, event: Event) -> list[str]:
+    """Return ``module.py:24`` of the function that an event ran: a constructor's for a node that
+    was made in it, the call's for an answer that somebody awaits.
+
+    There are several where its entity has run several and nobody knows which, none if nobody knows
+    any.
+    """
+    entity = event.entity
+    if event.kind is EventKind.CONSTRUCT:
+        made = (output.entity for output in trace.outputs_of(event.index))
+        entity = next((one for one in made if _is_node(trace, one)), entity)
+    found = trace.entities.get(entity)
+    source = "" if found is None else found.source
+    if event.kind in _LATER and not (source and event.kind is EventKind.ACTION):
+        places = _functions(trace.code_lines.get(entity, []), event)
+        if places:
+            return places
+    return [source] if source else []
+
+
+def _functions(lines: list[CodeLine], event: Event) -> list[str]:
+    met = [line for line in lines if line.event <= event.index and line.place]
+    of_call = [line for line in met if event.kind is EventKind.CLIENT]
+    best = [line for line in met if line.output == NO_SEQUENCE] or of_call
+    now = [line for line in best if line.event == event.index]
+    return list(dict.fromkeys(line.place for line in now or best))
+
+
+def output_places(trace: Trace, output: Output) -> list[str]:
+    """Return the lines (``module.py:31``) from which a message, call or log record came, or before
+    which another thread went on.
+
+    There are several where its callback had sent from several until then, none if nobody knows.
+    The last is ``ELSEWHERE`` where a run has not looked at the output.
+    """
+    if output.kind is OutputKind.LOG:
+        record = log_record(trace, output)
+        return [record.place] if record is not None and record.place else []
+    if output.kind is OutputKind.DRAW and is_switch(output.hash):
+        place = trace.switches.get(output.event)
+        return [place] if place else []
+    if output.kind not in _SENT:
+        return []
+    running = trace.event(output.event).entity
+    lines = trace.sent_from.get((output.entity, running), [])
+    number = NO_SEQUENCE
+    if any(line.event == output.event for line in lines):
+        outputs = trace.outputs_of(output.event)
+        numbers = [number for number, one in enumerate(outputs) if one == output]
+        exact = [line for line in lines if line.event == output.event and line.output in numbers]
+        if len(numbers) == 1 and exact and exact[0].place:
+            return [exact[0].place]
+        number = numbers[-1] if numbers else number
+    met = [line.place for line in lines if (line.event, line.output) < (output.event, number)]
+    places = list(dict.fromkeys(filter(None, met)))
+    return [*places, ELSEWHERE] if places and "" in met else places
+
+
+def entity_places(trace: Trace, entity: Entity) -> list[str]:
+    """Return where the functions are that an entity runs, then the lines from which it sends."""
+    lines = trace.code_lines.get(entity.id, [])
+    ran = [line.place for line in lines if line.output == NO_SEQUENCE]
+    sent = [line.place for line in lines if line.output != NO_SEQUENCE]
+    return list(dict.fromkeys(filter(None, [entity.source, *ran, *sent])))
+
+
+def places_text(places: list[str], joint: str = " or ") -> str:
+    """Return places as one text; of many the first: ``a.py:3 or a.py:9``."""
+    more = len(places) - _PLACES_SHOWN
+    shown = places[:_PLACES_SHOWN] + ([f"{more} more"] if more > 0 else [])
+    return joint.join(shown)
+
+
+def place_here(trace: Trace, place: str) -> str:
+    """Return a place by its path in the present folder if it is below that, or else as it is."""
+    found = code_file(trace, place)
+    if found is None or found[0].is_absolute() or ".." in found[0].parts:
+        return place
+    return f"{found[0].as_posix()}:{found[1]}"
+
+
+def code_file(trace: Trace, place: str) -> tuple[Path, int] | None:
+    """Return file and line (from 1) of a place, if a file of that name is where the job's are.
+
+    Looked for below the present folder and that of the trace, in the folders of the job's
+    ``search_path``. Nothing says that it is the file of then: see ``rsltrace:sources``.
+    """
+    name, _, line = place.rpartition(":")
+    path = PurePosixPath(name)
+    if not line.isdecimal() or path.is_absolute() or ".." in path.parts:
+        return None
+    for folder in _folders(trace):
+        if (folder / path).is_file():
+            return folder / path, int(line)
+    return None
+
+
+def _folders(trace: Trace) -> Iterator[Path]:
+    bases = [Path()] if "://" in trace.name else [Path(), Path(trace.name).parent]
+    try:
+        listed = json.loads(trace.job.get("resolved") or "{}").get("search_path")
+    except (ValueError, AttributeError, RecursionError):
+        listed = None
+    for base in bases:
+        for folder in listed if isinstance(listed, list) else ():
+            if isinstance(folder, str) and "\0" not in folder:
+                yield base / folder
+        yield base
+
+
+def _is_node(trace: Trace, entity: int) -> bool:
+    found = trace.entities.get(entity)
+    return found is not None and found.node == found.id != 0

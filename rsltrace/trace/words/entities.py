@@ -1,0 +1,61 @@
+"""What entities are called: within one trace by their ids, and whatever their ids are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.printable import printable
+
+RUN_NAME = "(run)"
+"""Stands for a node where something belongs to the run itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class EntityKey:
+    """An entity by what it is, whatever its id in a trace.
+
+    ``ordinal`` tells apart entities that are otherwise alike: 0, 1, … in creation order.
+    """
+
+    node: str
+    kind: str
+    name: str
+    type: str
+    ordinal: int = 0
+
+    def __str__(self) -> str:
+        number = f" #{self.ordinal + 1}" if self.ordinal else ""
+        return f"{self.node or RUN_NAME}: {self.kind} {self.name}{number}"
+
+
+class EntityNames:
+    """The names of one trace's entities by id, safe to print."""
+
+    def __init__(self, entities: Mapping[int, Entity]) -> None:
+        self._names: dict[int, tuple[str, str]] = {0: ("", "")}
+        for entity in entities.values():
+            owner = entities.get(entity.node)
+            node = printable(owner.name) if owner is not None else ""
+            name = printable(entity.name) or (entity.kind.label if entity.id else "")
+            self._names[entity.id] = node, name
+
+    def node(self, entity_id: int) -> str:
+        """Return the name of the node that an entity belongs to; nothing for the run."""
+        return self._names.get(entity_id, ("", ""))[0]
+
+    def name(self, entity_id: int) -> str:
+        """Return an entity's name, or its kind if it has none; ``#7`` if the trace does not
+        describe it, nothing for the run."""
+        return self._names.get(entity_id, ("", f"#{entity_id}"))[1]
+
+    @property
+    def longest_node(self) -> int:
+        """The length of the longest name of a node."""
+        return max(len(node) for node, _ in self._names.values())
+
+    @property
+    def longest_name(self) -> int:
+        """The length of the longest name."""
+        return max(len(name) for _, name in self._names.values())

@@ -1,0 +1,88 @@
+"""The events of one trace in words: whose they are, what ran, and everything they did."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.model.built_in import is_built_in
+from rsltrace.trace.model.draw import draw_text, is_switch
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.entities import EntityNames
+from rsltrace.trace.words.logs import log_record
+from rsltrace.trace.words.outputs import counted, output_text
+
+_WITHOUT_DETAIL = frozenset(
+    (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.ENTITY)
+)
+
+
+class EventWords:
+    """Puts the events of a trace in words. What it returns is safe to print."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+        self._entities = trace.entities
+        self.names = EntityNames(trace.entities)
+
+    def node(self, event: Event, outputs: Sequence[Output]) -> str:
+        """Return the node of an event: of a constructor, the one that it made; "" for the run."""
+        if event.kind is EventKind.CONSTRUCT:
+            for output in outputs:
+                entity = self._entities.get(output.entity)
+                if output.kind is OutputKind.ENTITY and entity and entity.kind is EntityKind.NODE:
+                    return self.names.name(entity.id)
+        return self.names.node(event.entity)
+
+    def output(self, output: Output) -> str:
+        """Return an output with what its payload says: ``log WARN too far``, ``delay 5 ms``."""
+        kind, name = output.kind, self.names.name(output.entity)
+        if kind is OutputKind.LOG:
+            record = log_record(self._trace, output)
+            return printable(f"log {record.level_name} {record.text}").rstrip() if record else "log"
+        if kind is OutputKind.DRAW:
+            place = self._trace.switches.get(output.event) if is_switch(output.hash) else None
+            if place:
+                return f"another thread goes on before {printable(place)}"
+            return f"{draw_text(output.hash)} ({self.names.node(output.entity) or name})"
+        entity = self._entities.get(output.entity)
+        text = output_text(kind, name, entity.kind.label if entity is not None else "")
+        detail = self._detail(output) if kind not in _WITHOUT_DETAIL else ""
+        if kind is OutputKind.EXCEPTION:
+            return f"{text} {detail}".rstrip()
+        return f"{text} ({detail})" if detail else text
+
+    def outputs(
+        self, outputs: Sequence[Output], more: Callable[[Output], str] = lambda output: ""
+    ) -> Iterator[str]:
+        """Yield the outputs of an event; repeated ones, and what every node has, are counted.
+
+        ``more`` gives what else to say of one.
+        """
+        built_in = 0
+        own = []
+        for output in outputs:
+            if output.kind is OutputKind.ENTITY and self._is_built_in(output.entity):
+                built_in += 1
+            else:
+                own.append(output)
+        yield from counted(f"{self.output(one)} {more(one)}".rstrip() for one in own)
+        if built_in:
+            yield f"{built_in} that every node has"
+
+    def _is_built_in(self, entity_id: int) -> bool:
+        entity = self._entities.get(entity_id)
+        return entity is not None and is_built_in(entity)
+
+    def _detail(self, output: Output) -> str:
+        """Return the detail recorded with an output; of an exception the last line."""
+        try:
+            detail = self._trace.detail(output) or ""
+        except TraceError as error:
+            detail = f"unreadable: {error}"
+        if output.kind is OutputKind.EXCEPTION:
+            detail = (detail.strip().splitlines() or [""])[-1]
+        return printable(detail.strip())

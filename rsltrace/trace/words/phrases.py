@@ -1,0 +1,81 @@
+"""Events as titles and as parts of sentences."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.stamp import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.trace.words.entities import EntityKey
+
+
+_ACTION = "/_action/"
+_PARTS = {
+    "send_goal": "goal",
+    "get_result": "result",
+    "cancel_goal": "cancelling",
+    "feedback": "feedback",
+    "status": "status",
+}
+"""What a person calls the services and topics that an action is made of."""
+
+
+def event_title(kind: EventKind, entity: EntityKey) -> str:
+    """Return ``/filter: subscription /scan``, with what else ran: ``/filter: … (resume)``."""
+    text = printable(str(entity)).rstrip()
+    word = kind.label.replace("_", " ")
+    return text if word in text else f"{text} ({word})"
+
+
+def event_phrase(kind: EventKind, entity: EntityKey) -> str:
+    """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
+    name = entity.name
+    if kind is EventKind.CONSTRUCT:
+        return f"the constructor of {name}" if name else "the construction"
+    if kind is EventKind.BAG:
+        return f"the bag's message on {name}"
+    if kind is EventKind.OUTSIDE:
+        published = entity.kind == EntityKind.PUBLISHER.label
+        return f"the message from outside on {name}" if published else "what outside did"
+    if kind is EventKind.FAULT:
+        return f"the fault of {name}"
+    if kind is EventKind.SHUTDOWN:
+        return f"the end of {name or 'the run'}"
+    if kind is EventKind.CLOCK_JUMP:
+        return "the jump of the clock to the start"
+    number = f" (number {entity.ordinal + 1} of that name)" if entity.ordinal else ""
+    owner = f" of {entity.node}" if entity.node else ""
+    action, _, part = name.rpartition(_ACTION)
+    what = entity.kind if kind in (EventKind.TASK, EventKind.RESUME) else kind.label
+    if part in _PARTS:
+        name, what = f"{action} ({_PARTS[part]})", "action"
+    what = what.replace("_", " ")
+    if kind is EventKind.CLIENT:
+        what = f"the response of{' action' if part in _PARTS else ''}"
+    elif kind is EventKind.TASK:
+        what = f"a task of {what}"
+    elif kind is EventKind.RESUME:
+        what = f"the resumed {what}"
+    return f"{what} {name}{number}{owner}"
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """Return a time in seconds without the zeros at its end: ``1.5``, ``2.0``."""
+    text = format_seconds(stamp_ns).rstrip("0")
+    return f"{text}0" if text.endswith(".") else text
+
+
+def at_time(stamp_ns: int) -> str:
+    """Return a time as part of a sentence: ``at 1.5 s``."""
+    return f"at {seconds_text(stamp_ns)} s"
+
+
+def as_sentence(text: str) -> str:
+    """Return a text with a capital and a full stop, whoever made it."""
+    text = printable(text).strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
