@@ -27,11 +27,10 @@ from rsltrace.debug.conditions.names import Names
 from rsltrace.debug.conditions.view import Sent
 
 from rsltrace import Job, load_job
-from rsltrace.checks.conditions import condition, opposite, plain, topic_of
-from rsltrace.checks.evaluate import title
+from rsltrace.checks.evaluate import condition, opposite, plain, title, topic_of
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.stamp import NS_PER_S
+from rsltrace.trace.model.printable import NS_PER_S
 
 DISCOVERY_S_MAX = 30.0
 SETTLE_S = 0.2

@@ -28,7 +28,7 @@ from rsltrace.job import Job
 from rsltrace.run.session import Session
 from rsltrace.search.explore.steps import Watch
 from rsltrace.simulation.chance.stream import Stream
-from rsltrace.simulation.loop.search_policies import Pct, pct_bound
+from rsltrace.simulation.loop.policy import Pct, pct_bound
 
 TOPICS = ("a", "b", "c")
 MESSAGES = 4

@@ -213,7 +213,7 @@ def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
 
 
 _NO_METHODS_OF_OURS = {
-    ("rsltrace/adapters/rclpy/boundary/quick_publish.py", "publish"): "of rclpy's Publisher",
+    ("rsltrace/adapters/rclpy/boundary/installation.py", "publish"): "of rclpy's Publisher",
     ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "__init__"): "of asyncio's loops",
     ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "_watcher"): "of asyncio's policies",
     ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "step"): "a slot of RecordedPoll",
@@ -260,8 +260,8 @@ RUNS_CODE = {
     "rsltrace/cli/main.py": "import_module",  # the module of a command
     "rsltrace/job/__init__.py": "import_module",  # public names of jobs
     "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
-    "rsltrace/adapters/rclpy/boundary/type_support.py": "exec_module import_module",  # of rosidl
-    "rsltrace/adapters/rclpy/executors/exchanged.py": "import_module",  # functions of rclpy
+    "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
+    "rsltrace/adapters/rclpy/executors/user_executors.py": "import_module",  # functions of rclpy
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
     "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # tomli; setup.py, as colcon
     # What a run, and only a run, does with code that its job names.
@@ -271,17 +271,17 @@ RUNS_CODE = {
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
     "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
-    "rsltrace/run/plans/target.py": "import_module",  # node: module:Class
+    "rsltrace/run/plans/scheduling.py": "import_module",  # node: module:Class
     "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
     "rsltrace/adapters/launch/api/names.py": "import_module",  # stand-ins for modules of launch
     "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
     "rsltrace/adapters/launch/api/sources.py": "exec_module",  # a Python launch file
-    "rsltrace/adapters/launch/apart.py": "pickle",  # the answer of that process
+    "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
-    "rsltrace/native/apart/link.py": "pickle",  # of user code: plain values only
-    "rsltrace/run/copying.py": "pickle",  # what a copy of the simulation returns
+    "rsltrace/native/apart/wire.py": "pickle",  # of user code: plain values only
+    "rsltrace/run/forked.py": "pickle",  # what a copy of the simulation returns
     # Who sits at the prompt of a session, in a run whose code they have agreed to run.
     "rsltrace/debug/python_expression.py": "compile eval",
 }

@@ -14,7 +14,7 @@ from rsltrace.simulation.loop.loop import ORDER_BAG
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.publisher import Publisher, Transport
 from rsltrace.simulation.middleware.qos.policies import (
     Durability,
     History,
@@ -22,7 +22,6 @@ from rsltrace.simulation.middleware.qos.policies import (
     Qos,
     Reliability,
 )
-from rsltrace.simulation.middleware.transport import Transport
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 

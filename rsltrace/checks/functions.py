@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from rsltrace.checks.properties import Violation
 from rsltrace.errors import CheckError, RsltraceError
 from rsltrace.job.values.target import Target
-from rsltrace.run.plans.target import load_target
+from rsltrace.run.plans.scheduling import load_target
 from rsltrace.trace.reader import Trace
 
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsltrace.checks.latency.figures import quantile
+from rsltrace.checks.latency.instances import quantile
 from rsltrace.checks.latency.measure import ChainLatency, Latencies, measuring
 from rsltrace.checks.properties import KEPT_MAX, Violation
-from rsltrace.job.parts.latency import LatencySpec
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.job.parts.check import LatencySpec
+from rsltrace.trace.model.printable import format_duration, format_seconds
 from rsltrace.trace.reader import Trace
 
 _WORDS = {

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import set_option
-from rsltrace.cli.output.picture import check_picture, save_picture
+from rsltrace.cli.output.text_file import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
 from rsltrace.terminal import say, tell
@@ -94,7 +94,7 @@ def analyze(
     from rsltrace.job import load_job
     from rsltrace.native.timing import analysis as timing
     from rsltrace.native.timing.model import Wanted, check_job
-    from rsltrace.run.launch_files import without_launch_files
+    from rsltrace.run.inputs import without_launch_files
 
     supply = _supply(reservation)
     by_end = dict(_deadline(text) for text in deadlines)
@@ -133,7 +133,7 @@ def analyze(
     else:
         _print(found, measured, [one.trace.name for one in native])
     if plot is not None:
-        from rsltrace.cli.output.analysis_plot import picture_of
+        from rsltrace.cli.output.analysis_text import picture_of
 
         save_picture(picture_of(found), plot)
         tell(f"wrote {plot}")

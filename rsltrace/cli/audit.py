@@ -17,7 +17,7 @@ from rsltrace.terminal import say, tell
 from rsltrace.trace.model.printable import printable
 
 if TYPE_CHECKING:
-    from rsltrace.guard.audit.model import Audit, Found
+    from rsltrace.guard.audit.rules import Audit, Found
 
 _FORMATS = ("text", "json", "github")
 
@@ -60,7 +60,7 @@ def audit(
     The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
     """
     result = _look(words, launch, skip, overrides)
-    from rsltrace.guard.audit.model import IS_SAFE
+    from rsltrace.guard.audit.rules import IS_SAFE
 
     found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
     for trouble in result.troubles:
@@ -84,7 +84,7 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
         if overrides:
             raise click.UsageError(f"--set changes a job, and {only} is none")
         return audit_path(only)
-    from rsltrace.run.launch_files import without_launch_files
+    from rsltrace.run.inputs import without_launch_files
     from rsltrace.run.plans.executables import source_of
     from rsltrace.run.process import search_path
 
@@ -130,7 +130,7 @@ def _as_json(result: Audit, found: Sequence[Found]) -> str:
 
 def _annotation(one: Found) -> str:
     from rsltrace.diff.report.ci import command_data, command_property
-    from rsltrace.guard.audit.model import IS_SAFE
+    from rsltrace.guard.audit.rules import IS_SAFE
 
     level = "notice" if one.treatment in IS_SAFE else "warning"
     place = f"file={command_property(printable(_shown(one.path)))},line={one.line},col={one.column}"

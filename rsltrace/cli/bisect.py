@@ -19,9 +19,8 @@ from rsltrace.terminal import say, tell
 if TYPE_CHECKING:
     from rsltrace.child_processes import Processes
     from rsltrace.job import Job
-    from rsltrace.search.bisect.judges import Check
     from rsltrace.search.bisect.repository import Repository
-    from rsltrace.search.bisect.runs import Runner
+    from rsltrace.search.bisect.runs import Check, Runner
     from rsltrace.search.bisect.search import Found
 
 _BEFORE, _AFTER = "before.mcap", "after.mcap"
@@ -107,7 +106,7 @@ def bisect(
     trouble: ends that do not differ, a job that is not deterministic, no repository.
     """
     from rsltrace.child_processes import Processes
-    from rsltrace.cli.output.bisect_text import line_of
+    from rsltrace.cli.output.search_text import line_of
     from rsltrace.search.bisect.repository import Repository
     from rsltrace.search.bisect.runs import Runner
     from rsltrace.search.bisect.search import Search
@@ -148,7 +147,7 @@ def bisect(
 
 
 def _check(expression: str | None, shell: str | None, processes: Processes) -> Check | None:
-    from rsltrace.search.bisect.judges import check_of, command
+    from rsltrace.search.bisect.runs import check_of, command
 
     if expression is not None:
         return check_of(expression)
@@ -243,7 +242,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 def _report(found: Found, runner: Runner, output: Path | None, *, as_json: bool) -> int:
     """Say what was found, keep the traces if asked for, and return the exit status."""
-    from rsltrace.cli.output.bisect_text import as_text, as_values
+    from rsltrace.cli.output.search_text import as_text, as_values
 
     kept = None
     if output is not None:

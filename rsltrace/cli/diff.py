@@ -230,7 +230,7 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
-    from rsltrace.cli.output.progress import working
+    from rsltrace.cli.output.search_progress import working
     from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.trace.contents import check_contents
 

@@ -38,7 +38,7 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
     """Read ``1000`` (trials) or ``10min`` (of real time)."""
     from rsltrace.job.values.times import parse_time
     from rsltrace.search.explore.search import Budget
-    from rsltrace.trace.model.stamp import NS_PER_S
+    from rsltrace.trace.model.printable import NS_PER_S
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:
@@ -340,9 +340,13 @@ class _End:
         """Write the page and the table, and print what came of the search."""
         from rsltrace.cli.output.search_text import search_lines
         from rsltrace.search.explore.report.exploration import Exploration, Reduced
-        from rsltrace.search.explore.report.formats import github_text, json_text, junit_text
+        from rsltrace.search.explore.report.formats import (
+            github_text,
+            json_text,
+            junit_text,
+            write_parquet,
+        )
         from rsltrace.search.explore.report.page import write_page
-        from rsltrace.search.explore.report.parquet import write_parquet
         from rsltrace.search.explore.table import PAGE, PARQUET, rows
 
         source, search = self._source, self._search

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from rsltrace.terminal import tell
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import format_seconds
 
 EXIT_CUT = 1
 
@@ -36,7 +36,7 @@ def export(
     The exit status is 0 if the bag is all there is, 1 if TRACE is cut (its run was killed): the bag
     then ends where the trace does.
     """
-    from rsltrace.cli.output.progress import working
+    from rsltrace.cli.output.search_progress import working
     from rsltrace.trace.reader import Trace
     from rsltrace.trace.recordings.export import export_bag
 

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.output.fit_text import as_json, checked_text, text
-from rsltrace.cli.output.picture import check_picture, save_picture
-from rsltrace.cli.output.text_file import write_text
+from rsltrace.cli.output.text_file import check_picture, save_picture, write_text
 from rsltrace.errors import OutputError, RunError, TraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.printable import printable
@@ -25,7 +24,7 @@ from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.native.fit.checked import Chains
+    from rsltrace.native.fit.comparison import Chains
     from rsltrace.native.fit.parts import Fit
 
 
@@ -93,7 +92,7 @@ def fit(
     of the simulated one, their ratio with its 95 % interval, and a two-sample test; beside them the
     same of the first run, since the robot is not like itself every time.
     """
-    from rsltrace.native.fit.checked import check
+    from rsltrace.native.fit.comparison import check
     from rsltrace.native.fit.measured import measured
     from rsltrace.native.fit.parts import fit as fitted_to
     from rsltrace.native.fit.parts import notes
@@ -253,8 +252,7 @@ def _chains(second: Trace) -> Chains:
     :raises SetupError: if what compares them is missing.
     :raises TraceError: if there are none.
     """
-    from rsltrace.native.fit.checked import chains_of
-    from rsltrace.native.fit.comparison import need_scipy
+    from rsltrace.native.fit.comparison import chains_of, need_scipy
 
     need_scipy()
     return chains_of(second)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.completion import complete_files
-from rsltrace.job.values.ros_arguments import split_ros_arguments
+from rsltrace.job.values.mappings import split_ros_arguments
 
 if TYPE_CHECKING:
     from rsltrace.job import Job

@@ -15,13 +15,13 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, all_overrides, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
-from rsltrace.cli.output.watching import interruptible, progress
+from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import READ_BY, Source
 from rsltrace.trace.model.printable import printable
-from rsltrace.trace.words.silent_topics import silent_topics, without_server
+from rsltrace.trace.words.logs import silent_topics, without_server
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked
@@ -315,7 +315,7 @@ def _say_if_it_has_no_end(job: Job) -> None:
 
 
 def _print_job(job: Job) -> None:
-    from rsltrace.run.launch_files import without_launch_files
+    from rsltrace.run.inputs import without_launch_files
 
     expanded = without_launch_files(job)
     for note in expanded.notes:

@@ -13,7 +13,7 @@ import click
 
 from rsltrace.cli.diff import Tolerance, print_diffs
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
-from rsltrace.cli.output.watching import interruptible, progress
+from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.cli.replay_node import (
     NodeWays,
     replay_from_job,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
-from rsltrace.cli.output.watching import interruptible, progress
+from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import NodeError
 from rsltrace.guard.pin import unpin

@@ -52,7 +52,7 @@ def rerun(
     from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
     from rsltrace_viewer.rerun_export.export import export
 
-    from rsltrace.cli.output.progress import working
+    from rsltrace.cli.output.search_progress import working
 
     timeline = EVENT if by_event else SIM_TIME
     how = show.choose(spawn=spawn, web=web, output=output)

@@ -23,11 +23,11 @@ from rsltrace.terminal import tell
 if TYPE_CHECKING:
     from rsltrace_viewer.session import Session
     from rsltrace_viewer.terminal.app import ViewerApp
+    from rsltrace_viewer.terminal.follow import RerunFollower
     from rsltrace_viewer.terminal.recordings.app import RecordingApp
-    from rsltrace_viewer.terminal.rerun_follower import RerunFollower
     from rsltrace_viewer.terminal.screenshot import Shown
 
-    from rsltrace.trace.words.times import TimeInRun
+    from rsltrace.trace.words.phrases import TimeInRun
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
@@ -140,7 +140,7 @@ def _recordings(
     from rsltrace_viewer.model.recordings.filter import read_filter
     from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 
-    from rsltrace.trace.words.times import START
+    from rsltrace.trace.words.phrases import START
 
     session = open_recordings(paths)
     start = None
@@ -202,7 +202,7 @@ def _check_rerun(*, follow: bool, exporting: bool) -> None:
 
 
 def _follower(stack: ExitStack, traces: tuple[Path, ...]) -> RerunFollower:
-    from rsltrace_viewer.terminal.rerun_follower import RerunFollower
+    from rsltrace_viewer.terminal.follow import RerunFollower
 
     follower = RerunFollower(traces)
     stack.callback(follower.close)
@@ -243,7 +243,7 @@ def _place(session: Any, at: str) -> int:
 
 
 def _time(at: str, what: str) -> TimeInRun:
-    from rsltrace.trace.words.times import parse_time_in_run
+    from rsltrace.trace.words.phrases import parse_time_in_run
 
     try:
         return parse_time_in_run(at)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from rsltrace.errors import nearest
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.trace.words.matching import is_named
+from rsltrace.trace.words.entities import is_named
 
 Fields = Callable[[str], Mapping[str, str] | None]
 """By the name of an interface (``nav_msgs/msg/Odometry``), its fields and their types."""

@@ -11,7 +11,7 @@ from rsltrace.conditions.condition import Armed, is_true, shown, shown_text
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, Sent
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.words.matching import is_named
+from rsltrace.trace.words.entities import is_named
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _SENDS = {

@@ -18,8 +18,8 @@ from rsltrace.errors import ConditionError, TraceError
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
+from rsltrace.trace.words.entities import is_named
 from rsltrace.trace.words.logs import log_record
-from rsltrace.trace.words.matching import is_named
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 

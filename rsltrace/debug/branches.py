@@ -103,7 +103,7 @@ class Branches:
 
         if is_trace(os.fspath(self._source)):
             if self._job_folder is None:
-                from rsltrace.replay.job_folder import folder_of
+                from rsltrace.replay.preparation import folder_of
                 from rsltrace.trace.reader import Trace
 
                 with Trace.open(self._source) as trace:

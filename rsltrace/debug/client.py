@@ -23,7 +23,7 @@ from typing import Any
 
 from rsltrace import errors
 from rsltrace.debug.branches import Branches
-from rsltrace.debug.positions import Breakpoint, Position, Stopped, position_of, stopped_of
+from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 

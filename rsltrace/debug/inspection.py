@@ -14,8 +14,8 @@ from rsltrace.conditions.names import nodes_called, short_name
 from rsltrace.debug.python_expression import PythonError, python_value
 from rsltrace.debug.source import source
 from rsltrace.errors import DebugError, did_you_mean
+from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import overview
-from rsltrace.simulation.middleware.receiver import Receiver
 
 if TYPE_CHECKING:
     from rsltrace.conditions.names import Names

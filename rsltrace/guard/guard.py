@@ -27,15 +27,22 @@ from rsltrace.guard.callers import (
     stack_of,
     user_frame,
 )
-from rsltrace.guard.context import Context
+from rsltrace.guard.context import Context, RandomStreams, RealTimePace
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.frames import code_of
-from rsltrace.guard.library_imports import present_import
-from rsltrace.guard.looks_and_draws import AHEAD_NS_MAX, LOOK_NS, Clock, Draw, Shown
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
-from rsltrace.guard.random_streams import RandomStreams
-from rsltrace.guard.real_time import RealTimePace
-from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_answer, finding_value
+from rsltrace.guard.recorded_answers import (
+    AHEAD_NS_MAX,
+    LOOK_NS,
+    Clock,
+    Draw,
+    RecordedAnswers,
+    Shown,
+    decoded,
+    encoded_answer,
+    finding_value,
+)
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 

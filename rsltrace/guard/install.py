@@ -2,24 +2,321 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import ctypes
+import hashlib
+import os
+import platform
+import resource
+import sys
+import tempfile
+import zlib
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
+from typing import Any
 
+from rsltrace.guard.callers import is_nobodys, module_of
+from rsltrace.guard.frames import caller, exchange_special
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.process_ids import meant_id, meant_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
 from rsltrace.guard.recorded.polls import recorded_polls
 from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
+from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import virtual_clocks
-from rsltrace.guard.virtual.directory_listings import sorted_listings
-from rsltrace.guard.virtual.module_caches import fresh_module_caches
 from rsltrace.guard.virtual.object_hashes import watched_hashes
-from rsltrace.guard.virtual.object_texts import numbered_texts
-from rsltrace.guard.virtual.own_process_id import own_process_ids
 from rsltrace.guard.virtual.processors import same_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.watched.functions import watched_calls
+from rsltrace.trace.model.finding import Mode, Source
+
+# Directory listings in the order of their names: a file system gives them in any order.
+
+_NAMES_MAX = 20
+"""Names of a listing that the trace keeps."""
+
+
+class SortedScan:
+    """What ``os.scandir`` returns, in the order of names."""
+
+    def __init__(self, entries: list[Any]) -> None:
+        self._entries = iter(entries)
+
+    def __iter__(self) -> SortedScan:
+        return self
+
+    def __next__(self) -> Any:
+        return next(self._entries)
+
+    def __enter__(self) -> SortedScan:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give nothing more."""
+        self._entries = iter(())
+
+
+def _sorted_names(value: list[Any]) -> tuple[list[Any], list[Any]]:
+    names = sorted(value, key=os.fsencode)
+    return names, names
+
+
+def _sorted_scan(value: Any) -> tuple[SortedScan, list[Any]]:
+    with value:
+        entries = sorted(value, key=lambda entry: os.fsencode(entry.name))
+    return SortedScan(entries), [entry.name for entry in entries]
+
+
+def _call(name: str, arguments: tuple[Any, ...]) -> str:
+    path = arguments[0] if arguments else "."
+    return f"os.{name}({os.fspath(path) if isinstance(path, os.PathLike) else path!r})"
+
+
+def _told(names: list[Any]) -> str:
+    """Return how many names there are, and which: two runs may have found others."""
+    texts = [os.fsdecode(name) for name in names]
+    if not texts:
+        return "no names"
+    more = len(texts) - _NAMES_MAX
+    if more <= 0:
+        return f"{len(texts)} name{'' if len(texts) == 1 else 's'} ({', '.join(texts)})"
+    digest = hashlib.sha256("\0".join(texts).encode(errors="surrogateescape")).hexdigest()[:16]
+    return f"{len(texts)} names, SHA-256 {digest} ({', '.join(texts[:_NAMES_MAX])}, …)"
+
+
+def _listing(
+    name: str, arrange: Callable[[Any], tuple[Any, list[Any]]], real: Callable[..., Any]
+) -> Any:
+    call = f"os.{name}()"
+
+    def listed(*arguments: Any, **options: Any) -> Any:
+        value = real(*map(meant_path, arguments), **options)
+        guard = engaged()
+        if guard is None:
+            return value
+        frame = caller()
+        mode = guard.mode(Source.DIRECTORY, frame)
+        if mode is Mode.VIRTUAL:
+            arranged, names = arrange(value)
+            guard.count(Source.DIRECTORY, call, frame)
+            guard.answered(Source.DIRECTORY, _call(name, arguments), partial(_told, names), frame)
+            return arranged
+        if mode is not Mode.ALLOW:
+            shown = repr(value[:10]) if isinstance(value, list) else ""
+            guard.watched(Source.DIRECTORY, call, shown, frame)
+        return value
+
+    return listed
+
+
+@contextmanager
+def sorted_listings() -> Iterator[None]:
+    """Sort what ``os.listdir`` and ``os.scandir`` give, and so glob, pathlib and ``os.walk``."""
+    with ExitStack() as stack:
+        for name, arrange in (
+            ("listdir", _sorted_names),
+            ("scandir", _sorted_scan),
+        ):
+            redirect(stack, getattr(os, name), partial(_listing, name, arrange))
+        yield
+
+
+# What Python's own modules remember for a whole process: forgotten for the time of a run.
+#
+# ``tempfile`` finds its folder once and has one sequence of names, ``platform`` asks the machine
+# once. A second run in the same process would get other names and miss what the first was told of;
+# so each run begins as in a process of its own, each node has names of its own and is told itself
+# what it asks, and afterwards everything is as it was.
+
+_tempfile: Any = tempfile
+_platform: Any = platform
+_ASKED_ONCE: dict[str, tuple[str, Callable[[], object]]] = {
+    "uname": ("_uname_cache", lambda: None),
+    "platform": ("_platform_cache", dict),
+    "freedesktop_os_release": ("_os_release_cache", lambda: None),
+}
+"""Functions of ``platform``, where each keeps its answer, and what is there before the first."""
+
+
+class _Names:
+    """Stands in for ``tempfile``'s sequence of random names: each node has its own."""
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+
+    def __iter__(self) -> _Names:
+        return self
+
+    def __next__(self) -> str:
+        guard = engaged()
+        if guard is None:
+            if self._real is None:
+                self._real = _tempfile._RandomNameSequence()
+            return str(next(self._real))
+        names = guard.streams.file_names
+        stream = guard.stream(sys._getframe(1))
+        if stream not in names:
+            names[stream] = _tempfile._RandomNameSequence()
+        return str(next(names[stream]))
+
+
+def _unseen(real: Callable[..., str]) -> Callable[..., str]:
+    """Where files go is asked by one node for all: neither its chance nor its finding."""
+
+    def default_folder(*arguments: Any) -> str:
+        with engage(None):
+            return real(*arguments)
+
+    return default_folder
+
+
+def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
+    """Ask the machine again each time: whoever asked before may have been a library."""
+
+    def ask(*arguments: Any, **options: Any) -> Any:
+        setattr(_platform, cache, empty())
+        return real(*arguments, **options)
+
+    return ask
+
+
+@contextmanager
+def fresh_module_caches() -> Iterator[None]:
+    """Let nothing be remembered from before, and put it back afterwards."""
+    with ExitStack() as stack:
+        for name, (cache, empty) in _ASKED_ONCE.items():
+            if hasattr(platform, cache):
+                replace_attribute(stack, platform, cache, empty())
+                replace_attribute(
+                    stack, platform, name, _asking(getattr(platform, name), cache, empty)
+                )
+        find = _tempfile._get_default_tempdir
+        chosen = tempfile.tempdir
+        if chosen is not None and chosen == find():
+            chosen = None  # nobody has chosen it
+        replace_attribute(stack, tempfile, "tempdir", chosen)
+        replace_attribute(stack, tempfile, "_get_default_tempdir", _unseen(find))
+        replace_attribute(stack, tempfile, "_name_sequence", _Names(_tempfile._name_sequence))
+        yield
+
+
+# ``os.getpid`` in user code: names, seeds and files made of it are the same in every run.
+
+_CALL = "os.getpid()"
+_LOGGING = "logging"
+_TAKE_IDS = (
+    *("getpgid", "getsid", "getpriority", "setpriority", "pidfd_open"),
+    *("sched_getparam", "sched_setparam", "sched_getscheduler", "sched_setscheduler"),
+    "sched_rr_get_interval",
+)
+"""Functions of ``os`` that are given the id of a process; ``os.kill`` is the door's."""
+
+_TAKE_PATHS = ("readlink", "access")
+"""Functions of ``os`` that are given a path and that nobody else redirects."""
+
+
+def _getpid(real: Callable[[], int]) -> Callable[[], int]:
+    def getpid() -> int:
+        guard = engaged()
+        if guard is None:
+            return real()
+        frame = caller()
+        if is_nobodys(frame):
+            return real()
+        mode = guard.mode(Source.PID, frame)
+        shown = module_of(frame) == _LOGGING  # which notes it in every record, whoever logs
+        if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
+            if not shown:
+                guard.count(Source.PID, _CALL, frame)
+            return virtual_id(guard)
+        if shown:
+            return real()
+        if mode is Mode.RECORD and guard.is_for_user(frame):
+            return int(guard.recorded(Source.PID, _CALL, real, frame))
+        value = real()
+        guard.watched(Source.PID, _CALL, value, frame)
+        return value
+
+    return getpid
+
+
+def _taking(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*arguments: Any, **options: Any) -> Any:
+        options = {name: meant(value) for name, value in options.items()}
+        return real(*map(meant, arguments), **options)
+
+    return call
+
+
+@contextmanager
+def own_process_ids() -> Iterator[None]:
+    """Give each main a process id of its own, and take it back where one is asked for."""
+    with ExitStack() as stack:
+        redirect(stack, os.getpid, _getpid)
+        for name in _TAKE_IDS:
+            if hasattr(os, name):
+                redirect(stack, getattr(os, name), partial(_taking, meant_id))
+        redirect(stack, resource.prlimit, partial(_taking, meant_id))
+        for name in _TAKE_PATHS:
+            redirect(stack, getattr(os, name), partial(_taking, meant_path))
+        yield
+
+
+# Texts of objects that have none of their own: a number of the run's in place of the address.
+#
+# ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. ``object.__repr__`` and
+# those of functions, generators and coroutines are exchanged for the time of a run; every type
+# that takes its text from them is told to look for it by name.
+
+_as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
+    ("PyInstanceMethod_New", ctypes.pythonapi)
+)
+_SHOWN_ALIKE = (FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType)
+
+
+def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
+    def __repr__(self: Any, /) -> str:  # noqa: N807
+        text = real(self)
+        guard = engaged()
+        if guard is None or guard.mode(Source.ADDRESS, caller()) is Mode.ALLOW:
+            return text
+        with engage(None):
+            address = f"0x{id(self):x}"
+            return text.replace(address, _shown(guard, self) or address)
+
+    # Neither a function nor new: numba's jitclass looks for what a class adds to ``object``.
+    vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
+    method: Callable[[Any], str] = _as_method(__repr__)
+    return method
+
+
+def _shown(guard: Guard, thing: Any) -> str | None:
+    """Return what stands for the address of an object: the node's number for it, in hexadecimal.
+
+    Addresses do not begin like that. None for an object that cannot be recognised later.
+    """
+    node = guard.context.node()
+    number = guard.shown.number(node, thing)
+    if number is None:
+        return None
+    return f"0x52{zlib.crc32(node.encode('utf-8', 'replace')) & 0xFFFF:04x}{number * 16:06x}"
+
+
+@contextmanager
+def numbered_texts() -> Iterator[None]:
+    """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
+    with ExitStack() as stack:
+        for kind in (object, *_SHOWN_ALIKE):
+            exchange_special(stack, kind, "__repr__", _numbered)
+        yield
+
 
 _REPLACEMENTS = (
     fresh_module_caches,

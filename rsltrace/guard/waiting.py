@@ -13,15 +13,14 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.context import Context
+from rsltrace.guard.context import STEP_NS, Context
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.library_imports import present_import
-from rsltrace.guard.real_time import STEP_NS
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
 
 NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""

@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rsltrace.job.job import Job
     from rsltrace.job.parts.bag import BagSpec, QosSpec
-    from rsltrace.job.parts.check import CheckSpec
+    from rsltrace.job.parts.check import CheckSpec, MetricSpec
     from rsltrace.job.parts.fault import FaultSpec
     from rsltrace.job.parts.guard import GuardSpec, SourceSpec, policy_of
-    from rsltrace.job.parts.hooks import HooksSpec
     from rsltrace.job.parts.launch import LaunchSpec
-    from rsltrace.job.parts.metric import MetricSpec
     from rsltrace.job.parts.node import NodeSpec
-    from rsltrace.job.parts.record import RecordSpec
+    from rsltrace.job.parts.record import HooksSpec, RecordSpec
     from rsltrace.job.parts.stop import StopSpec, TopicStop
     from rsltrace.job.parts.vary import VarySpec
     from rsltrace.job.reading.load import job_from_text, load_job, locate, showing_line
@@ -27,10 +25,10 @@ _HOMES = {
     "CheckSpec": "parts.check",
     "FaultSpec": "parts.fault",
     "GuardSpec": "parts.guard",
-    "HooksSpec": "parts.hooks",
+    "HooksSpec": "parts.record",
     "Job": "job",
     "LaunchSpec": "parts.launch",
-    "MetricSpec": "parts.metric",
+    "MetricSpec": "parts.check",
     "NodeSpec": "parts.node",
     "QosSpec": "parts.bag",
     "RecordSpec": "parts.record",

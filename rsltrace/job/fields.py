@@ -10,18 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from rsltrace.job.parts.bag import BagSpec
-from rsltrace.job.parts.check import CheckSpec
+from rsltrace.job.parts.check import CheckSpec, MetricSpec, check_metric_name
 from rsltrace.job.parts.clocks import ClockSpec, clocks_part
 from rsltrace.job.parts.delay import DelaysSpec
 from rsltrace.job.parts.distribution import files_of
 from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.job.parts.guard import GuardSpec, guard_part
-from rsltrace.job.parts.hooks import HooksSpec
 from rsltrace.job.parts.launch import LaunchSpec
-from rsltrace.job.parts.metric import MetricSpec, check_metric_name
 from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import Part
-from rsltrace.job.parts.record import RecordSpec
+from rsltrace.job.parts.record import HooksSpec, RecordSpec
 from rsltrace.job.parts.scheduling import (
     ExecutionSpec,
     ExecutorSpec,
@@ -44,8 +42,8 @@ from rsltrace.job.values.checks import (
     text,
     whole,
 )
+from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Loc, Problem, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 

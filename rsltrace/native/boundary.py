@@ -17,7 +17,7 @@ from typing import Any
 from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.native.ledger import Ledger, Logged, Sent, Span, Taken, now_ns
-from rsltrace.native.patches import patched
+from rsltrace.native.support import patched
 from rsltrace.native.things import Thing, Things
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import OutputKind

@@ -14,11 +14,11 @@ from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import message_type, service_type
-from rsltrace.native.patches import patched
+from rsltrace.native.support import patched
 from rsltrace.native.things import Thing, Things
 from rsltrace.simulation.middleware.entity import callback_name
-from rsltrace.trace.model.built_in import NODE_SERVICES
 from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.operation import NODE_SERVICES
 
 _ROSOUT = "/rosout"
 

@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any
 
-from rsltrace.native.patches import patched
+from rsltrace.native.support import patched
 from rsltrace.native.things import Thing, Things
 from rsltrace.simulation.loop.policy import Candidate, PriorityRule
 from rsltrace.trace.model.entity import EntityKind

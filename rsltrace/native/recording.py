@@ -11,14 +11,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rsltrace.adapters.rclpy.exit_code_topic import watch_exit_code
+from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 from rsltrace.errors import RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
 from rsltrace.native.pen import Clocks, Pen, Spans
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.run.inputs import check_output
-from rsltrace.run.plans.stopping import end_ns_of, stop_conditions
+from rsltrace.run.plans.scheduling import end_ns_of, stop_conditions
 from rsltrace.run.process import Observer
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
 from rsltrace.simulation.loop.policy import PriorityRule

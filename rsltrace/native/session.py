@@ -14,7 +14,6 @@ from rsltrace.job import Job
 from rsltrace.native import support
 from rsltrace.native.apart.run import InProcesses
 from rsltrace.native.boundary import Boundary
-from rsltrace.native.domain import domain
 from rsltrace.native.entries import RunningEntry, destroy
 from rsltrace.native.executors import EXECUTORS, Executors
 from rsltrace.native.ledger import Ledger
@@ -28,8 +27,9 @@ from rsltrace.native.recording import (
     Spent,
     rclpy_running,
 )
+from rsltrace.native.support import domain
 from rsltrace.native.things import Things
-from rsltrace.run.launch_files import without_launch_files
+from rsltrace.run.inputs import without_launch_files
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import Observer, kept_process, search_path
 from rsltrace.simulation.loop.stop import Stop
@@ -136,7 +136,7 @@ class InThreads(Recording):
 
     def _make_executor(self) -> Any:
         if self.priorities is not None:
-            from rsltrace.native.priority_executor import PriorityExecutor
+            from rsltrace.native.executors import PriorityExecutor
 
             return PriorityExecutor(self.priorities)
         import rclpy.executors

@@ -13,8 +13,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from rsltrace.simulation.middleware.entity import callback_name
-from rsltrace.simulation.middleware.interface import MessageType
-from rsltrace.simulation.middleware.source_position import source_of
+from rsltrace.simulation.middleware.interface import MessageType, source_of
 from rsltrace.trace.model.entity import Entity, EntityKind
 
 

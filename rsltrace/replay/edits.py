@@ -24,7 +24,7 @@ from rsltrace.errors import EditError, did_you_mean
 from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.times import TimeInRun, parse_stamp, parse_time_in_run
+from rsltrace.trace.words.phrases import TimeInRun, parse_stamp, parse_time_in_run
 
 Step = tuple[str, Any]
 """A step into an object: ``(".", name)`` or ``("[", key)``."""

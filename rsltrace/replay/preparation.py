@@ -2,22 +2,237 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from rsltrace.errors import ReplayError
-from rsltrace.job import Job
-from rsltrace.replay.code import Code, code_of
+from rsltrace.adapters.launch import ros_launch
+from rsltrace.errors import JobError, ReplayError
+from rsltrace.job import Job, job_from_text, load_job
+from rsltrace.job.reading.resolved import job_from_resolved
+from rsltrace.replay.code import Code, code_of, file_of
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
-from rsltrace.replay.job_folder import folder_of, job_in_trace
-from rsltrace.replay.trust import why_not_trusted
+from rsltrace.run.inputs import without_launch_files
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.finding import Mode
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
+
+# The folder of a trace's job. A trace holds no absolute paths, so the folder is looked for.
+
+_NAME_MAX = 255
+"""Bytes that the name of a file can have."""
+
+
+def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
+    """Return a job without its bags, which need not be there. ``load`` gets overrides.
+
+    :raises JobError: if it cannot be used otherwise.
+    """
+    try:
+        return load(("bags=[]",))
+    except JobError as error:
+        try:
+            return load(("bags=[]", "progress=null"))  # who has no bags has no progress
+        except JobError:
+            raise error from None
+
+
+def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
+    """Return the job that a trace holds, as if its file were in ``folder``. Nothing is run.
+
+    Without ``bags`` it is that job without them, and they need not be there.
+
+    :raises ReplayError: if the trace holds none, or one of another version.
+    """
+    try:
+        resolved = _resolved(trace)
+        _let_follow(trace, resolved, folder)
+        if not bags:
+            resolved.update(bags=[], progress=None)
+        return job_from_resolved(
+            resolved, name=job_name(trace), text=trace.job_text, folder=folder.absolute()
+        )
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise ReplayError(f"the job in {trace.name} cannot be read: {error}") from error
+    except JobError as error:
+        raise ReplayError(
+            f"the job in {trace.name} cannot be run in {folder}: {error}; the folder of the job "
+            "file is named with --job-folder DIR"
+        ) from error
+
+
+def _resolved(trace: Trace) -> dict[str, Any]:
+    try:
+        resolved = json.loads(trace.job.get("resolved") or "null")
+    except (ValueError, RecursionError) as error:
+        raise ReplayError(f"the job in {trace.name} cannot be read: {error}") from error
+    if not isinstance(resolved, dict):
+        raise ReplayError(f"{trace.name} does not hold the job that was run: nothing to replay")
+    return resolved
+
+
+def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
+    """Let a job that followed a recording which is gone follow the trace: it has that order."""
+    policy = resolved.get("policy")
+    if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
+        return
+    if not (folder / policy["recorded"]).is_file():
+        policy["recorded"] = str(Path(trace.name).resolve())
+
+
+def job_name(trace: Trace) -> str:
+    """Return the name of the file that a trace's job was read from, empty if it was none."""
+    name = Path(trace.job.get("name", "")).name
+    return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
+
+
+def folder_of(trace: Trace, given: Path | None) -> Path:
+    """Return the folder of a trace's job: the one that is given, or one in which the job is.
+
+    :raises ReplayError: saying what was looked for, and where.
+    """
+    if given is not None:
+        if not given.is_dir():
+            raise ReplayError(f"--job-folder {given}: there is no such folder")
+        return given
+    beside = [] if "://" in trace.name else [Path(trace.name).parent]
+    places = list(dict.fromkeys([*beside, Path()]))
+    wanted = _wanted(trace)
+    best = max(places, key=lambda place: _found(trace, place, wanted))
+    if _found(trace, best, wanted)[0] or not wanted:
+        return best
+    listed = ", ".join(wanted[:5]) + (f" and {len(wanted) - 5} more" if len(wanted) > 5 else "")
+    where = " and in ".join(_shown(place) for place in places)
+    raise ReplayError(
+        f"the job of {trace.name} is not here: looked for {listed} in {where}; name the folder "
+        "that the job file is in with --job-folder DIR"
+    )
+
+
+def _shown(place: Path) -> str:
+    return "the present folder" if place == Path() else str(place)
+
+
+def _wanted(trace: Trace) -> list[str]:
+    """Return what shows that a folder is the job's: its file, or else the modules of its nodes."""
+    if job_name(trace):
+        return [job_name(trace)]
+    return [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
+
+
+def _found(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
+    """Say whether a folder has what is wanted, and whether the job file says what it said."""
+    if not job_name(trace):
+        folders = _search(trace, folder)
+        return all(file_of(name, folders, installed=False) for name in wanted), False
+    file = folder / job_name(trace)
+    return file.is_file(), file.is_file() and _text(file) == trace.job_text
+
+
+def _search(trace: Trace, folder: Path) -> list[str]:
+    listed = _resolved(trace).get("search_path")
+    return [str(folder / str(path)) for path in (listed if isinstance(listed, list) else ["."])]
+
+
+def _text(file: Path) -> str:
+    try:
+        return file.read_bytes().decode("utf-8-sig", "replace")
+    except OSError:
+        return ""
+
+
+# Whether to run what a trace names. A trace may come from anybody, and its job may name any code.
+#
+# ``record`` runs what a job file says that somebody chose to run. A replay runs what a *trace*
+# says, and a trace looks like data. So it runs without being asked only where it does no more than
+# ``record`` of the job file in the present folder would do: the same nodes (or some of them) with
+# the same parameters, arguments, launch files, hooks and bags. What only says when, in which order
+# and for how long they run may differ.
+
+_LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
+_MAY_DIFFER = frozenset(
+    (
+        "start_ns",
+        "construct_time_ns",
+        "stop",
+        "seed",
+        "timer_ties",
+        "livelock_limit",
+        "policy",
+        "min_time_step_ns",
+        "executors",
+        "execution",
+        "record",
+    )
+)
+"""Keys of a job that say when, in which order and for how long its nodes run, and what is kept."""
+
+
+def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: bool = True) -> str:
+    """Return why a trace runs only if somebody says so, empty if it may.
+
+    ``named``: the job's folder has been named by whoever runs it. Nothing is run to find out.
+    ``bags``: those of the job will play.
+    """
+    name = job_name(trace)
+    if not named and folder.resolve() != Path.cwd():
+        return f"its job lies in {folder}, which is not the present folder"
+    if not name:
+        return "its job was made in Python, so there is no job file here that says the same"
+    try:
+        own = _own_job(folder / name, bags=bags)
+    except (JobError, OSError, RecursionError):
+        own = None
+    if own is None:
+        return f"there is no {name} in {folder} to compare its job with without running code"
+    differing = _differing(own, job)
+    if differing:
+        return f"its job differs from {folder / name} in {', '.join(differing)}"
+    if edits_of(trace):
+        return "it holds edits, which the nodes would run with"
+    if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
+        return "it holds answers from outside (of files, sockets, …) that the nodes would be given"
+    return ""
+
+
+def _own_job(file: Path, *, bags: bool) -> Job | None:
+    """Return the job of a job file or launch file, None if that takes running a program."""
+    if file.name.endswith(_LAUNCH):
+        spec = json.dumps({"file": file.name, "arguments": {}})
+        job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
+    elif file.suffix in (".yaml", ".yml", ".json"):
+        job = load_job(file) if bags else without_bags(lambda to: load_job(file, overrides=to))
+    else:
+        return None
+    for launch in job.launch:
+        # ROS's own launch runs what a launch file tells it to.
+        if not launch.file.endswith(_LAUNCH) or ros_launch.can_read(job.resolve(launch.file)):
+            return None
+    return without_launch_files(job, programs=False).job
+
+
+def _differing(own: Job, job: Job) -> list[str]:
+    a, b = _values(own), _values(job)
+    fewer = all(node in a["nodes"] for node in b["nodes"])  # of the nodes that are named here
+    return [key for key in a if a[key] != b[key] and not (key == "nodes" and fewer)]
+
+
+def _values(job: Job) -> dict[str, Any]:
+    resolved = json.loads(json.dumps(job.resolved()))
+    values = {key: value for key, value in resolved.items() if key not in _MAY_DIFFER}
+    values["guard"] = {key: value for key, value in values["guard"].items() if key != "pin"}
+    policy = resolved["policy"] or {}
+    values["stop.function"] = resolved["stop"]["function"]
+    values["policy"] = policy.get("function"), policy.get("recorded")
+    values["files"] = sorted(job.model_files())
+    return values
+
 
 Position = int | str
 """An event by its index (an int, or digits), or a simulated time (``2.5``, ``60s``, ``5ms``)."""
@@ -111,7 +326,7 @@ def count_to(trace: Trace, position: Position) -> int:
 
     :raises ReplayError: if it is no position, or before the first event.
     """
-    from rsltrace.trace.words.times import parse_time_in_run
+    from rsltrace.trace.words.phrases import parse_time_in_run
 
     text = str(position).strip()
     if text.isascii() and text.isdigit():

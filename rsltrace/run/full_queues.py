@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from rsltrace.simulation.middleware.receiver import Receiver
+from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.trace.model.drop import Drop
 
 _TOLD = 5

@@ -18,8 +18,7 @@ from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
 from rsltrace.run.full_queues import drop_notes, drops
-from rsltrace.run.inputs import check_output
-from rsltrace.run.launch_files import without_launch_files
+from rsltrace.run.inputs import check_output, without_launch_files
 from rsltrace.run.numerical_libraries import LateLibraries
 from rsltrace.run.plans.bags import (
     BagInput,
@@ -29,24 +28,26 @@ from rsltrace.run.plans.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
 from rsltrace.run.plans.guard import RunGuard, install_guard, packages_of
 from rsltrace.run.plans.main_programs import MainProgram
-from rsltrace.run.plans.network import network_plan
+from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
 from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import (
+    end_ns_of,
     going_on,
     is_ordered,
     policy_of_job,
     scheduling_plan,
+    stop_at_size,
+    stop_conditions,
+    stop_with,
     switches_at_lines,
     unmet_departures,
 )
 from rsltrace.run.plans.starts import missed_starts
-from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions, stop_with
 from rsltrace.run.process import (
     Observer,
     frozen_heap,
@@ -67,15 +68,13 @@ from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.loop.timer_queue import timer_queue
-from rsltrace.simulation.middleware.events.census import Census
-from rsltrace.simulation.middleware.faults import FaultsOfAll
+from rsltrace.simulation.middleware.events.event import Census
+from rsltrace.simulation.middleware.interface import FaultsOfAll
 from rsltrace.trace.format import METADATA_ENVIRONMENT
 from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.model.drop import kept_drops
-from rsltrace.trace.model.endless_wait import EndlessWait, kept_waits
-from rsltrace.trace.model.finding import GuardCount
-from rsltrace.trace.model.printable import shortened
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.finding import EndlessWait, GuardCount, kept_waits
+from rsltrace.trace.model.printable import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
@@ -84,9 +83,8 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
-    from rsltrace.simulation.chance.network import NetworkPlan
-    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
-    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
+    from rsltrace.simulation.chance.channel import NetworkPlan
+    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -386,7 +384,7 @@ class Session:
     def begin(self) -> None:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
         if self.job.stop.topic is not None:
-            from rsltrace.adapters.rclpy.exit_code_topic import watch_exit_code
+            from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 
             watch = watch_exit_code(
                 self.loop,

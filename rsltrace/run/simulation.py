@@ -18,8 +18,8 @@ from rsltrace.run.session import RunResult, Session
 from rsltrace.run.tap import Tap
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.trace.model.stamp import format_seconds
-from rsltrace.trace.words.times import parse_time_in_run
+from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.words.phrases import parse_time_in_run
 
 T = TypeVar("T")
 Time = str | int | float

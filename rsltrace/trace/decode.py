@@ -25,11 +25,11 @@ from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rsltrace.errors import TraceError
+from rsltrace.trace.cdr import STAND_IN_TYPE, with_wide_texts, without_wide_texts
 from rsltrace.trace.index import ChannelInfo
-from rsltrace.trace.mcap import limits
+from rsltrace.trace.mcap import records as limits
 from rsltrace.trace.mcap.records import SCHEMA_ENCODING
-from rsltrace.trace.model.placeholders import PLACEHOLDERS
-from rsltrace.trace.wide_texts import STAND_IN_TYPE, with_wide_texts, without_wide_texts
+from rsltrace.trace.model.printable import PLACEHOLDERS
 
 if TYPE_CHECKING:
     from rsltrace.trace.leaves import Leaf

@@ -8,8 +8,8 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
-from rsltrace.trace.model.placeholders import NO_FIELD
-from rsltrace.trace.wide_texts import STAND_IN_TYPE
+from rsltrace.trace.cdr import STAND_IN_TYPE
+from rsltrace.trace.model.printable import NO_FIELD
 
 _DEPTH_MAX = 6
 

@@ -15,11 +15,18 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.index import MESSAGE_INDEX_FIXED, ChunkEntry, TraceIndex
+from rsltrace.trace.index import (
+    MESSAGE_INDEX_FIXED,
+    ChunkEntry,
+    TraceIndex,
+    damaged,
+    messages_in,
+    read_body,
+    read_chunk,
+)
 from rsltrace.trace.mcap.chunk import message_at
 from rsltrace.trace.mcap.records import Damaged, Fields, Span
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.pieces import damaged, messages_in, read_body, read_chunk
 
 _CHUNKS_CACHED = 4
 """Payload chunks have about half a megabyte, so this is memory; two topics read side by side need

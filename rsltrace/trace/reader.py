@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
-from rsltrace.trace.chain import digest_text
-from rsltrace.trace.check import check_data_section, check_hashes, check_records
+from rsltrace.trace.chain import digest_text, hash64, verify_chain
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_ENVIRONMENT,
@@ -30,6 +30,8 @@ from rsltrace.trace.format import (
     METADATA_NATIVE,
     METADATA_OWN,
     METADATA_RESULT,
+    OUTPUT_DTYPE,
+    OUTPUT_HASHED,
     PREFIX_OWN,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
@@ -42,25 +44,127 @@ from rsltrace.trace.format import (
     TOPIC_ROSOUT,
 )
 from rsltrace.trace.guarded import parse_counts
-from rsltrace.trace.index import ChannelInfo, read_summary
-from rsltrace.trace.mcap.limits import ENTITY_ID_MAX
+from rsltrace.trace.index import (
+    ChannelInfo,
+    TraceIndex,
+    damaged,
+    read_attachment,
+    read_metadata,
+    read_summary,
+)
 from rsltrace.trace.mcap.place import open_source
-from rsltrace.trace.mcap.records import Header
+from rsltrace.trace.mcap.records import (
+    ENTITY_ID_MAX,
+    MAGIC,
+    Damaged,
+    Header,
+    parse_channel,
+    parse_schema,
+)
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import has_end
-from rsltrace.trace.model.code_line import CodeLine
+from rsltrace.trace.mcap.summary import Summary, check_data, has_end
+from rsltrace.trace.mcap.walk import read_body, walk_records
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, Event, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, Mode
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import format_seconds
 from rsltrace.trace.payloads import PayloadReader
-from rsltrace.trace.pieces import read_attachment, read_metadata
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder, Decoders
     from rsltrace.trace.leaves import Leaf
     from rsltrace.trace.tables import Tables
+
+# Checking a whole trace: every byte against the file's checksum, every event against its hashes.
+#
+# Reading checks what it reads. This reads everything, and also finds what no single read can see:
+# a changed environment or job, or events whose hashes are not those of their contents.
+
+_DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
+
+
+def check_data_section(source: ByteSource, summary_start: int) -> None:
+    """Raise TraceError unless the bytes before the summary have the checksum given there."""
+    try:
+        check_data(source, summary_start)
+    except Damaged as error:
+        raise damaged(source, 0, "the data section", error) from error
+
+
+def check_records(source: ByteSource, index: TraceIndex) -> None:
+    """Raise TraceError unless the records before the summary follow each other without a gap, and
+    have the channels and schemas that the summary says.
+
+    A checksum may have been made for bytes that are no MCAP file, and who reads a file from its
+    start knows no summary.
+    """
+    told = Summary()
+    try:
+        for opcode, span in walk_records(source, len(MAGIC), index.summary_start):
+            if opcode in _DEFINITIONS:
+                _add_once(told, opcode, read_body(source, span, opcode))
+    except Damaged as error:
+        raise damaged(source, 0, "the data section", error) from error
+    found = TraceIndex(complete=True, header=index.header)
+    found.take(told)
+    if found.channels != index.channels:
+        raise damaged(
+            source, index.summary_start, "the summary", "its channels are not those before it"
+        )
+
+
+def _add_once(told: Summary, opcode: int, body: bytes) -> None:
+    """Add a channel or schema. Raises Damaged if there is another one of its id."""
+    if opcode == Opcode.SCHEMA:
+        schema = parse_schema(body)
+        is_only = told.schemas.setdefault(schema.id, schema) == schema
+    else:
+        channel = parse_channel(body)
+        is_only = told.channels.setdefault(channel.id, channel) == channel
+    if not is_only:
+        raise Damaged("a channel or schema is defined twice, in two ways")
+
+
+def check_hashes(source: ByteSource, segments: SegmentReader) -> None:
+    """Raise TraceError unless all chain hashes and output hashes follow from the contents."""
+    previous = 0
+    for segment in range(len(segments.table)):
+        events = segments.events(segment)
+        wrong = verify_chain(events, previous)
+        if wrong is not None:
+            raise TraceError(
+                f"{source.name}: the chain hash of event {events[wrong]['index']} is not that of "
+                "its contents; the trace was changed after it was recorded"
+            )
+        previous = int(events["chain_hash"][-1])
+        outputs = segments.outputs(segment)
+        if not np.array_equal(outputs["event"], np.repeat(events["index"], events["outputs"])):
+            raise TraceError(
+                f"{source.name}: the outputs of the events from {events[0]['index']} on are not "
+                "as many as the events say; the trace was changed after it was recorded"
+            )
+        _check_output_hashes(source, events, outputs)
+
+
+def _check_output_hashes(
+    source: ByteSource, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]
+) -> None:
+    packed = np.ascontiguousarray(outputs, dtype=OUTPUT_DTYPE).tobytes()
+    size = OUTPUT_DTYPE.itemsize
+    position = 0
+    rows = zip(events["outputs"].tolist(), events["output_hash"].tolist(), strict=True)
+    for number, (count, expected) in enumerate(rows):
+        folded = 0
+        for _ in range(count):
+            folded = hash64(packed[position : position + size][OUTPUT_HASHED], folded)
+            position += size
+        if folded != expected:
+            raise TraceError(
+                f"{source.name}: the output hash of event {events[number]['index']} is not that of "
+                "its outputs; the trace was changed after it was recorded"
+            )
+
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")

@@ -10,9 +10,8 @@ from collections.abc import Callable, Sequence
 
 from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
-from rsltrace.trace.model.code_line import CodeLine
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, OutputKind
 from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.writer import TraceWriter
 

@@ -23,13 +23,19 @@ from rsltrace.trace.format import (
     TOPIC_OUTPUTS,
     begins_a_trace,
 )
-from rsltrace.trace.index import ChunkEntry, TraceIndex, check_version, not_a_trace, read_header
+from rsltrace.trace.index import (
+    ChunkEntry,
+    TraceIndex,
+    check_version,
+    messages_in,
+    not_a_trace,
+    read_header,
+)
 from rsltrace.trace.mcap.chunk import read_chunk
 from rsltrace.trace.mcap.records import Damaged, Fields, Span
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.mcap.summary import Summary
 from rsltrace.trace.mcap.walk import length_by_fields, read_body, whole_records
-from rsltrace.trace.pieces import messages_in
 from rsltrace.trace.segments import check_numbered, events_in, outputs_in
 
 

@@ -19,10 +19,10 @@ from rsltrace.trace.format import (
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
+from rsltrace.trace.index import damaged, read_chunk
 from rsltrace.trace.mcap.records import RECORD_HEAD, Damaged, Span
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.event import Event, EventFlag, EventKind, Output, OutputKind
-from rsltrace.trace.pieces import damaged, read_chunk
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"
 """The CDR header as numpy gives it: without the zeros at its end."""

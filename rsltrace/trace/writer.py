@@ -55,16 +55,14 @@ from rsltrace.trace.format import (
     TOPIC_STATES,
     TOPIC_TIMINGS,
 )
-from rsltrace.trace.mcap.chunk_body import Waiting, messages_chunk
+from rsltrace.trace.index import metadata_checksum
+from rsltrace.trace.mcap.chunk import Waiting, messages_chunk
 from rsltrace.trace.mcap.deferred import DeferredWriter
-from rsltrace.trace.mcap.limits import MESSAGE_BYTES_MAX
-from rsltrace.trace.mcap.records import MESSAGE_HEAD
+from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
-from rsltrace.trace.model.code_line import CodeLine
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.event import NO_SEQUENCE
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
 from rsltrace.trace.model.finding import Finding
-from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
 
 _HEADER_BYTES = MESSAGE_HEAD.size

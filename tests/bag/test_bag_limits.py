@@ -12,7 +12,7 @@ import zstandard
 
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import BagError
-from rsltrace.trace.mcap.limits import CHUNK_BYTES_MAX
+from rsltrace.trace.mcap.records import CHUNK_BYTES_MAX
 from rsltrace.trace.recordings import files as files_module
 from rsltrace.trace.recordings import metadata as metadata_module
 from rsltrace.trace.recordings import open_bag

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rsltrace.trace.recordings import DURATION_INFINITE_NS, BagQos, BagTopic
-from rsltrace.trace.recordings.qos import parse_qos
+from rsltrace.trace.recordings.topic import parse_qos
 
 WORDS = """\
 - history: keep_all

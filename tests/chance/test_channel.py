@@ -17,11 +17,14 @@ from rsltrace.simulation.chance.channel import (
     LOST_OUTAGE,
     Burst,
     Channel,
+    LinkRule,
     Model,
+    NameRule,
+    NetworkPlan,
     Outage,
+    OutageRule,
 )
 from rsltrace.simulation.chance.distribution import Constant, Distribution, Gamma, Normal, Uniform
-from rsltrace.simulation.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
 from tests.tiers import cases
 
 N = 100_000

@@ -24,10 +24,9 @@ from rsltrace.simulation.chance.distribution import (
     Samples,
     Series,
     Uniform,
+    quantile,
 )
-from rsltrace.simulation.chance.exact import exp, log
-from rsltrace.simulation.chance.normal import quantile
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import Stream, exp, log
 
 N = 100_000
 MS = 1_000_000

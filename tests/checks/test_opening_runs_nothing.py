@@ -9,10 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from rsltrace import Trace, load_job, record
-from rsltrace.adapters.launch.values import yaml_value
+from rsltrace.adapters.launch.model import yaml_value
 from rsltrace.cli.main import cli
 from rsltrace.errors import JobError
-from rsltrace.trace.recordings.qos import parse_qos
+from rsltrace.trace.recordings.topic import parse_qos
 from tests.trace.make import write_run
 
 HARM = (

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.words.silent_topics import silent_topics, without_server
+from rsltrace.trace.words.logs import silent_topics, without_server
 
 
 def entities(*ends: tuple[str, EntityKind, str]) -> list[Entity]:

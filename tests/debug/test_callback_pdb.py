@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rsltrace.debug.callback_pdb import call_under_pdb
-from rsltrace.debug.prompt.pdb_terminal import talk
+from rsltrace.debug.prompt.command_table import talk
 from rsltrace.errors import DebugError
 
 

@@ -7,10 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from rsltrace.debug.positions import Breakpoint, Position, Stopped
+from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
-from rsltrace.debug.prompt.completion import completions
-from rsltrace.debug.prompt.shell import Shell
+from rsltrace.debug.prompt.shell import Shell, completions
 from rsltrace.debug.prompt.show import (
     graph_lines,
     position_line,

@@ -15,7 +15,7 @@ from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of
 
 from rsltrace import DebugSession
-from rsltrace.debug.positions import Stopped
+from rsltrace.debug.checkpoints import Stopped
 from rsltrace.job import load_job
 from rsltrace.run import record
 from rsltrace.trace.model.event import EventKind, OutputKind

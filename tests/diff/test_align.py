@@ -7,8 +7,7 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.alignment.align import EarlierPairs
-from rsltrace.diff.alignment.match import NO_CAUSE, UNKNOWN, EventSequence, match
+from rsltrace.diff.alignment.align import NO_CAUSE, UNKNOWN, EarlierPairs, EventSequence, match
 from tests.tiers import cases
 
 # (stamp, input, cause, nth)

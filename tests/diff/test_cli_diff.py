@@ -21,7 +21,7 @@ from click.testing import CliRunner
 from mcap.reader import make_reader
 
 from rsltrace.cli.main import cli
-from rsltrace.trace.pieces import metadata_checksum
+from rsltrace.trace.index import metadata_checksum
 
 SAMPLES = Path(__file__).parent.parent.parent / "sample_traces"
 PAIR = SAMPLES / "nondeterministic_callback"

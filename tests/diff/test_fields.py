@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.bags.content import ContentKeys
+from rsltrace.diff.bags.comparison import ContentKeys
 from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.sentences.values import notes_text

@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.diff.alignment.longest_increasing import longest_increasing
+from rsltrace.diff.alignment.rows import longest_increasing
 
 
 def rises(values: list[int]) -> bool:

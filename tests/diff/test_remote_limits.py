@@ -15,8 +15,8 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation
 import rsltrace
 from rsltrace.diff.report import render
 from rsltrace.errors import TraceError
-from rsltrace.trace.mcap import limits
-from rsltrace.trace.mcap.address import public, without_secrets
+from rsltrace.trace.mcap import records as limits
+from rsltrace.trace.mcap.source import public, without_secrets
 from rsltrace.trace.reader import Trace
 from tests.range_server import RangeServer
 

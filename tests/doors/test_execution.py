@@ -18,8 +18,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace.errors import DeadlockError
-from rsltrace.trace.model.draw import draw_text
-from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.event import OutputKind, draw_text
 
 pytestmark = pytest.mark.ros
 

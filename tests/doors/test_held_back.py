@@ -16,7 +16,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from rsltrace.cli.main import cli
-from rsltrace.trace.model.endless_wait import waits_of
+from rsltrace.trace.model.finding import waits_of
 from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros

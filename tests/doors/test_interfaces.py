@@ -19,7 +19,8 @@ from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci, NestedMessage
 from test_msgs.msg import BoundedSequences, Strings
 
-from rsltrace.adapters.rclpy.wire import interface_files, interface_schema
+from rsltrace.adapters.rclpy.wire import interfaces as interface_files
+from rsltrace.adapters.rclpy.wire import interfaces as interface_schema
 from rsltrace.adapters.rclpy.wire.interfaces import (
     get_message_class,
     get_service_class,

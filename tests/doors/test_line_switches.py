@@ -19,9 +19,8 @@ from std_msgs.msg import Int32
 
 from rsltrace.errors import NodeError, RunError
 from rsltrace.run.plans.recorded_order import ATTACHMENT_CHOICES
-from rsltrace.simulation.loop.choices import decoded
-from rsltrace.simulation.loop.policy import Candidate, Moment
-from rsltrace.trace.model.draw import is_switch
+from rsltrace.simulation.loop.policy import Candidate, Moment, decoded
+from rsltrace.trace.model.event import is_switch
 from tests.forked_command import Forks
 
 pytestmark = pytest.mark.ros

@@ -10,8 +10,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.simulation.chance.clock import ClockModel, WrongClock
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import ClockModel, Stream, WrongClock
 
 MS = 1_000_000
 S = 1_000_000_000

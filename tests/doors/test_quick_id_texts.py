@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.node import Node
 
-from rsltrace.adapters.rclpy.boundary.quick_id_texts import octets_text, quick_id_texts
+from rsltrace.adapters.rclpy.boundary.installation import octets_text, quick_id_texts
 
 pytestmark = pytest.mark.ros
 

@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 from rclpy.serialization import serialize_message
 from std_msgs.msg import String, UInt64
 
-from rsltrace.adapters.rclpy.boundary.quick_publish import quick_publish
+from rsltrace.adapters.rclpy.boundary.installation import quick_publish
 
 pytestmark = pytest.mark.ros
 

@@ -9,8 +9,7 @@ import pytest
 
 import rsltrace.adapters.rclpy.boundary.installation as installing
 from rsltrace.adapters.rclpy.boundary.boundary import Boundary
-from rsltrace.adapters.rclpy.boundary.installation import boundary
-from rsltrace.adapters.rclpy.boundary.release import missing_parts
+from rsltrace.adapters.rclpy.boundary.installation import boundary, missing_parts
 from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.errors import SetupError
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.errors import ExploreError
-from rsltrace.search.explore.bundle import bundle_of
+from rsltrace.search.explore.cluster import bundle_of
 from rsltrace.search.explore.outcome import Wants
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 
@@ -93,7 +93,7 @@ def test_the_hash_of_a_bundle_is_that_of_its_content(job: Path) -> None:
 
 
 def test_a_large_file_must_be_there(job: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rsltrace.search.explore.bundle.SHIPPED_MAX", 100)
+    monkeypatch.setattr("rsltrace.search.explore.cluster.SHIPPED_MAX", 100)
     bundle = bundle_of(JobSource(str(job)))
     assert list(bundle.large) == ["robot/src/robot.py"]
     bundle.unpack(job.parents[2] / "a")

@@ -11,8 +11,14 @@ from xml.etree import ElementTree
 
 import pytest
 
-from rsltrace.search.explore.report.effects import FAILS, effects
-from rsltrace.search.explore.report.exploration import Exploration, Reduced, causes, repeat_command
+from rsltrace.search.explore.report.exploration import (
+    FAILS,
+    Exploration,
+    Reduced,
+    causes,
+    effects,
+    repeat_command,
+)
 from rsltrace.search.explore.report.formats import github_text, json_values, junit_text
 from rsltrace.search.explore.report.page import page, write_page
 from rsltrace.search.explore.trial import CHECK, EXCEPTION, Failure, Trial, TrialResult
@@ -200,7 +206,7 @@ def test_a_command_that_nobody_can_read_is_not_shown() -> None:
 
 def test_a_table_can_be_queried_and_merged_with_another(tmp_path: Path) -> None:
     duckdb = pytest.importorskip("duckdb")
-    from rsltrace.search.explore.report.parquet import write_parquet
+    from rsltrace.search.explore.report.formats import write_parquet
 
     for name in "ab":
         (tmp_path / name).mkdir()

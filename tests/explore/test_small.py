@@ -15,9 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.search.explore.outcome import Wants
-from rsltrace.search.explore.small.ddmin import ddmin
-from rsltrace.search.explore.small.folder import write_small
-from rsltrace.search.explore.small.reduction import Reduced, Reduction
+from rsltrace.search.explore.small.causes import write_small
+from rsltrace.search.explore.small.reduction import Reduced, Reduction, ddmin
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
 from rsltrace.trace.reader import Trace

@@ -11,8 +11,7 @@ import pytest
 
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job, NodeSpec
-from rsltrace.search.explore.strategies.feedback import Feedback
-from rsltrace.search.explore.strategies.named import NAMES, strategy_named
+from rsltrace.search.explore.strategies.named import NAMES, Feedback, strategy_named
 from rsltrace.search.explore.trial import Trial, TrialResult
 
 JOB = Job(nodes=[NodeSpec(node="m:N")])

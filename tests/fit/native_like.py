@@ -7,8 +7,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_NATIVE, TIMING
-from rsltrace.trace.model.draw import Draw, encode_draw
-from rsltrace.trace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, Draw, OutputKind, encode_draw
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter

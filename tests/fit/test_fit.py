@@ -17,13 +17,11 @@ from rsltrace import Trace, record
 from rsltrace.checks.latency.measure import measure_latencies
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
-from rsltrace.native.fit.measured import measured
-from rsltrace.native.fit.measurement import Measured
+from rsltrace.native.fit.measured import Measured, measured
 from rsltrace.native.fit.models import ks_distance
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.simulation.chance.stream import Stream
-from rsltrace.trace.model.draw import Draw
-from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.event import Draw, OutputKind
 from tests.fit.native_like import AHEAD_NS, BITS, as_native
 
 pytestmark = pytest.mark.ros

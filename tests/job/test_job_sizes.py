@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.job.values.sizes import format_size, parse_size
+from rsltrace.job.values.times import format_size, parse_size
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job.reading.yaml_source import REPEATED_MAX, parse_yaml
-from rsltrace.trace.model.nesting import NESTING_MAX
+from rsltrace.trace.model.operation import NESTING_MAX
 
 
 @pytest.mark.parametrize(

@@ -10,9 +10,9 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
-from rsltrace.run.plans.clocks import clocks_of
+from rsltrace.run.plans.network import clocks_of
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
-from rsltrace.simulation.chance.clock import ClockModel
+from rsltrace.simulation.chance.stream import ClockModel
 
 MS = 1_000_000
 

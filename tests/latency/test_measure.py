@@ -14,13 +14,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rsltrace.checks.latency.figures import figures
-from rsltrace.checks.latency.instances import Parts
+from rsltrace.checks.latency.instances import Parts, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, measure_latencies
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.checks.latency_checks import check_latency
 from rsltrace.errors import TraceError
-from rsltrace.job.parts.latency import LatencySpec
+from rsltrace.job.parts.check import LatencySpec
 from rsltrace.trace.format import (
     CDR_HEADER,
     EVENT_DTYPE,
@@ -29,9 +28,8 @@ from rsltrace.trace.format import (
     TIMING,
     TOPIC_TIMINGS,
 )
-from rsltrace.trace.model.draw import Draw, encode_draw
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, encode_draw
 from tests.tiers import cases
 
 NODES, TOPICS = 3, 4

@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.adapters.launch.expression import evaluate
-from rsltrace.adapters.launch.scope import Scope
-from rsltrace.adapters.launch.substitution import Substitutions
-from rsltrace.adapters.launch.template import Call, parse_template
+from rsltrace.adapters.launch.model import Scope
+from rsltrace.adapters.launch.substitution import Call, Substitutions, parse_template
 
 
 def text(written: str) -> str:

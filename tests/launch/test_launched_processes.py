@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.adapters.launch.apart import read_apart
+from rsltrace.adapters.launch.expand import read_apart
 from rsltrace.adapters.launch.model import Launched
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.job import NodeSpec

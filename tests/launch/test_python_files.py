@@ -14,12 +14,12 @@ import pytest
 
 from rsltrace import Trace
 from rsltrace.adapters.launch import ros_launch
-from rsltrace.adapters.launch.apart import read_apart
+from rsltrace.adapters.launch.expand import read_apart
 from rsltrace.adapters.launch.model import Launched
 from rsltrace.adapters.launch.python_file import read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
-from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.parts.launch import StartAfterSpec
 
 FILES = Path(__file__).parent / "files"
 SUB = "<launch><arg name='who'/><node pkg='demo' exec='talker' name='sub_$(var who)'/></launch>"

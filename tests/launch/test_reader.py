@@ -11,7 +11,7 @@ from rsltrace.adapters.launch.model import Launched, LaunchedNode
 from rsltrace.adapters.launch.specs import node_specs as specs_of
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
-from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.parts.launch import StartAfterSpec
 from rsltrace.run.plans.executables import why_not
 
 
@@ -412,8 +412,8 @@ def test_a_bad_name_is_told_at_its_node(read: Any, prefix: Path) -> None:
 
 
 def test_the_document_names_all_that_is_read() -> None:
+    from rsltrace.adapters.launch.model import Scope
     from rsltrace.adapters.launch.reader import ActionReader
-    from rsltrace.adapters.launch.scope import Scope
     from rsltrace.adapters.launch.substitution import Substitutions
 
     text = (Path(__file__).parents[2] / "docs" / "launch.md").read_text(encoding="utf-8")

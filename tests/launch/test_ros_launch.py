@@ -16,7 +16,7 @@ from rsltrace.adapters.launch.model import Launched
 from rsltrace.adapters.launch.reader import read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
-from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.parts.launch import StartAfterSpec
 
 pytest.importorskip("launch_ros", reason="needs ROS's launch and launch_ros")
 

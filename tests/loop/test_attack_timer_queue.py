@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import random
 
-from rsltrace.simulation.loop.timer import TimerState
-from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
+from rsltrace.simulation.loop.timer_queue import CreationOrderQueue, TimerState
 
 
 def test_a_watchdog_leaves_nothing_behind() -> None:

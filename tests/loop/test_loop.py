@@ -13,8 +13,7 @@ from rsltrace.simulation.loop.loop import ORDER_BAG, EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop, Place
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.loop.stop import Progress, Stop, stop_after_events, stop_at
-from rsltrace.simulation.loop.timer import TimerState
-from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
+from rsltrace.simulation.loop.timer_queue import CreationOrderQueue, TimerState
 from tests.tiers import cases
 
 

@@ -6,8 +6,7 @@ import pytest
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.chance.stream import Stream
-from rsltrace.simulation.loop.policy import Candidate, Moment
-from rsltrace.simulation.loop.search_policies import Departure, Departures, Pct, pct_bound
+from rsltrace.simulation.loop.policy import Candidate, Departure, Departures, Moment, Pct, pct_bound
 
 THREADS, EVENTS = 4, 3
 

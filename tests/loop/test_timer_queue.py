@@ -8,8 +8,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.simulation.loop.timer import TimerState
-from rsltrace.simulation.loop.timer_queue import CreationOrderQueue, HeapOrderQueue, timer_queue
+from rsltrace.simulation.loop.timer_queue import (
+    CreationOrderQueue,
+    HeapOrderQueue,
+    TimerState,
+    timer_queue,
+)
 
 PERIODS = st.integers(min_value=1, max_value=7)
 

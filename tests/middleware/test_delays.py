@@ -14,8 +14,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
-from rsltrace.trace.model.draw import draw_text
-from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.event import EventKind, OutputKind, draw_text
 
 pytestmark = pytest.mark.ros
 

@@ -8,15 +8,13 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.simulation.chance.channel import Model
+from rsltrace.simulation.chance.channel import Model, NetworkPlan
 from rsltrace.simulation.chance.distribution import Constant
-from rsltrace.simulation.chance.network import NetworkPlan
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.stop import stop_at
 from rsltrace.simulation.loop.timer_queue import timer_queue
 from rsltrace.simulation.middleware.domain import Domain
-from rsltrace.simulation.middleware.faults import MessageFault, TopicFaults
-from rsltrace.simulation.middleware.interface import MessageType
+from rsltrace.simulation.middleware.interface import MessageFault, MessageType, TopicFaults
 from rsltrace.simulation.middleware.links import Network
 from tests.tiers import cases
 

@@ -6,8 +6,8 @@ import random
 import threading
 
 from rsltrace.native.boundary import channel_of
-from rsltrace.native.causes import Causes
 from rsltrace.native.ledger import Failed, Ledger, Scheduled, Sent, Span, Taken
+from rsltrace.native.pen import Causes
 from rsltrace.native.things import Thing
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind

@@ -11,10 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.native.apart import merge as merging
-from rsltrace.native.apart.link import Link, LinkError
-from rsltrace.native.apart.merge import Merge
-from rsltrace.native.apart.wire import SpanReader, SpanWriter
+from rsltrace.native.apart import run as merging
+from rsltrace.native.apart.run import Merge
+from rsltrace.native.apart.wire import Link, LinkError, SpanReader, SpanWriter
 from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span, Taken, now_ns
 from rsltrace.native.things import Things
 from rsltrace.simulation.middleware.interface import MessageType

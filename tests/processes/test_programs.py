@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 
 from rsltrace.adapters.processes import build
+from rsltrace.adapters.processes.build import interpreter, why_not_run
 from rsltrace.adapters.processes.child import Child
-from rsltrace.adapters.processes.programs import interpreter, why_not_run
 from rsltrace.adapters.workspace import cache
 from rsltrace.errors import SetupError
 

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.adapters.processes.child import Child
-from rsltrace.adapters.processes.life import Life, has_memory
+from rsltrace.adapters.processes.child import Child, Life, has_memory
 from rsltrace.job import load_job
 from rsltrace.run.recording import run
 from rsltrace.search.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings

@@ -13,16 +13,13 @@ pytest.importorskip("rerun")
 
 import pyarrow as pa
 import rerun as rr
-from rsltrace_viewer.rerun_export.columns import clock_for, lists
+from rsltrace_viewer.rerun_export.columns import FrameTree, clock_for, lists
 from rsltrace_viewer.rerun_export.divergence import document
-from rsltrace_viewer.rerun_export.events.labels import hashes
-from rsltrace_viewer.rerun_export.events.rates import step_for
-from rsltrace_viewer.rerun_export.frames import FrameTree
-from rsltrace_viewer.rerun_export.messages.clouds import extent, shaded
-from rsltrace_viewer.rerun_export.messages.fields import curves_of
-from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
-from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
-from rsltrace_viewer.rerun_export.messages.tracks import Track
+from rsltrace_viewer.rerun_export.events.chunks import hashes, step_for
+from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerBoard
+from rsltrace_viewer.rerun_export.messages.rows import curves_of
+from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint, extent, shaded
+from rsltrace_viewer.rerun_export.messages.trails import Track
 
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.remarks import DifferentJobs

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.run.module_code import module_code
+from rsltrace.run.provenance import module_code
 
 CODE = 'import pkg.gains\n\n\ndef go(x):\n    """Go."""\n    return [x, 1.5]\n'
 

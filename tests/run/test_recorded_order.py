@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import JobError
-from rsltrace.simulation.loop.choices import Choices, decoded
+from rsltrace.simulation.loop.policy import Choices, decoded
 from rsltrace.trace.reader import Trace
 
 MIXED = """

@@ -15,7 +15,7 @@ from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
+from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
 
 pytestmark = pytest.mark.ros
 

@@ -14,7 +14,7 @@ from rsltrace.diff.file_kind import is_trace
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.format import METADATA_RESULT
-from rsltrace.trace.pieces import metadata_checksum
+from rsltrace.trace.index import metadata_checksum
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from tests.tiers import cases

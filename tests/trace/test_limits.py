@@ -20,7 +20,7 @@ from rsltrace.errors import OutputError, TraceError
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.decode import Decoder, Decoders
 from rsltrace.trace.index import ChannelInfo
-from rsltrace.trace.mcap import limits
+from rsltrace.trace.mcap import records as limits
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace

@@ -15,11 +15,11 @@ from trace_maker import Feeder, Opened, boundaries, opcodes, write_run
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import index as index_module
 from rsltrace.trace.format import EVENT_DTYPE, EVENTS_PER_SEGMENT, OUTPUT_DTYPE
+from rsltrace.trace.index import read_chunk
 from rsltrace.trace.mcap.records import Span
 from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
-from rsltrace.trace.pieces import read_chunk
 from rsltrace.trace.reader import RUN, Trace
 
 EVENTS = 2 * EVENTS_PER_SEGMENT + 500

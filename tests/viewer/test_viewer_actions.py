@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from rsltrace_viewer.model.inspector.event import inspect
-from rsltrace_viewer.model.inspector.lines import Openness
+from rsltrace_viewer.model.inspector.message_tree import Openness
 from rsltrace_viewer.model.run import Run
 
 import rsltrace

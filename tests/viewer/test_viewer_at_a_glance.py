@@ -22,15 +22,14 @@ from rsltrace_viewer.model.overview import (
 )
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import source_of
-from rsltrace_viewer.terminal.editor import command
+from rsltrace_viewer.terminal.choose import command
 from rsltrace_viewer.terminal.screens.logs import LogScreen
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.source import SourceView
 
-from rsltrace.trace.counts import count
-from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.contents import count
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.event import Draw, EventKind, OutputKind, encode_draw
 
 Drive = Callable[..., None]
 SAMPLES = Path(__file__).parents[2] / "sample_traces"

@@ -10,16 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from rsltrace_viewer.model.axis import axis_text
 from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.lane_window import LaneWindow
-from rsltrace_viewer.model.lanes import Lanes, drawn
+from rsltrace_viewer.model.lanes import Lanes, axis_text, drawn
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.steady import ends_of, spread
-from rsltrace_viewer.model.view import OneRun
-from rsltrace_viewer.model.windows import Window, step_below, step_from
+from rsltrace_viewer.model.view import OneRun, Window, ends_of, spread, step_below, step_from
 
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import format_seconds
 
 _S = 1_000_000_000
 

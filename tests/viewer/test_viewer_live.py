@@ -19,9 +19,8 @@ from click.testing import CliRunner
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace_viewer.live.app import LiveApp
+from rsltrace_viewer.live.app import BreakpointsPanel, LiveApp
 from rsltrace_viewer.live.execution import Execution
-from rsltrace_viewer.live.panels import BreakpointsPanel
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of

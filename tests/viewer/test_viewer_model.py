@@ -9,30 +9,26 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rsltrace_viewer.model.cells import cells, fit, wrap
-from rsltrace_viewer.model.history import History, Marks
+from rsltrace_viewer.model.folder import History, Marks
 from rsltrace_viewer.model.inspector.effects import effects_of
 from rsltrace_viewer.model.inspector.event import inspect
-from rsltrace_viewer.model.inspector.lines import Openness, Role
+from rsltrace_viewer.model.inspector.message_tree import Openness, Role
 from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.rows import FilteredRows
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.columns import layout
-from rsltrace_viewer.model.timeline.events import EventTexts
-from rsltrace_viewer.model.timeline.short_names import ShortNames
-from rsltrace_viewer.model.view import OneRun
-from rsltrace_viewer.model.windows import Window
+from rsltrace_viewer.model.timeline.events import EventTexts, ShortNames, layout
+from rsltrace_viewer.model.view import OneRun, Window, cells, fit, wrap
 from rsltrace_viewer.terminal.screens.help import help_text
 
 from rsltrace.trace.model.event import NO_EVENT
-from rsltrace.trace.words.times import parse_stamp
+from rsltrace.trace.words.phrases import parse_stamp
 
 
 def test_the_model_loads_no_terminal_library() -> None:
     code = (
         "import rsltrace_viewer.session, rsltrace_viewer.model.inspector.differences, "
-        "rsltrace_viewer.model.plots.series, rsltrace_viewer.model.plots.braille, sys\n"
+        "rsltrace_viewer.model.plots.series, rsltrace_viewer.model.plots.series, sys\n"
         "print(*[m for m in ('textual', 'rerun', 'rclpy', 'pydantic') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rsltrace_viewer.model.query.completion import completions
 from rsltrace_viewer.model.query.conditions import mask_of
 from rsltrace_viewer.model.query.fields import FIELDS
-from rsltrace_viewer.model.query.parser import parse
+from rsltrace_viewer.model.query.parser import completions, parse
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import outputs_text

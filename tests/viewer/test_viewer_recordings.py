@@ -15,12 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rsltrace_viewer.model.folder import found_in
-from rsltrace_viewer.model.plots.data import difference
-from rsltrace_viewer.model.plots.series import Series
+from rsltrace_viewer.model.plots.series import Series, difference
 from rsltrace_viewer.model.query.tokens import QueryError
-from rsltrace_viewer.model.recordings.pairs import Pairs
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
-from rsltrace_viewer.model.recordings.recording import Topic
+from rsltrace_viewer.model.recordings.recording import Pairs, Topic
 from rsltrace_viewer.model.recordings.session import RecordingSession
 from rsltrace_viewer.terminal.choose import ChooseApp
 from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
@@ -33,7 +31,7 @@ from trace_maker import uint64_message
 from rsltrace.cli.main import cli
 from rsltrace.diff.row_sign import Sign
 from rsltrace.trace.decode import to_plain
-from rsltrace.trace.words.times import START, parse_time_in_run
+from rsltrace.trace.words.phrases import START, parse_time_in_run
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces" / "delayed_input"
 

@@ -22,7 +22,7 @@ pytest.importorskip("rerun")
 from rsltrace_viewer.rerun_export import picture
 from rsltrace_viewer.rerun_export.sdk import viewer
 from rsltrace_viewer.terminal.app import ViewerApp, open_session
-from rsltrace_viewer.terminal.rerun_follower import RerunFollower
+from rsltrace_viewer.terminal.follow import RerunFollower
 from rsltrace_viewer.terminal.screenshot import settle, text_of
 
 from rsltrace.cli.main import cli

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rsltrace_viewer.model.query.conditions import mask_of
-from rsltrace_viewer.model.query.message_text import MessageText
+from rsltrace_viewer.model.query.fields import MessageText
 from rsltrace_viewer.model.run import Run
 
 from rsltrace.errors import TraceError

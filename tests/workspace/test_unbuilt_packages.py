@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from rsltrace.adapters.workspace import cache
 from rsltrace.adapters.workspace.build_files import entry_points, name_and_version
 from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.adapters.workspace.installs import share_prefix
 from rsltrace.adapters.workspace.interfaces import interface_makers, module_name
-from rsltrace.adapters.workspace.share import share_prefix
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run

@@ -14,15 +14,15 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.stamp import NS_PER_S, format_duration
+from rsltrace.trace.model.printable import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
-from rsltrace.trace.words.times import TimeInRun
+from rsltrace.trace.words.phrases import TimeInRun
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
-from rsltrace_viewer.model.history import Event, History, Marks
+from rsltrace_viewer.model.folder import Event, History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
-from rsltrace_viewer.model.inspector.lines import Line, Openness
+from rsltrace_viewer.model.inspector.message_tree import Line, Openness
 from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.lanes import Lanes
 from rsltrace_viewer.model.logs import Logs, mark_lanes, read_logs
@@ -33,11 +33,16 @@ from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.columns import Columns, layout
-from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
+from rsltrace_viewer.model.timeline.events import (
+    Columns,
+    EventText,
+    EventTexts,
+    ShortNames,
+    layout,
+    node_of,
+)
+from rsltrace_viewer.model.timeline.message_values import RowValues
 from rsltrace_viewer.model.timeline.pair_values import PairValues
-from rsltrace_viewer.model.timeline.row_values import RowValues
-from rsltrace_viewer.model.timeline.short_names import ShortNames
 from rsltrace_viewer.model.view import OneRun, View
 
 if TYPE_CHECKING:

@@ -10,11 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.launch.element import Attribute, Element
-from rsltrace.adapters.launch.model import Launched, Unsupported
-from rsltrace.adapters.launch.scope import Scope
+from rsltrace.adapters.launch.model import Attribute, Element, Launched, Scope, Unsupported, typed
 from rsltrace.adapters.launch.substitution import Substitutions, truth
-from rsltrace.adapters.launch.values import typed
 from rsltrace.job.reading.yaml_source import Place
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job.reading.substitute import package_prefix
-from rsltrace.job.values.paths import near_path
+from rsltrace.job.values.mappings import near_path
 from rsltrace.source_packages import source_packages
 
 _OPTION = "--launch"

@@ -2,11 +2,223 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
-from rsltrace.adapters.launch.scope import Parameters, full_name
+from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
+from ruamel.yaml.error import YAMLError
+
+from rsltrace.errors import JobError, did_you_mean
+from rsltrace.job import Job
+from rsltrace.job.reading.yaml_source import Place
+from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.printable import printable
+
+# What a launch file can see while it is read: arguments, environment, namespace, defaults.
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterFile:
+    """A file of parameters (absolute), at its place among a node's parameters."""
+
+    path: str
+
+
+Parameters = tuple["ParameterFile | dict[str, Any]", ...]
+"""Files and mappings in order; what comes later has the last word."""
+
+
+@dataclass(slots=True)
+class Scope:
+    """What one group can see; ``copy`` gives an inner group its own."""
+
+    configurations: dict[str, str] = field(default_factory=dict)
+    environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
+    namespace: str = ""
+    parameters: Parameters = ()
+    remappings: tuple[tuple[str, str], ...] = ()
+
+    def copy(self) -> Scope:
+        """Return a copy that can be changed without changing this."""
+        return replace(
+            self, configurations=dict(self.configurations), environment=dict(self.environment)
+        )
+
+
+def absolute_namespace(base: str, own: str | None) -> str | None:
+    """Return the namespace of a node below another one; None if there is neither. An empty one
+    is the root, if there is no other."""
+    namespace = joined_namespace(base, own)
+    if namespace and not namespace.startswith("/"):
+        namespace = f"/{namespace}"
+    return namespace or (None if own is None else "/")
+
+
+def full_name(namespace: str | None, name: str) -> str:
+    """Return the name of a node with its namespace; a name that is a path already stands alone."""
+    return name if name.startswith("/") else f"{(namespace or '').rstrip('/')}/{name}"
+
+
+def joined_namespace(base: str, own: str | None) -> str:
+    """Return a namespace below another one, as launch joins them; absolute ones stand alone."""
+    if own is None or own == "":
+        return base
+    if own.startswith("/"):
+        return "/" + own.strip("/")
+    return f"{base.rstrip('/')}/{own.strip('/')}"
+
+
+# Values of parameters in launch files: what a text or a typed YAML value becomes.
+
+
+class _Constructor(SafeConstructor):
+    """Reads what ROS's launch writes, too: it has tuples where a file has lists.
+
+    Names are text, even if they are ``n`` or ``on``.
+    """
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Return a mapping."""
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:bool":
+                key.tag = "tag:yaml.org,2002:str"
+        return super().construct_mapping(node, deep)
+
+
+_Constructor.add_constructor(
+    "tag:yaml.org,2002:python/tuple",
+    lambda constructor, node: constructor.construct_sequence(node, deep=True),
+)
+
+
+def yaml_value(text: str) -> Any:
+    """Return what YAML 1.1 (that of ROS) reads, or the text itself where it is not YAML."""
+    if nested_too_deep(text) >= 0:
+        return text
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _Constructor
+    yaml.version = (1, 1)
+    try:
+        return yaml.load(text)
+    except (YAMLError, ValueError):
+        return text
+
+
+def inferred(text: str) -> Any:
+    """Return a number, a truth value or a list if the text is one, else the text."""
+    value = yaml_value(text)
+    if isinstance(value, list) and value and all(isinstance(v, type(value[0])) for v in value):
+        return value if isinstance(value[0], (bool, int, float, str)) else text
+    return value if isinstance(value, (bool, int, float)) else text
+
+
+def typed(value: Any, kind: str | None) -> Any:
+    """Return ``value`` as ``kind`` (``int``, ``list_of_str``, …; None: as it looks).
+
+    :raises ValueError: if it is none, or there is no such kind.
+    """
+    if kind is None:
+        return inferred(value) if isinstance(value, str) else value
+    if kind == "yaml":
+        return yaml_value(value) if isinstance(value, str) else value
+    if kind.startswith("list_of_"):
+        items = yaml_value(value) if isinstance(value, str) else value
+        if not isinstance(items, list):
+            raise ValueError(f"expected a list ([a, b]), got {value!r}")
+        return [_one(item, kind.removeprefix("list_of_")) for item in items]
+    return _one(value, kind)
+
+
+def _one(value: Any, kind: str) -> Any:
+    if kind == "str":
+        return value if isinstance(value, str) else str(value)
+    found = yaml_value(value) if isinstance(value, str) else value
+    if kind == "bool" and isinstance(found, bool):
+        return found
+    if kind == "int" and isinstance(found, int) and not isinstance(found, bool):
+        return found
+    if kind == "float" and isinstance(found, (int, float)) and not isinstance(found, bool):
+        return float(found)
+    if kind not in ("bool", "int", "float"):
+        raise ValueError(
+            f"unknown type {kind!r}: there are bool, int, float, str, yaml and list_of_ these"
+        )
+    raise ValueError(f"expected {kind}, got {value!r}")
+
+
+# What becomes of a job with launch files.
+
+
+class Expanded(NamedTuple):
+    """A job without launch files, and what of them it leaves out or has no use for."""
+
+    job: Job
+    notes: tuple[str, ...] = ()
+
+
+# The tree that XML and YAML launch files have in common, every part with its place.
+
+Scalar = str | int | float | bool
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """A value as written: text (with substitutions in it), or a typed value or list of YAML."""
+
+    value: Any
+    place: Place
+
+
+@dataclass(eq=False)
+class Element:
+    """One tag of a launch file."""
+
+    tag: str
+    place: Place
+    attributes: dict[str, Attribute] = field(default_factory=dict)
+    children: list[Element] = field(default_factory=list)
+
+    def get(self, name: str) -> Attribute | None:
+        """Return an attribute, or None if it is not given."""
+        return self.attributes.get(name)
+
+    def need(self, name: str) -> Attribute:
+        """Return an attribute. Raises ``JobError`` if it is missing."""
+        found = self.attributes.get(name)
+        if found is None:
+            raise self.place.error(f"<{self.tag}> needs the attribute '{name}'")
+        return found
+
+    def named(self, tag: str) -> list[Element]:
+        """Return the children of a tag."""
+        return [child for child in self.children if child.tag == tag]
+
+    def check(self, attributes: Iterable[str], children: Iterable[str] | None = ()) -> None:
+        """Raise ``JobError`` at anything else in it; ``children`` None: any."""
+        allowed = [*attributes, "if", "unless"]
+        for name, attribute in self.attributes.items():
+            if name not in allowed:
+                raise attribute.place.error(_unknown("attribute", name, self.tag, allowed))
+        if children is None:
+            return
+        tags = list(children)
+        for child in self.children:
+            if child.tag not in tags:
+                raise child.place.error(_unknown("element", child.tag, self.tag, tags))
+
+
+def _unknown(what: str, name: str, tag: str, known: list[str]) -> str:
+    there = f"there are {', '.join(known)}" if known else "it has none"
+    return f"unknown {what} {name!r} in <{tag}>; {did_you_mean(name, known, there)}"
+
+
+def not_a_launch_file(name: str, why: str) -> JobError:
+    """Return the error that a file is no launch file."""
+    return JobError(f"{why}; a launch file is <launch>…</launch> or 'launch: [...]'", where=name)
+
 
 ENVIRONMENT = (
     "{where}: environment variable {name}: it counts for the launch file and for processes; nodes "

@@ -6,11 +6,18 @@ import shlex
 from functools import partial
 from typing import Any
 
-from rsltrace.adapters.launch.element import Element
 from rsltrace.adapters.launch.evaluation import Evaluation
-from rsltrace.adapters.launch.model import LaunchedNode, Surroundings, respawning
+from rsltrace.adapters.launch.model import (
+    Element,
+    LaunchedNode,
+    ParameterFile,
+    Parameters,
+    Surroundings,
+    absolute_namespace,
+    full_name,
+    respawning,
+)
 from rsltrace.adapters.launch.parameter_files import substituted_parameters
-from rsltrace.adapters.launch.scope import ParameterFile, Parameters, absolute_namespace, full_name
 
 _WITHOUT_MEANING = (
     "output",

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.launch.values import yaml_value
+from rsltrace.adapters.launch.model import yaml_value
 from rsltrace.errors import JobError
 from rsltrace.trace.model.regular_file import read_regular
 

@@ -8,18 +8,84 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
-from rsltrace.adapters.launch.element import Element
 from rsltrace.adapters.launch.evaluation import Evaluation
-from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, Launched
+from rsltrace.adapters.launch.model import (
+    ENVIRONMENT,
+    Argument,
+    Attribute,
+    Element,
+    Launched,
+    ParameterFile,
+    Scope,
+    joined_namespace,
+    not_a_launch_file,
+)
 from rsltrace.adapters.launch.nodes import Nodes
-from rsltrace.adapters.launch.scope import ParameterFile, Scope, joined_namespace
 from rsltrace.adapters.launch.xml_file import parse_xml
-from rsltrace.adapters.launch.yaml_file import parse_launch_yaml
 from rsltrace.errors import JobError, nearest
-from rsltrace.job.reading.yaml_source import Place
-from rsltrace.job.values.times import parse_time
+from rsltrace.job.reading.yaml_source import Item, Place, parse_yaml
+from rsltrace.job.values.times import ExactFloat, parse_time
 from rsltrace.trace.model.regular_file import read_regular
+
+# A YAML launch file as the same elements an XML one has.
+
+
+def parse_launch_yaml(text: str, name: str, folder: str) -> Element:
+    """Return the ``launch`` element. Raises ``JobError`` with the place of a mistake."""
+    root = parse_yaml(text, name, folder=folder).root
+    if root is None:
+        raise not_a_launch_file(name, "the file is empty")
+    if not isinstance(root.value, dict) or list(root.value) != ["launch"]:
+        raise root.place.error("a YAML launch file has one key, 'launch', with a list below it")
+    return _element("launch", root.value["launch"])
+
+
+def _element(tag: str, item: Item) -> Element:
+    element = Element(tag, item.key_place or item.place)
+    if isinstance(item.value, list):
+        element.children = _entities(item)
+        return element
+    if not isinstance(item.value, dict):
+        raise item.place.error(f"{tag!r} takes a mapping (name: value), not {item.plain()!r}")
+    for key, inner in item.value.items():
+        name = str(key)
+        if name == "children":
+            element.children += _entities(inner)
+        elif _is_list_of_mappings(inner):
+            element.children += [_element(name, one) for one in inner.value]
+        elif isinstance(inner.value, dict):
+            raise inner.place.error(f"{name!r} in {tag!r} takes a value or a list, not a mapping")
+        else:
+            place = inner.key_place or inner.place
+            element.attributes[name] = Attribute(_plain(inner.plain()), place)
+    return element
+
+
+def _entities(item: Item) -> list[Element]:
+    if not isinstance(item.value, list):
+        raise item.place.error("expected a list of actions (- node: …)")
+    found = []
+    for one in item.value:
+        if not isinstance(one.value, dict) or len(one.value) != 1:
+            raise one.place.error("an action is a mapping with one key, its kind (- node: …)")
+        ((tag, inner),) = one.value.items()
+        found.append(_element(str(tag), inner))
+    return found
+
+
+def _is_list_of_mappings(item: Item) -> bool:
+    return isinstance(item.value, list) and any(isinstance(one.value, dict) for one in item.value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    if value is None:
+        return ""
+    return float(value) if isinstance(value, ExactFloat) else value
+
 
 SIZE_MAX = 16 << 20
 _INCLUDES_MAX = 50

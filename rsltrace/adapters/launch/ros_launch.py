@@ -22,14 +22,16 @@ from rsltrace.adapters.launch.model import (
     Argument,
     Launched,
     LaunchedNode,
+    ParameterFile,
+    Parameters,
     Surroundings,
     Unsupported,
     argument_words,
+    full_name,
     respawning,
+    yaml_value,
 )
 from rsltrace.adapters.launch.parameter_files import parameters_for
-from rsltrace.adapters.launch.scope import ParameterFile, Parameters, full_name
-from rsltrace.adapters.launch.values import yaml_value
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
 

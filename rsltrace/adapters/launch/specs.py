@@ -6,16 +6,22 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-from rsltrace.adapters.launch.model import Launched, LaunchedNode, Surroundings, Unsupported
+from rsltrace.adapters.launch.model import (
+    Launched,
+    LaunchedNode,
+    ParameterFile,
+    Surroundings,
+    Unsupported,
+    full_name,
+    inferred,
+)
 from rsltrace.adapters.launch.parameter_files import flat, parameters_for
-from rsltrace.adapters.launch.scope import ParameterFile, full_name
-from rsltrace.adapters.launch.values import inferred
 from rsltrace.adapters.workspace.cache import lasting
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.job.parts.launch import StartAfterSpec
 from rsltrace.job.parts.process import RespawnSpec
-from rsltrace.job.parts.start_after import StartAfterSpec
-from rsltrace.job.values.ros_arguments import split_ros_arguments
+from rsltrace.job.values.mappings import split_ros_arguments
 
 _LISTED_MAX = 30
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 from xml.parsers import expat
 
-from rsltrace.adapters.launch.element import Attribute, Element, not_a_launch_file
+from rsltrace.adapters.launch.model import Attribute, Element, not_a_launch_file
 from rsltrace.errors import JobError
 from rsltrace.job.reading.yaml_source import Mark, Place, YamlSource
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import fcntl
+import mmap
 import os
 import signal
 import socket
@@ -12,11 +14,119 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.adapters.processes.life import Life, has_memory
-from rsltrace.adapters.processes.shared import Said, Shared
-from rsltrace.adapters.processes.wire import HEAD, RECORD, Told
+from rsltrace.adapters.processes.wire import HEAD, RECORD, Told, WireError
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
+
+# Memory that a process and the loop both see (``native/shared.h``): files in memory that grow.
+
+_LENGTH = struct.Struct("<Q")
+_SIZE = 1 << 16
+
+
+class Shared:
+    """A file in memory, mapped; it never shrinks."""
+
+    def __init__(self, name: str) -> None:
+        self.fd = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(self.fd, _SIZE)
+        fcntl.fcntl(self.fd, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)  # what is mapped stays there
+        self._look_again()
+
+    def _look_again(self) -> None:
+        self.data = mmap.mmap(self.fd, 0)
+        self.size = len(self.data)
+
+    def grow(self, size: int) -> None:
+        """Have room for so many bytes."""
+        if size > self.size:
+            os.ftruncate(self.fd, 2 * size)
+            self._look_again()
+
+    def has(self, size: int) -> bool:
+        """Return whether there are so many bytes; the process may have made it grow."""
+        if size > self.size:
+            with suppress(OSError, ValueError):
+                self._look_again()
+        return size <= self.size
+
+    def close(self) -> None:
+        """Give the file back; what is mapped goes with its last user."""
+        if self.fd >= 0:
+            os.close(self.fd)
+        self.fd = -1
+
+
+class Said(Shared):
+    """What a process has said and nobody has taken: the length, then whole records."""
+
+    def batch(self, size: int) -> memoryview:
+        """Return what is there; it holds until ``taken``.
+
+        :raises WireError: if it is not of this size.
+        """
+        if size != _LENGTH.unpack_from(self.data)[0] or not self.has(_LENGTH.size + size):
+            raise WireError("a process has sent what is no batch")
+        return memoryview(self.data)[_LENGTH.size : _LENGTH.size + size]
+
+    def left(self) -> memoryview:
+        """Return what is there of a process that has ended: whole records."""
+        size: int = _LENGTH.unpack_from(self.data)[0]
+        return self.batch(size)
+
+    def taken(self) -> None:
+        """Make room for the next batch."""
+        _LENGTH.pack_into(self.data, 0, 0)
+
+
+# What the kernel says of a process: whether it is there, and whether it gets on with its life.
+
+_TICK_S = 1 / os.sysconf("SC_CLK_TCK")
+_WAITS_FOR_NOTHING = "S"
+"""The state of a thread that sleeps until something happens. One that may run, waits for a disk or
+was stopped has another."""
+_CPU_S = 0.1
+"""What a process that goes in circles uses between two looks, at least."""
+
+
+def has_memory(pid: int) -> bool:
+    """Return whether a process can still run code; one that is ending has no memory any more."""
+    return any(text.split()[0] != "0" for text in _of_threads(pid, "statm"))
+
+
+def _of_threads(pid: int, name: str) -> Iterator[str]:
+    """Yield what the kernel has of each thread of a process, of those that have not ended."""
+    for path in Path(f"/proc/{pid}/task").glob(f"*/{name}"):
+        with suppress(OSError):
+            yield path.read_text()
+
+
+class Life:
+    """Tells a process that is slow from one that does nothing or goes in circles: the time that it
+    takes is not that of a machine that is busy with others, or that somebody has stopped."""
+
+    def __init__(self, pid: int) -> None:
+        self._pid = pid
+        self._cpu_s = self._look()[1]
+
+    def goes_on(self) -> bool:
+        """Return whether it has had time of its own since the last look: it was computing, or all
+        of its threads were waiting."""
+        states, cpu_s = self._look()
+        if cpu_s - self._cpu_s >= _CPU_S:
+            self._cpu_s = cpu_s
+            return True
+        return set(states) == {_WAITS_FOR_NOTHING}
+
+    def _look(self) -> tuple[str, float]:
+        """Return the states of its threads, one letter each, and the CPU time of all of them."""
+        states, ticks = "", 0
+        for text in _of_threads(self._pid, "stat"):
+            state, *fields = text.rpartition(")")[2].split()
+            states += state
+            ticks += int(fields[10]) + int(fields[11])
+        return states, ticks * _TICK_S
+
 
 _LARGE = 1 << 14
 """What is longer is not sent, but laid into memory that both see."""

@@ -9,7 +9,7 @@ from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.publisher import Publisher, Transport
 from rsltrace.simulation.middleware.qos.policies import Qos
 from rsltrace.simulation.middleware.services import (
     CLIENT,
@@ -21,7 +21,6 @@ from rsltrace.simulation.middleware.services import (
 )
 from rsltrace.simulation.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
 from rsltrace.simulation.middleware.timer import TIMER, Timer
-from rsltrace.simulation.middleware.transport import Transport
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import NO_EVENT, OutputKind

@@ -15,8 +15,7 @@ from rsltrace.adapters.processes.endpoints import (
     ProcessTimer,
     Thing,
 )
-from rsltrace.adapters.processes.things import Interfaces, Things
-from rsltrace.adapters.processes.waking import GraphChange, WakingTimer
+from rsltrace.adapters.processes.things import GraphChange, Interfaces, Things, WakingTimer
 from rsltrace.adapters.processes.wire import (
     GO,
     GRAPH_ID,
@@ -36,7 +35,7 @@ from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import format_seconds
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)

@@ -21,9 +21,8 @@ from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.trace.model.draw import Draw, encode_draw
-from rsltrace.trace.model.event import NO_EVENT, EventKind
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.event import NO_EVENT, Draw, EventKind, encode_draw
+from rsltrace.trace.model.printable import format_seconds
 
 _DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
 

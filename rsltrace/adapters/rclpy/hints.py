@@ -11,11 +11,29 @@ from __future__ import annotations
 import linecache
 import os
 import re
+import sys
 from types import TracebackType
+from typing import Any
 
-from rsltrace.adapters.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.guard.virtual import set_order
 from rsltrace.simulation.middleware.events.failure import text_of
+
+# Nodes whose constructor never came to rclpy's own, so that they are none.
+
+
+def is_unmade(value: object) -> bool:
+    """Return whether a value is of a class of nodes, and ``Node.__init__`` has not run on it."""
+    module = sys.modules.get("rclpy.node")
+    return module is not None and isinstance(value, module.Node) and not hasattr(value, "handle")
+
+
+def constructor_of(node: object) -> str:
+    """Return the name of a node's class, and where its constructor is."""
+    kind: Any = type(node)
+    code = getattr(kind.__init__, "__code__", None)
+    place = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
+    return f"{kind.__qualname__}{place}"
+
 
 _WHEELS = frozenset(
     """

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from rsltrace.simulation.chance.clock import ClockModel, WrongClock
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import ClockModel, Stream, WrongClock
 from rsltrace.simulation.middleware.domain import Domain
-from rsltrace.trace.model.draw import encode_clock
+from rsltrace.trace.model.event import encode_clock
 
 
 @dataclass(frozen=True, slots=True)

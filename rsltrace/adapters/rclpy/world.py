@@ -16,31 +16,28 @@ from rsltrace.adapters.rclpy.boundary.boundary import Boundary, Surroundings
 from rsltrace.adapters.rclpy.boundary.installation import installed
 from rsltrace.adapters.rclpy.callback_errors import RclpyDoor
 from rsltrace.adapters.rclpy.entry import Entry
-from rsltrace.adapters.rclpy.executors.exchanged import note_exchanged
-from rsltrace.adapters.rclpy.executors.user_executors import own_executors
+from rsltrace.adapters.rclpy.executors.user_executors import note_exchanged, own_executors
 from rsltrace.adapters.rclpy.handles.logs import Logs
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
 from rsltrace.adapters.rclpy.stacks.asyncio_loops import simulated_event_loops
 from rsltrace.adapters.rclpy.stacks.blocked_groups import note_waits
 from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked
-from rsltrace.adapters.rclpy.stacks.construction import Construction
 from rsltrace.adapters.rclpy.stacks.exit_handlers import own_exit_handlers
 from rsltrace.adapters.rclpy.stacks.forked_child import forked_children_end
 from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
 from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs
-from rsltrace.adapters.rclpy.stacks.process_exit import own_process_ends
+from rsltrace.adapters.rclpy.stacks.process_exit import own_process_ends, own_signal_handlers
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.signals import own_signal_handlers
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_waiting
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
-from rsltrace.adapters.rclpy.stacks.starts import Starts
+from rsltrace.adapters.rclpy.stacks.starts import Construction, Starts
 from rsltrace.adapters.rclpy.stacks.threads import cooperative_threads
 from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
-from rsltrace.adapters.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.errors import DeadlockError, JobError, RunError
-from rsltrace.simulation.chance.network import NetworkPlan
+from rsltrace.simulation.chance.channel import NetworkPlan
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.middleware.domain import Domain

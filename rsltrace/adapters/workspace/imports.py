@@ -130,7 +130,7 @@ class Workspace:
         if package is None:
             return None
         with engage(None):
-            from rsltrace.adapters.workspace.share import share_prefix
+            from rsltrace.adapters.workspace.installs import share_prefix
 
             return str(share_prefix(package))
 

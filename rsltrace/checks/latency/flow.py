@@ -21,10 +21,9 @@ import numpy.typing as npt
 from rsltrace.checks.latency.observed import observed
 from rsltrace.checks.latency.paths import NO_PATH, Hop, Paths, Wanted, sink_hop
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.built_in import NODE_TOPICS
-from rsltrace.trace.model.draw import Draw, encode_draw
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.reader import Trace
 
 NONE = -1

@@ -5,9 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.trace.format import TOPIC_DETAILS
-from rsltrace.trace.model.draw import draw_text, is_switch
-from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    Event,
+    Output,
+    OutputKind,
+    draw_text,
+    is_switch,
+)
+from rsltrace.trace.model.printable import format_seconds
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import code_place, output_places
 from rsltrace.trace.words.kinds import flag_names

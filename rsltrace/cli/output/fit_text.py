@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.checks.latency.figures import Durations
-from rsltrace.native.fit.checked import NEAR, Checked, CheckedChain, far
-from rsltrace.native.fit.comparison import Compared
+from rsltrace.checks.latency.instances import Durations
+from rsltrace.native.fit.comparison import NEAR, Checked, CheckedChain, Compared, far
 from rsltrace.native.fit.models import Model, as_job_has_it
 from rsltrace.native.fit.parts import Fit, time_text
-from rsltrace.trace.model.stamp import format_duration
-from rsltrace.trace.words.table import table
+from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.words.phrases import table
 
 _PERCENT = (50, 95, 99)
 _HEAD = ("count", "p50", "p95", "p99", "max")

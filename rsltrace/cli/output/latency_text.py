@@ -8,12 +8,11 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.checks.latency.figures import Figures, figures
-from rsltrace.checks.latency.instances import Parts, Passage
+from rsltrace.checks.latency.instances import Figures, Parts, Passage, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.model.printable import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.table import table
+from rsltrace.trace.words.phrases import table
 
 _WORDS = {
     "latency": "latency",

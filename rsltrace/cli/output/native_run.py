@@ -10,10 +10,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.cli.output.watching import interruptible, progress
+from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.errors import NodeError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.model.printable import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked

@@ -2,12 +2,115 @@
 
 from __future__ import annotations
 
+import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from rsltrace.diff import diff_files
+from rsltrace.diff.report import render
 from rsltrace.search.explore.search import Search, Tally
 from rsltrace.search.explore.trial import JobSource, TrialResult, overrides_of
+
+if TYPE_CHECKING:
+    from rsltrace.diff.result import Diff
+    from rsltrace.search.bisect.repository import Commit, Repository
+    from rsltrace.search.bisect.search import Found, Tried
+
+# What ``rsltrace bisect`` says: the first commit that changed a run, and how the run changed.
+
+_FILES_MAX = 12
+Kept = tuple[Path, Path] | None
+
+
+def line_of(tried: Tried) -> str:
+    """Return what came of a revision, in a line; why it failed, if it did, is another."""
+    run = tried.run
+    what = f"digest {run.digest}, {run.events} events" if run.digest else "no run"
+    failure = tried.why or run.failure
+    why = f"\n      {failure.splitlines()[0]}" if failure else ""
+    return f"{tried.answer.value:<4}  {tried.commit.short}  {what}  {tried.commit.subject}{why}"
+
+
+def as_text(found: Found, repository: Repository, kept: Kept) -> str:
+    """Return the answer for people; ``kept`` are the places of the traces, None if they go."""
+    first = found.first
+    if first is not None:
+        lines = [f"first changed at {first}  ({first.author}, {first.date})"]
+        if len(first.parents) > 1:
+            lines.append(f"  a merge of {len(first.parents)} commits, none of which has the change")
+        lines += _files(repository.changed_files(first))
+    else:
+        count = len(found.candidates)
+        lines = [f"first changed at one of these {count} commits: those that were skipped hide it"]
+        lines += [f"  {commit}" for commit in found.candidates]
+    difference = _difference(found, kept)
+    report = render(difference).rstrip().splitlines()
+    if kept is None:  # what to do next with traces that are gone
+        report = [line for line in report if not line.startswith("next: ")]
+    lines += ["", *report]
+    lines += [f"the traces are {kept[0]} and {kept[1]}"] if kept else []
+    return "\n".join(lines)
+
+
+def as_values(found: Found, repository: Repository, kept: Kept) -> dict[str, Any]:
+    """Return the answer as what ``json`` writes."""
+    first = found.first
+    return {
+        "first": None if first is None else _commit(first),
+        "files": [] if first is None else list(repository.changed_files(first)),
+        "candidates": [_commit(commit) for commit in found.candidates],
+        "tried": [_tried(one) for one in found.tried],
+        "before": found.before.commit.id,
+        "after": found.after.commit.id,
+        "notes": list(found.notes),
+        "kept": [str(path) for path in kept or ()],
+        "diff": json.loads(render(_difference(found, kept), "json")),
+    }
+
+
+def _files(names: Sequence[str]) -> list[str]:
+    shown = [f"  {name}" for name in names[:_FILES_MAX]]
+    more = len(names) - len(shown)
+    return [*shown, f"  and {more} more files"] if more else shown
+
+
+def _difference(found: Found, kept: Kept) -> Diff:
+    before, after = found.before, found.after
+    if kept is not None:
+        return diff_files(*kept)
+    result = diff_files(before.run.path, after.run.path)
+    return replace(
+        result,
+        a=replace(result.a, path=f"at {before.commit.short}"),
+        b=replace(result.b, path=f"at {after.commit.short}"),
+    )
+
+
+def _commit(commit: Commit) -> dict[str, Any]:
+    return {
+        "commit": commit.id,
+        "date": commit.date,
+        "author": commit.author,
+        "subject": commit.subject,
+        "parents": list(commit.parents),
+    }
+
+
+def _tried(tried: Tried) -> dict[str, Any]:
+    run = tried.run
+    return {
+        **_commit(tried.commit),
+        "answer": tried.answer.value,
+        "why": tried.why,
+        "digest": run.digest,
+        "events": run.events,
+        "exit_code": run.exit_code,
+        "error": run.failure,
+    }
+
 
 _CAUSES_MAX = 20
 _TEXT_MAX = 300

@@ -11,8 +11,8 @@ from rsltrace.errors import DebugError, nearest
 
 if TYPE_CHECKING:
     from rsltrace.conditions.names import Names
+    from rsltrace.debug.checkpoints import Stopped
     from rsltrace.debug.client import DebugSession
-    from rsltrace.debug.positions import Stopped
 
 
 class Prompt(Protocol):

@@ -6,21 +6,152 @@ It knows nothing of the run but what the session says, as any client of it.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.conditions.names import Names
+from rsltrace.conditions.names import Names, short_name
 from rsltrace.debug.prompt import show
-from rsltrace.debug.prompt.command_table import COMMANDS
-from rsltrace.debug.prompt.completion import completions
-from rsltrace.debug.prompt.lines import LineReader
+from rsltrace.debug.prompt.command_table import COMMANDS, INFO
+from rsltrace.debug.prompt.commands import Prompt
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.finding import Source
+from rsltrace.trace.words.entities import LOG_LEVELS
 
 if TYPE_CHECKING:
+    from rsltrace.debug.checkpoints import Stopped
     from rsltrace.debug.client import DebugSession
-    from rsltrace.debug.positions import Stopped
+
+# Lines of a debugging session: typed at a terminal, or out of a pipe or file.
+
+Completer = Callable[[str], Sequence[str]]
+"""By a line up to where the cursor is: what its last word could become."""
+
+
+class LineReader:
+    """Gives ``first`` lines, then those of stdin. ``is_script``: nobody sits at a terminal."""
+
+    def __init__(self, first: Sequence[str], complete: Completer) -> None:
+        self._first = list(first)
+        self._complete = complete
+        self.is_script = sys.stdin is None or not sys.stdin.isatty()
+        self._from_terminal = False
+
+    @property
+    def from_terminal(self) -> bool:
+        """Whether the last line was typed."""
+        return self._from_terminal
+
+    def read(self, prompt: str) -> str | None:
+        """Return the next line, None after the last one.
+
+        :raises KeyboardInterrupt: Ctrl-C at the prompt.
+        """
+        self._from_terminal = False
+        if self._first:
+            line: str | None = self._first.pop(0)
+        elif self.is_script:
+            line = sys.stdin.readline() if sys.stdin is not None else ""
+            line = line.rstrip("\n") if line else None
+        else:
+            self._from_terminal = True
+            with _readline(self._complete):
+                try:
+                    return input(prompt)
+                except EOFError:
+                    say()
+                    return None
+        if line is not None:
+            say(f"{prompt}{line}".rstrip())  # what is printed reads as if it had been typed
+        return line
+
+
+@contextmanager
+def _readline(complete: Completer) -> Iterator[None]:
+    """Let lines be edited, found again and completed, where Python has readline."""
+    try:
+        import readline
+    except ImportError:
+        yield
+        return
+    found: list[str] = []
+
+    def completer(text: str, state: int) -> str | None:
+        if state == 0:
+            with suppress(Exception):  # a broken completion must not break the line
+                found[:] = complete(readline.get_line_buffer()[: readline.get_endidx()])
+        return found[state] if state < len(found) else None
+
+    before = readline.get_completer(), readline.get_completer_delims()
+    readline.set_completer(completer)
+    readline.set_completer_delims(" \t")
+    readline.parse_and_bind("tab: complete")
+    try:
+        yield
+    finally:
+        readline.set_completer(before[0])
+        readline.set_completer_delims(before[1])
+
+
+# What a line at the prompt could become.
+
+_HEADS = "node topic entity output exception log finding watch when t=".split()
+
+
+def completions(text: str, shell: Prompt) -> list[str]:
+    """Return what the last word of ``text`` could become."""
+    words = text.lstrip().split(" ")
+    last = words[-1]
+    if len(words) == 1:
+        found = _begin((command.name for command in COMMANDS.all), last)
+        return [f"{found[0]} "] if len(found) == 1 else found
+    try:
+        name = COMMANDS.find(words[0]).name
+    except DebugError:
+        return []
+    return _begin(_arguments(name, words[1:-1], shell), last)
+
+
+def _arguments(command: str, before: list[str], shell: Prompt) -> Iterable[str]:
+    names = shell.names()
+    if command in ("break", "when") and not before:
+        messages = (f"{topic}:" for topic in names.topics)
+        return (*_HEADS, *names.nodes, *messages, *names.entities)
+    if command in ("break", "when"):
+        of = {
+            "node": names.nodes,
+            "topic": names.topics,
+            "entity": names.entities,
+            "log": tuple(LOG_LEVELS),
+            "finding": tuple(source.value for source in Source),
+        }
+        return of.get(before[0], _nodes_as_names(shell))
+    if command == "info":
+        return names.nodes if before[:1] == ["node"] else tuple(INFO)
+    if command in ("next", "reverse-next", "who-changed") and not before:
+        return (*names.nodes, *map(short_name, names.nodes))
+    if command == "who-changed" and len(before) == 1:
+        return shell.session.node(before[0])
+    if command in ("print", "watch"):
+        here = shell.node_here()
+        own = () if here is None else tuple(shell.session.node(here))
+        return (*own, *_nodes_as_names(shell), *(f'node("{name}")' for name in names.nodes))
+    if command == "help":
+        return (one.name for one in COMMANDS.all)
+    if command == "delete":
+        return (str(one.number) for one in shell.session.breakpoints)
+    return ()
+
+
+def _nodes_as_names(shell: Prompt) -> tuple[str, ...]:
+    return tuple(f"{short_name(node)}." for node in shell.names().nodes)
+
+
+def _begin(words: Iterable[str], with_: str) -> list[str]:
+    return sorted({word for word in words if word.startswith(with_)})
+
 
 PROMPT = "(rsltrace) "
 EXIT_DIVERGED = 1

@@ -6,12 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:
-    from rsltrace.debug.positions import Breakpoint, Position, Stopped
+    from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped
 
 _CELL_MAX = 60
 _DID_MAX = 160

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EqualBlock, EventPair
-from rsltrace.diff.alignment.longest_increasing import longest_increasing
+from rsltrace.diff.alignment.rows import longest_increasing
 from rsltrace.diff.row_sign import Sign
 
 Ints = npt.NDArray[np.int64]

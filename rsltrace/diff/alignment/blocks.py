@@ -15,8 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.alignment.align import EarlierPairs, Pairs, align
-from rsltrace.diff.alignment.longest_increasing import longest_increasing
-from rsltrace.diff.alignment.rows import CONSTRUCT, SHUTDOWN, Rows, Run, load_rows
+from rsltrace.diff.alignment.rows import (
+    CONSTRUCT,
+    SHUTDOWN,
+    Rows,
+    Run,
+    load_rows,
+    longest_increasing,
+)
 
 NOTHING = -1
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.alignment.longest_increasing import longest_increasing
+from rsltrace.diff.alignment.rows import longest_increasing
 
 Keys = npt.NDArray[np.uint64]
 _SMALL = 250_000

@@ -46,9 +46,8 @@ from rsltrace.diff.facts.evidence import (
     StateDifference,
     node_of,
 )
-from rsltrace.trace.model.draw import is_switch
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind, is_switch
 
 _DRAWN_FROM = ("delay", "faults", "execution", "seed", "clocks")
 """Keys of a job that decide whether something is drawn."""

@@ -23,9 +23,9 @@ from rsltrace.diff.facts.evidence import (
     EventView,
     MessageDifference,
 )
-from rsltrace.trace.model.endless_wait import EndlessWait, waits_of
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.finding import EndlessWait, waits_of
 
 _LOOKED_AT_MAX = 1000
 _QOS_EVENT = EntityKind.QOS_EVENT.label

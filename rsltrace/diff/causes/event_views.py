@@ -14,7 +14,7 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.words.code import code_places, place_here, places_text
 from rsltrace.trace.words.entities import EntityKey
-from rsltrace.trace.words.outputs import output_text
+from rsltrace.trace.words.events import output_text
 
 COUNTED_MAX = 8192
 """Events up to here are told which of their entity's events they are. Counting takes reading."""

@@ -18,8 +18,8 @@ from typing import Any
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.facts.evidence import Setting, SettingKind
-from rsltrace.trace.model.nesting import nested_too_deep
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.model.operation import nested_too_deep
+from rsltrace.trace.model.printable import format_duration
 from rsltrace.trace.reader import Trace
 
 _LINES_MAX = 20_000

@@ -41,15 +41,21 @@ from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.errors import TraceError
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
-from rsltrace.trace.model.draw import draw_text
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    EventKind,
+    Output,
+    OutputKind,
+    draw_text,
+)
 from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
 from rsltrace.trace.model.printable import printable, shortened
 from rsltrace.trace.words.code import output_places, place_here
 from rsltrace.trace.words.entities import EntityKey
+from rsltrace.trace.words.events import output_text
 from rsltrace.trace.words.logs import LogRecord
-from rsltrace.trace.words.outputs import output_text
 
 MESSAGES_MAX = 50
 """Differing messages of one event that are decoded; one callback can publish thousands."""

@@ -60,11 +60,18 @@ from rsltrace.diff.sentences.values import (
     state_text,
     what_differs,
 )
-from rsltrace.trace.model.draw import Draw, draw_text, duration_of, is_switch, kind_of
-from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    Draw,
+    EventKind,
+    OutputKind,
+    draw_text,
+    duration_of,
+    is_switch,
+    kind_of,
+)
 from rsltrace.trace.model.finding import Source
-from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.model.stamp import durations_apart, format_duration
+from rsltrace.trace.model.printable import durations_apart, format_duration, printable, shortened
 from rsltrace.trace.words.phrases import at_time, event_phrase, seconds_text
 
 PARAMETER_EVENTS = "/parameter_events"

@@ -28,8 +28,13 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.sentences import says, sentence
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import printable, shortened, told_apart
-from rsltrace.trace.model.stamp import durations_apart, format_duration
+from rsltrace.trace.model.printable import (
+    durations_apart,
+    format_duration,
+    printable,
+    shortened,
+    told_apart,
+)
 
 NAMED_MAX = 3
 _VALUE_MAX = 40

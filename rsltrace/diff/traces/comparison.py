@@ -45,8 +45,7 @@ from rsltrace.diff.traces.ended_runs import (
     judge_end,
     who_ended,
 )
-from rsltrace.diff.traces.sides import interruptions, side
-from rsltrace.diff.traces.tolerance import messages_within
+from rsltrace.diff.traces.tolerance import interruptions, messages_within, side
 from rsltrace.errors import TraceError, did_you_mean
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.printable import printable

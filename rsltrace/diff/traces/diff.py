@@ -8,12 +8,12 @@ around the divergence, unless everything is asked for.
 
 from __future__ import annotations
 
-from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.diff.alignment.rows import first_difference
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.remarks import Identical, OtherEnd
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
-from rsltrace.diff.traces.sides import side
+from rsltrace.diff.traces.tolerance import side
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 
@@ -32,7 +32,7 @@ def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
     if start is None and a.complete and b.complete and a.event_count:
         return _identical(a, b)
     # Most runs are compared in the hope that they are identical: those load no more than this.
-    from rsltrace.diff.traces.cut_runs import agree_until_cut, of_different_jobs
+    from rsltrace.diff.traces.ended_runs import agree_until_cut, of_different_jobs
 
     if not (a.event_count and b.event_count) and (found := of_different_jobs(a, b)) is not None:
         return found

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.alignment.longest_increasing import longest_increasing
+from rsltrace.diff.alignment.rows import longest_increasing
 from rsltrace.diff.bags.comparison import compare_content
 from rsltrace.diff.facts.bags import (
     CallbackTimes,
@@ -28,7 +28,7 @@ from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeCompared
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
-from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.diff.traces.tolerance import interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind

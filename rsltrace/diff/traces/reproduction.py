@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.diff.alignment.rows import first_difference
 from rsltrace.diff.facts.remarks import Repeats
 from rsltrace.diff.result import Reproduction
 from rsltrace.trace.native import refuse_native

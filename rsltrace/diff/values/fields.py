@@ -26,9 +26,13 @@ from rsltrace.diff.values.numbers import (
     number_text,
     same_number,
 )
-from rsltrace.trace.model.placeholders import PLACEHOLDERS
-from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.model.stamp import NS_PER_S, format_seconds
+from rsltrace.trace.model.printable import (
+    NS_PER_S,
+    PLACEHOLDERS,
+    format_seconds,
+    printable,
+    shortened,
+)
 
 WHOLE = "(whole)"
 """The path of a difference that belongs to no field: of the types, or of two plain values."""

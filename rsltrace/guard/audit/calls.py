@@ -4,17 +4,108 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from rsltrace.guard.audit import rules
-from rsltrace.guard.audit.durations import is_difference_of_now
-from rsltrace.guard.audit.exchanges import exchanged
-from rsltrace.guard.audit.model import Rule
 from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, rule_of
+from rsltrace.guard.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, Rule, rule_of
 from rsltrace.guard.audit.scopes import Module, Scope
 from rsltrace.guard.audit.sets import is_set, order_matters
+from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
+
+# Differences of two looks at a ROS clock in one function: in a simulation they are 0.
+
+_DEPTH_MAX = 8
+_CONVERSIONS = ("float", "int", "abs")
+
+
+def is_difference_of_now(node: ast.expr, scope: Scope, depth: int = 0) -> bool:
+    """Return whether an expression is a difference of two times that this function looked up,
+    however converted."""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
+        return all(_is_now(side, scope, depth) for side in (node.left, node.right))
+    return _within(node, scope, depth, is_difference_of_now)
+
+
+def _is_now(node: ast.expr, scope: Scope, depth: int) -> bool:
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+        return node.func.attr == "now" and not node.args and _is_clock(node.func.value)
+    return _within(node, scope, depth, _is_now)
+
+
+def _is_clock(node: ast.expr) -> bool:
+    """Return whether an expression is a ROS clock, as far as its name tells."""
+    if isinstance(node, ast.Call):
+        return isinstance(node.func, ast.Attribute) and node.func.attr == "get_clock"
+    name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
+    return str(name).lower().endswith("clock")
+
+
+def _within(
+    node: ast.expr, scope: Scope, depth: int, holds: Callable[[ast.expr, Scope, int], bool]
+) -> bool:
+    """Look below conversions of a time, and behind names of the function."""
+    if depth > _DEPTH_MAX:
+        return False
+    if isinstance(node, ast.Attribute) and node.attr in ("nanoseconds", "nanosec", "sec"):
+        return holds(node.value, scope, depth + 1)
+    if isinstance(node, ast.BinOp) and isinstance(node.right, ast.Constant):
+        return holds(node.left, scope, depth + 1)
+    if isinstance(node, ast.Call) and len(node.args) == 1 and isinstance(node.func, ast.Name):
+        return node.func.id in _CONVERSIONS and holds(node.args[0], scope, depth + 1)
+    if isinstance(node, ast.Name) and scope.kind == "function":
+        bound = scope.names.get(node.id, [])
+        return bool(bound) and all(
+            isinstance(one, ast.expr) and holds(one, scope, depth + 1) for one in bound
+        )
+    return False
+
+
+# Functions of rclpy that a module replaces although no simulation calls them.
+
+_FUNCTIONS = {f"{place}.{name}" for place, names in NEVER_CALLED.items() for name in names}
+_READERS = ("builtins.getattr", "builtins.hasattr")
+
+
+def exchanged(
+    module: Module, node: ast.AST, names: Names
+) -> Iterator[tuple[ast.stmt | ast.expr, str]]:
+    """Yield where ``node`` replaces such a function, or overrides it, and its full name.
+
+    Found are ``Executor._take_timer = …``, ``setattr(Executor, "_take_timer", …)`` and what else is
+    called with a class and a name (``patch.object``), full names in a text (``patch``), and methods
+    of an executor of one's own.
+    """
+    if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+        yield from _known(node, names.of(node, module.scope_of(node)))
+    elif isinstance(node, ast.Call) and node.args:
+        yield from _known(node, _called_with(module, node, names))
+    elif isinstance(node, ast.ClassDef):
+        own_module = EXECUTOR.rpartition(".")[0]
+        for method in (one for one in node.body if isinstance(one, ast.FunctionDef)):
+            for base in node.bases:
+                name = names.of(ast.Attribute(base, method.name, ast.Load()), module.scope_of(base))
+                if name is not None and name.startswith(own_module):
+                    yield from _known(method, name)
+
+
+def _known(
+    node: ast.stmt | ast.expr, name: str | None
+) -> Iterator[tuple[ast.stmt | ast.expr, str]]:
+    if name in _FUNCTIONS:
+        yield node, str(name)
+
+
+def _called_with(module: Module, node: ast.Call, names: Names) -> str | None:
+    texts = [one.value if isinstance(one, ast.Constant) else None for one in node.args[:2]]
+    if isinstance(texts[0], str):
+        return texts[0]
+    scope = module.scope_of(node)
+    if len(texts) < 2 or not isinstance(texts[1], str) or names.of(node.func, scope) in _READERS:
+        return None
+    return names.of(ast.Attribute(node.args[0], texts[1], ast.Load()), scope)
+
 
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)",

@@ -17,7 +17,7 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.recorded.descriptors import recording, stand_in
 from rsltrace.guard.redirect import redirect, replace_attribute

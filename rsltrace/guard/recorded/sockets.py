@@ -16,7 +16,7 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded.descriptors import joining, recording
 from rsltrace.guard.redirect import redirect

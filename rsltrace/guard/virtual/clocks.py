@@ -19,8 +19,7 @@ from typing import Any
 
 from rsltrace.guard import frames
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.extension_types import put_member
-from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.frames import caller, code_of, put_member
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_read
 from rsltrace.trace.model.finding import Mode, Source

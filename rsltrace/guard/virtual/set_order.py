@@ -28,8 +28,7 @@ from typing import Any
 from rsltrace.guard import frames
 from rsltrace.guard.addresses import is_by_address
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.extension_types import exchange, exchange_special
-from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.frames import caller, code_of, exchange, exchange_special
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import Mode, Source

@@ -10,10 +10,14 @@ from __future__ import annotations
 
 import _ctypes
 import _imp
+import ast
 import ctypes
 import mmap
+import operator
 import os
+import random
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from importlib.machinery import EXTENSION_SUFFIXES
@@ -21,8 +25,224 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from rsltrace.guard.callers import is_user_file
-from rsltrace.guard.guard import engage
-from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.guard.frames import caller, exchange
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
+from rsltrace.guard.virtual.clocks import clock_call, numpy_now
+from rsltrace.guard.virtual.object_hashes import hash_method
+from rsltrace.guard.virtual.set_order import ordered
+from rsltrace.guard.virtual.user_modules import rewrite
+
+# PyTorch's generator, for each node as if it were alone in the process.
+#
+# Torch draws in C++ from one generator, and offers no place to ask who is calling. So the
+# generator's state is exchanged whenever another node's code begins to run: some 10 microseconds
+# each time, in jobs that have loaded torch and in no others.
+
+
+class TorchStreams:
+    """The states of torch's generator, by the name of the node (or of the entry) that draws."""
+
+    def __init__(self, generator: Any, seed: int) -> None:
+        self._generator = generator
+        self._seed = seed
+        self._states: dict[str, Any] = {}
+        self._name: str | None = None
+
+    def enter(self, name: str) -> None:
+        """Go on where a node's code has stopped drawing."""
+        if name == self._name:
+            return
+        self._keep()
+        self._name = name
+        state = self._states.get(name)
+        if state is not None:
+            self._generator.set_state(state)
+        else:
+            self._generator.manual_seed(random.Random(f"torch {self._seed} {name}").getrandbits(63))
+
+    def rename(self, name: str) -> None:
+        """Go on under another name: an entry has made its node, and may have seeded before."""
+        self._keep()
+        self._name = name
+
+    def _keep(self) -> None:
+        if self._name is not None:
+            self._states[self._name] = self._generator.get_state()
+
+
+def _seeding(real: Any) -> Any:
+    def seed(self: Any) -> int:
+        """Do ``Generator.seed``, which would take entropy in C++."""
+        value = int.from_bytes(os.urandom(8), "big") >> 1
+        self.manual_seed(value)
+        return value
+
+    return seed
+
+
+def torch_streams(stack: ExitStack, guard: Guard) -> TorchStreams:
+    """Divide the generator of torch, which is loaded, among the nodes until ``stack`` ends."""
+    torch: Any = sys.modules["torch"]
+    generator = torch.default_generator
+    stack.callback(generator.set_state, generator.get_state())
+    exchange(stack, torch._C.Generator, "seed", _seeding)
+    return TorchStreams(generator, guard.streams.seed)
+
+
+# ``torch.compile`` reads the code that runs, our calls included: it may take them for nothing.
+#
+# It would follow them into the guard, and could go no further where a set of texts is gone
+# through. In a graph sets are in the order that Python gives them, which is that of all pinned
+# processes.
+
+COMPILES = "torch._dynamo"
+"""The module of torch that reads code."""
+
+
+def _as_it_is(thing: Any) -> Any:
+    return thing
+
+
+def _hash_method(owner: Any) -> Any:
+    return owner.__hash__
+
+
+def _call(function: Any, text: str, *more: Any) -> Any:
+    return function(text, *more)
+
+
+_MEANT = {
+    ordered: _as_it_is,
+    hash_method: _hash_method,
+    numpy_now: _call,
+}
+_known: list[object] = []
+
+
+def plain_in_graphs() -> None:
+    """Let torch, whose compiler is loaded, see plain Python where modules call the guard."""
+    substitute = getattr(sys.modules[COMPILES], "substitute_in_graph", None)
+    if substitute is None or substitute in _known:
+        return  # a torch that does it otherwise; or it is told already, and for good
+    _known.append(substitute)
+    for function, meant in _MEANT.items():
+        substitute(function)(meant)
+
+
+# Our calls in test modules, too: those that pytest compiles itself when it runs in a node.
+#
+# Its import hook comes before all others, and keeps what it compiled in a cache of its own. While
+# a run lasts that cache is neither read nor written: plain pytest shall not find our calls there.
+
+REWRITES = "_pytest.assertion.rewrite"
+"""The module of pytest that compiles test modules."""
+
+
+def rewritten_in_pytest(stack: ExitStack) -> None:
+    """Put our calls into what pytest compiles from now on, until ``stack`` ends."""
+    module: Any = sys.modules[REWRITES]
+    names = ("rewrite_asserts", "_read_pyc", "_write_pyc")
+    if not all(hasattr(module, name) for name in names):
+        return  # a pytest that does it otherwise
+    real = module.rewrite_asserts
+
+    def rewrite_asserts(tree: ast.Module, source: bytes, path: Any = None, *more: Any) -> None:
+        real(tree, source, path, *more)
+        if path is None or is_user_file(str(path)):
+            rewrite(tree)
+
+    instead = (rewrite_asserts, lambda *what: None, lambda *what: False)
+    for name, function in zip(names, instead, strict=True):
+        stack.callback(setattr, module, name, getattr(module, name))
+        setattr(module, name, function)
+
+
+# pygame's clock and waits: it asks SDL in C, and here they take simulated time as Python's do.
+
+_FRAMES = 10
+"""After how many frames pygame counts anew how many there are in a second."""
+
+
+def _ticks_of(real: Callable[[], int]) -> Callable[[], int]:
+    def get_ticks() -> int:
+        """Return the milliseconds since the run began."""
+        guard = engaged()
+        if guard is None:
+            return real()
+        call = "pygame.time.get_ticks()"
+        found: int = clock_call(guard, caller(), call, lambda ns: ns // 1_000_000, real)
+        return found
+
+    return get_ticks
+
+
+def _wait_of(real: Callable[[int], int]) -> Callable[[int], int]:
+    def wait(milliseconds: int) -> int:
+        """Wait in simulated time; return the milliseconds that passed."""
+        if engaged() is None:
+            return real(milliseconds)
+        for_ms = max(operator.index(milliseconds), 0)
+        time.sleep(for_ms / 1000)
+        return for_ms
+
+    return wait
+
+
+def _clock_type(ticks: Callable[[], int]) -> type:
+    class Clock:
+        """Times the frames of a game, as ``pygame.time.Clock`` does."""
+
+        def __init__(self) -> None:
+            self._last_ms = ticks()
+            self._passed_ms = self._raw_ms = 0
+            self._frames, self._since_ms, self._fps = 0, 0, 0.0
+
+        def tick(self, framerate: float = 0) -> int:
+            """Wait until it is time for the next frame; return the ms since the last one."""
+            self._raw_ms = ticks() - self._last_ms
+            if framerate:
+                time.sleep(max(int(1000 / framerate) - self._raw_ms, 0) / 1000)
+            now_ms = ticks()
+            self._passed_ms, self._last_ms = now_ms - self._last_ms, now_ms
+            if not framerate:
+                self._raw_ms = self._passed_ms
+            self._frames += 1
+            if not self._since_ms:
+                self._frames, self._since_ms = 0, now_ms
+            elif self._frames >= _FRAMES and now_ms > self._since_ms:
+                self._fps = self._frames * 1000 / (now_ms - self._since_ms)
+                self._frames, self._since_ms = 0, now_ms
+            return self._passed_ms
+
+        tick_busy_loop = tick
+
+        def get_time(self) -> int:
+            """Return the ms between the last two frames."""
+            return self._passed_ms
+
+        def get_rawtime(self) -> int:
+            """Return the ms that the last frame took without waiting."""
+            return self._raw_ms
+
+        def get_fps(self) -> float:
+            """Return how many frames there are in a second."""
+            return self._fps
+
+    return Clock
+
+
+def pygame_clock(stack: ExitStack) -> None:
+    """Put pygame, which is loaded, on simulated time until ``stack`` ends."""
+    pygame: Any = sys.modules["pygame"]
+    ticks = _ticks_of(pygame.time.get_ticks)
+    replace_attribute(stack, pygame.time, "get_ticks", ticks)
+    for name in ("wait", "delay"):
+        replace_attribute(stack, pygame.time, name, _wait_of(getattr(pygame.time, name)))
+    clock = _clock_type(ticks)
+    for owner in (pygame.time, pygame):
+        if hasattr(owner, "Clock"):  # pygame-ce has it in both
+            replace_attribute(stack, owner, "Clock", clock)
 
 
 class _Names(NamedTuple):
@@ -172,4 +392,11 @@ def one_tbb_thread(told: Callable[[str, str], None]) -> Iterator[None]:
         yield
 
 
-__all__ = ["one_tbb_thread"]
+__all__ = [
+    "COMPILES",
+    "REWRITES",
+    "one_tbb_thread",
+    "plain_in_graphs",
+    "pygame_clock",
+    "rewritten_in_pytest",
+]

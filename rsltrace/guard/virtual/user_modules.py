@@ -16,8 +16,7 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
-from rsltrace.guard.libraries import is_library
-from rsltrace.guard.library_imports import importing
+from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.object_hashes import hash_method
 from rsltrace.guard.virtual.original_code import keep_source

@@ -20,9 +20,8 @@ from rsltrace.job.values.checks import (
     positive_time,
     whole,
 )
-from rsltrace.job.values.mappings import names_to_names
+from rsltrace.job.values.mappings import check_path, names_to_names
 from rsltrace.job.values.names import check_glob, check_topic
-from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 

@@ -7,13 +7,145 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.latency import LatencySpec
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, given, number, positive_time, text
-from rsltrace.job.values.names import check_topic
+from rsltrace.job.values.checks import (
+    attach,
+    check,
+    given,
+    items,
+    number,
+    one_of,
+    positive_time,
+    text,
+)
+from rsltrace.job.values.names import check_node_glob, check_topic
 from rsltrace.job.values.problem import Problem, describe
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike
+
+# ``latency:`` of a check: how long data may take through a chain of topics.
+
+MEASURES = ("latency", "age", "last_age", "reaction", "worst_reaction")
+
+Topic = Annotated[str | None, check(text(check_topic), optional=True)]
+
+
+class LatencySpec(Part):
+    """What data takes through a chain stays below a time. The chain is given by ``start`` (in a
+    file: ``from``) and ``end`` (``to``), or by all of its topics (``chain``)."""
+
+    TIMES: ClassVar[dict[str, str]] = {"below": "below_ns"}
+
+    start: Topic = Field(
+        default=None,
+        alias="from",
+        description="The topic of the inputs.",
+        examples=["/scan"],
+    )
+    end: Topic = Field(
+        default=None,
+        alias="to",
+        description="The topic of the outputs, or the node whose callback is the end.",
+        examples=["/cmd_vel"],
+    )
+    chain: Annotated[tuple[str, ...], check(items(text(check_topic)))] = Field(
+        default=(),
+        description="All topics of the chain, instead of `from` and `to`.",
+        examples=[["/scan", "/objects", "/cmd_vel"]],
+    )
+    via: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
+        default=(),
+        description="Nodes (globs) that make use of the last message that they received, as a "
+        "timer does that samples.",
+        examples=[["/controller"]],
+    )
+    measure: Annotated[str, check(one_of(*MEASURES))] = Field(
+        default="latency",
+        description="What has to be below: the `latency`, the `age` of data (`last_age`: until the "
+        "next output), the `reaction` to an input (`worst_reaction`: to what happens right after "
+        "the input before), as `docs/latency.md` defines them.",
+        examples=["age"],
+    )
+    below_ns: Annotated[int, check(positive_time)] = Field(
+        alias="below", description="What all of them have to be below.", examples=["50ms"]
+    )
+    quantile: Annotated[float | None, check(number(0, 100, open_below=True), optional=True)] = (
+        Field(
+            default=None,
+            description="Percentage of them that has to be; without it, all.",
+            examples=[99],
+        )
+    )
+
+    @model_validator(mode="after")
+    def _says_which_chain(self) -> LatencySpec:
+        if self.chain and (self.start is not None or self.end is not None):
+            raise Problem("give either chain, or from and to", ("chain",))
+        if not self.chain and (self.start is None or self.end is None):
+            raise Problem("which chain? Give from and to, or chain")
+        if self.chain and len(self.chain) < 2:
+            raise Problem("a chain has two topics at least", ("chain",))
+        if self.start is not None and self.start == self.end:
+            raise Problem("from and to are the same topic; give a loop as a chain", ("to",))
+        return self
+
+    @property
+    def wanted(self) -> dict[str, Any]:
+        """The chain, as ``measure_latencies`` takes it."""
+        return {"start": self.start, "end": self.end, "topics": self.chain, "via": self.via}
+
+
+# ``metrics:`` of a job: numbers that say how a run went, found out from its trace.
+
+
+def check_metric_name(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` can be the name of a metric: one line of text."""
+    if not name.strip() or not name.isprintable():
+        raise ValueError(f"{describe(name)} is no name: use a word, as in distance")
+
+
+check_metric_name.pattern = r"\S"  # type: ignore[attr-defined]
+
+
+class MetricSpec(Part):
+    """One number. Exactly one of ``expression`` and ``function``; a text alone is an
+    ``expression``."""
+
+    ONE_OF: ClassVar[tuple[str, ...]] = ("expression", "function")
+
+    expression: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="What it is worth for a finished run, as in `rsltrace bisect --check`: "
+        '`last("/odom").pose.pose.position.x`, `count("/stop")`, '
+        '`max(m.data for m in messages("/error"))`, `end`.',
+        examples=['last("/odom").pose.pose.position.x'],
+    )
+    function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Function that gets the finished trace (`rsltrace.Trace`) and returns the "
+        "number, or `None` if there is none.",
+        examples=["my_robot.metrics:energy"],
+    )
+    unit: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None, description="Unit of the number, to be shown beside it.", examples=["m"]
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            expression: str | None = None,
+            function: Target | None = None,
+            unit: str | None = None,
+        ) -> None: ...
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> MetricSpec:
+        if (self.expression is None) == (self.function is None):
+            raise Problem("give expression or function")
+        return self
+
 
 _RATE = re.compile(r"\s*(\S+?)\s*[Hh][Zz]\s*")
 _positive = number(0, open_below=True)

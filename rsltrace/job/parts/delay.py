@@ -18,8 +18,8 @@ from rsltrace.job.values.checks import (
     positive_time,
     text,
 )
+from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_glob, check_node_glob, check_service_glob
-from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem
 from rsltrace.job.values.times import parse_time
 

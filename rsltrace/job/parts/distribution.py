@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
-from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.problem import Loc, Problem
 from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
 from rsltrace.simulation.chance.distribution import LONGEST_NS

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
+from rsltrace.job.parts.launch import StartAfterSpec
 from rsltrace.job.parts.part import Part
-from rsltrace.job.parts.process import RespawnSpec, check_environment
-from rsltrace.job.parts.start_after import StartAfterSpec
-from rsltrace.job.parts.stdin import InputSpec, inputs
+from rsltrace.job.parts.process import InputSpec, RespawnSpec, check_environment, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
-from rsltrace.job.values.mappings import check_arguments, check_remappings
+from rsltrace.job.values.mappings import check_arguments, check_path, check_remappings
 from rsltrace.job.values.names import (
     check_component,
     check_container,
@@ -25,7 +24,6 @@ from rsltrace.job.values.names import (
     check_node_name,
 )
 from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem
 from rsltrace.job.values.target import Target, check_callable_target, target_text
 from rsltrace.job.values.times import TimeLike

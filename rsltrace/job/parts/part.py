@@ -7,20 +7,137 @@ name (``duration_ns=``). The pydantic context tells the two apart.
 
 from __future__ import annotations
 
+import re
 import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
 
-from rsltrace.errors import JobError
-from rsltrace.job.parts.validation import worded_problems
+from rsltrace.errors import JobError, nearest
+from rsltrace.job.parts.keys import field_at, file_fields, models_in
 from rsltrace.job.values.checks import from_file
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import (
+    Loc,
+    Problem,
+    Problems,
+    as_flag,
+    describe,
+    format_loc,
+    meant_by,
+    unknown_key,
+)
 from rsltrace.job.values.times import Nanoseconds
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+# What pydantic finds wrong with a job, in words for its author and with each mistake's place.
+
+_VARIABLE = re.compile(r"\$\{?([A-Za-z_][A-Za-z0-9_]*)\}?")
+
+
+def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[Problem]:
+    """Return the findings of a failed validation of ``model``, worded and with full locations."""
+    found: list[Problem] = []
+    entries = error.errors(include_url=False)
+    # A misspelt key is one mistake, not two: the key that it was meant to be is not missing.
+    meant = {
+        (*entry["loc"][:-1], near)
+        for entry in entries
+        if entry["type"] == "extra_forbidden"
+        for names in (_keys_at(model, entry["loc"][:-1]),)
+        for near in (meant_by(str(entry["loc"][-1]), names), nearest(str(entry["loc"][-1]), names))
+    }
+    for entry in entries:
+        loc: Loc = entry["loc"]
+        cause = entry.get("ctx", {}).get("error")
+        if isinstance(cause, (Problem, Problems)):
+            items = cause.items if isinstance(cause, Problems) else [cause]
+            hint = _as_variable(entry["input"])
+            found += [
+                _named(item.message + hint, loc + item.loc, at_key=item.at_key) for item in items
+            ]
+        elif entry["type"] == "extra_forbidden":
+            found.append(unknown_key(loc[-1], _keys_at(model, loc[:-1]), loc[:-1]))
+        elif entry["type"] == "missing" and loc in meant:
+            continue
+        elif entry["type"] == "missing":
+            inside = f"{format_loc(loc[:-1])}: " if loc[:-1] else ""
+            found.append(Problem(f"{inside}the key '{loc[-1]}' is missing", loc))
+        else:
+            text = _wording(entry["type"], entry["msg"], cause, entry["input"])
+            text += _as_variable(entry["input"])
+            is_part = entry["type"].startswith("model_") and not isinstance(cause, ValueError)
+            if is_part and isinstance(entry["input"], (str, int, float, list, tuple)):
+                keys = _keys_at(model, loc)
+                text += f"; its keys are {', '.join(keys)}" if keys else ""
+                text += _as_part(entry["input"], _models_at(model, loc))
+            found.append(_named(text, loc))
+    return found
+
+
+def _named(message: str, loc: Loc, *, at_key: bool = False) -> Problem:
+    place = format_loc(loc[:-1] if at_key else loc)
+    return Problem(f"{place}: {message}" if place else message, loc, at_key=at_key)
+
+
+def _wording(kind: str, message: str, cause: object, value: object) -> str:
+    if isinstance(cause, ValueError):
+        return str(cause)
+    expected = {
+        "model_type": "a mapping",
+        "model_attributes_type": "a mapping",
+        "dict_type": "a mapping",
+        "tuple_type": "a list",
+        "int_type": "an integer",
+        "bool_type": "true or false",
+        "string_type": "text",
+    }.get(kind)
+    hint = as_flag(value) if kind == "bool_type" else ""
+    return f"expected {expected}, got {describe(value)}{hint}" if expected else message
+
+
+def _as_variable(value: object) -> str:
+    """Say how to write an environment variable, if a shell would take a text for one."""
+    found = _VARIABLE.search(value) if isinstance(value, str) else None
+    return f"; an environment variable is $(env {found[1]})" if found else ""
+
+
+def _as_part(value: object, models: list[type[BaseModel]]) -> str:
+    """Say how to write what was meant: ``stop: 60s`` is ``{duration: 60s}``."""
+    for inner in models:
+        keys: tuple[str, ...] = getattr(inner, "LISTED", ())
+        if isinstance(value, (list, tuple)) and len(value) == len(keys):
+            values = ", ".join(f"{k}: {_written(v)}" for k, v in zip(keys, value, strict=True))
+            return f"; write {{{values}}}"
+        key: str | None = getattr(inner, "MEANT", None)
+        if hasattr(inner, "meant_key") and isinstance(value, str):
+            key = inner.meant_key(value)
+        wanted = (list, tuple) if getattr(inner, "MEANT_LIST", False) else (str, int, float)
+        if key is not None and isinstance(value, wanted) and not isinstance(value, bool):
+            return f"; write {{{key}: {_written(value)}}}"
+    return ""
+
+
+def _written(value: object) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_written, value))}]"
+    return str(getattr(value, "text", value))
+
+
+def _keys_at(model: type[BaseModel], loc: Loc) -> list[str]:
+    """Return the keys a job may have at ``loc``."""
+    return [key for inner in _models_at(model, loc) for key, _ in file_fields(inner)]
+
+
+def _models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+    """Return the parts that may be at ``loc``, found by walking the models' annotations."""
+    if not loc:
+        return [model]
+    field = field_at(model, loc)
+    assert field is not None, "extra keys can only be forbidden inside a model"
+    return models_in(field.annotation)
 
 
 _PLUGINS = "pydantic.plugin._loader"

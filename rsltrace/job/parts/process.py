@@ -4,12 +4,90 @@ from __future__ import annotations
 
 from typing import Annotated, ClassVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, whole
+from rsltrace.job.values.checks import attach, check, flag, is_plain, text, whole
+from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.problem import Collected, Problem, describe
 from rsltrace.job.values.times import parse_time
+
+# ``stdin:`` of an entry: what is typed at its terminal, and when.
+
+_LINE_MAX = 4000
+"""A terminal of Linux takes no longer lines (4096 bytes, its end and what was typed before)."""
+
+
+def _line(value: object) -> str:
+    """Check one line; a number stands for its digits."""
+    if not is_plain(value):
+        raise Problem(f"expected a line of text, got {describe(value)}")
+    line = str(getattr(value, "text", value))
+    if "\n" in line or "\r" in line:
+        raise Problem("this is more than one line: write each as an entry of its own")
+    if len(line.encode()) > _LINE_MAX:
+        raise Problem(f"a terminal takes lines of at most {_LINE_MAX} bytes")
+    return line
+
+
+attach(_line, schema={"type": ["string", "number"]})
+
+
+class InputSpec(Part):
+    """Something that is typed: one of ``line``, ``keys``, ``file`` and ``end``. Text alone is a
+    ``line``."""
+
+    ONE_OF: ClassVar[tuple[str, ...]] = ("line", "keys", "file", "end")
+    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns"}
+
+    at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="at",
+        description="When, since the start of the run. Without it, as soon as what comes before "
+        "has been read.",
+        examples=["2.5s"],
+    )
+    line: Annotated[str | None, check(_line, optional=True)] = Field(
+        default=None, description="A line, and the Enter key.", examples=["start", 42]
+    )
+    keys: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="Keys one after the other, without Enter (which is `\\r`): `\\e[A` is the up "
+        "arrow, `\\x03` is Ctrl-C.",
+        examples=["wwad", "\x1b[A"],
+    )
+    file: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None, description="The lines of a text file.", examples=["answers.txt"]
+    )
+    end: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="The end of the input (Ctrl-D): who reads a line gets an end of file.",
+        examples=[True],
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> InputSpec:
+        given = [key for key in self.ONE_OF if getattr(self, key) not in (None, False)]
+        if len(given) != 1:
+            raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+        if self.keys == "":
+            raise Problem("no key is given", ("keys",))
+        return self
+
+
+def _inputs(value: object) -> object:
+    """Let the name of a file stand for its lines and the end of the input."""
+    if isinstance(value, str):
+        return ({"file": value}, {"end": True})
+    if not isinstance(value, (list, tuple)):
+        raise Problem(
+            "expected a file whose lines are typed, or a list of what is typed, got "
+            f"{describe(value)}"
+        )
+    return tuple({"line": item} if is_plain(item) else item for item in value)
+
+
+inputs = check(_inputs, optional=True, entry_shorthand="line", or_text=True)
 
 
 def check_environment(value: object) -> dict[str, str]:

@@ -10,7 +10,33 @@ from pydantic import Field, field_validator
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import Globs, check, flag, whole
 from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.trace.model.event import SEGMENT_EVENTS
+
+# ``hooks:``: functions that are called around the construction of the nodes.
+
+
+class HooksSpec(Part):
+    """What is called before the first and after the last node is constructed."""
+
+    before: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Function called with the job before the first node is constructed. It may "
+        "return nodes of its own (one, or a list).",
+        examples=["my_robot.setup:prepare"],
+    )
+    after: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Function called with the list of all nodes after the last one is constructed, "
+        "before the run starts. It may return more nodes.",
+        examples=["my_robot.setup:wire"],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self, *, before: Target | None = None, after: Target | None = None
+        ) -> None: ...
 
 
 class RecordSpec(Part):

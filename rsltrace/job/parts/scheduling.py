@@ -12,8 +12,8 @@ from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
+from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_node_glob
-from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time

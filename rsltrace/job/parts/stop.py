@@ -9,9 +9,8 @@ from pydantic import Field
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import check, part, positive_time, text, whole
 from rsltrace.job.values.names import check_field_path, check_topic
-from rsltrace.job.values.sizes import parse_size
 from rsltrace.job.values.target import Target, check_callable_target
-from rsltrace.job.values.times import TimeLike, parse_time
+from rsltrace.job.values.times import TimeLike, parse_size, parse_time
 
 
 class TopicStop(Part):

@@ -23,8 +23,8 @@ from rsltrace.job.reading.override import apply_override
 from rsltrace.job.reading.substitute import Substitution
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource
 from rsltrace.job.values.checks import attach, check, check_names, is_plain, items, text
+from rsltrace.job.values.mappings import check_path, near_path
 from rsltrace.job.values.names import check_variable
-from rsltrace.job.values.paths import check_path, near_path
 from rsltrace.job.values.problem import Collected, Loc, Problem, describe
 
 DEPTH_MAX = 20

@@ -17,7 +17,7 @@ from ruamel.yaml.reader import ReaderError
 
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import ExactFloat
-from rsltrace.trace.model.nesting import NESTING_MAX, nested_too_deep
+from rsltrace.trace.model.operation import NESTING_MAX, nested_too_deep
 
 VALUES_MAX = 100_000
 """Aliases can make a small file mean an enormous one; no job needs this many values."""

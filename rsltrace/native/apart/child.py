@@ -7,30 +7,123 @@ until it is told to end, or ends by itself. It never outlives the run.
 from __future__ import annotations
 
 import atexit
+import builtins
 import ctypes
 import os
 import signal
 import socket
 import sys
 import threading
+import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import wraps
+from types import ModuleType
 from typing import Any
 
 from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.entry import Entry
-from rsltrace.adapters.rclpy.error_text import exit_status
 from rsltrace.errors import JobError, RsltraceError
-from rsltrace.native.apart.link import Link, LinkError
-from rsltrace.native.apart.mains import RunningMain
 from rsltrace.native.apart.observers import Observers, Sender
-from rsltrace.native.apart.order import Order
+from rsltrace.native.apart.wire import Link, LinkError, Order
 from rsltrace.native.entries import RunningEntry, destroy
+from rsltrace.native.executors import failure_of
+from rsltrace.native.ledger import Callback
 from rsltrace.native.priorities import Priorities
 from rsltrace.native.recording import ENDS_WITHIN_S, rclpy_running
+from rsltrace.native.things import Thing
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
 from rsltrace.run.provenance import source_files
 from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
+
+# A main, a script or a module as a process of its own has it, observed.
+
+
+class RunningMain:
+    """Runs the main of an entry. What it does between its callbacks is its own events."""
+
+    def __init__(self, entry: Entry, observers: Observers, *, echo: bool) -> None:
+        self._entry = entry
+        self._observers = observers
+        self._words = [word for part in entry.arguments[:1] for word in part.arguments]
+        if not echo:
+            self._words += ["--ros-args", "--disable-stdout-logs"]
+        self._callback: Callback | None = None
+        self._is_over = False
+
+    def is_constructed(self) -> bool:
+        """Return whether it has waited or spun for the first time, or has ended."""
+        callback = self._callback
+        return self._is_over or (callback is not None and callback.span is None)
+
+    def run(self) -> None:
+        """Run it to its end; what it raises comes out. SIGINT interrupts it from now on."""
+        ledger, things, entry = self._observers.ledger, self._observers.things, self._entry
+        self._callback = callback = ledger.begin(int(EventKind.CONSTRUCT), None)
+        thing = things.add((), None, EntityKind.MAIN, entry.name, runs=entry.make)
+        callback.thing = thing
+        if callback.span is not None:
+            callback.span.thing = thing
+        self._become_main(thing)
+        failure = None
+        try:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            status = entry.make()
+            if status is not None:  # a console script is sys.exit(main())
+                raise SystemExit(status)
+        except (SystemExit, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            failure = failure_of(error)
+            raise
+        finally:
+            ledger.end(failure)
+            self._is_over = True
+
+    def _become_main(self, thing: Thing) -> None:
+        """Have this process be what ``ros2 run`` would have started."""
+        import rclpy.clock
+        import rclpy.context
+        import rclpy.timer
+
+        main = ModuleType("__main__")
+        vars(main).update(__builtins__=builtins, __annotations__={})
+        sys.modules["__main__"] = main
+        sys.argv = list(self._entry.argv or [self._entry.name])
+        self._observers.nodes.main = self._entry
+        context: Any = rclpy.context.Context
+        context.init = self._with_words(context.init)
+        for owner, name in (
+            (time, "sleep"),
+            (rclpy.timer.Rate, "sleep"),
+            (rclpy.clock.Clock, "sleep_until"),
+        ):
+            setattr(owner, name, self._pausing(getattr(owner, name), thing))
+
+    def _with_words(self, original: Callable[..., None]) -> Callable[..., None]:
+        """Add the ROS arguments of the entry to those of ``rclpy.init``."""
+
+        @wraps(original)
+        def init(context: Any, args: Any = None, **more: Any) -> None:
+            given = sys.argv if args is None else args
+            original(context, [*given, *self._words], **more)
+
+        return init
+
+    def _pausing(self, original: Callable[..., Any], thing: Thing) -> Callable[..., Any]:
+        """Let an event of the main end where it sleeps."""
+
+        @wraps(original)
+        def sleep(*words: Any, **more: Any) -> Any:
+            self._observers.ledger.pause(thing)
+            return original(*words, **more)
+
+        return sleep
+
 
 _PR_SET_PDEATHSIG = 1
 
@@ -133,7 +226,7 @@ class _Child:
 
     def _make_executor(self) -> Any:
         if self._priorities is not None and self._entry is not None:
-            from rsltrace.native.priority_executor import PriorityExecutor
+            from rsltrace.native.executors import PriorityExecutor
 
             threading.current_thread().name = f"rsltrace {self._entry.entry.name}"
             return PriorityExecutor(self._priorities)

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.errors import JobError
-from rsltrace.native.apart.link import Frame, Link
-from rsltrace.native.apart.order import Order
+from rsltrace.native.apart.wire import Frame, Link, Order
 
 # Does not load what lies in the present folder.
 _PROGRAM = """

@@ -6,17 +6,141 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from ctypes import (
+    CDLL,
+    POINTER,
+    Structure,
+    byref,
+    c_bool,
+    c_char_p,
+    c_int64,
+    c_size_t,
+    c_ubyte,
+    c_uint64,
+    c_void_p,
+    string_at,
+)
+from pathlib import Path
 from typing import Any
 
-from rsltrace.native.apart.gids import gids
-from rsltrace.native.apart.link import Link
-from rsltrace.native.apart.wire import SpanWriter
+from rsltrace.native.apart.wire import Link, SpanWriter
 from rsltrace.native.boundary import Boundary
 from rsltrace.native.executors import Executors
 from rsltrace.native.ledger import Ledger
 from rsltrace.native.nodes import Nodes
 from rsltrace.native.things import Things
 from rsltrace.trace.native import CUT_AFTER_NS
+
+# Which publisher a message is from: what rcl knows and rclpy does not tell.
+#
+# A message is taken as rclpy takes it, by rcl, and made into a Python object by rclpy's own
+# extension; in between there is its header, with the publisher's gid.
+
+_OK, _NOTHING_THERE = 0, 401
+_NO_NUMBER = 2**64 - 1
+
+
+class _Gid(Structure):
+    _fields_ = (("middleware", c_char_p), ("data", c_ubyte * 16))
+
+
+class _Info(Structure):
+    """``rmw_message_info_t``, and room for what releases to come may add."""
+
+    _fields_ = (
+        ("source_ns", c_int64),
+        ("received_ns", c_int64),
+        ("publication", c_uint64),
+        ("reception", c_uint64),
+        ("gid", _Gid),
+        ("from_this_process", c_bool),
+        ("room", c_ubyte * 256),
+    )
+
+
+class _Allocator(Structure):
+    _fields_ = tuple((name, c_void_p) for name in ("new", "free", "more", "zeros", "state"))
+
+
+class _Bytes(Structure):
+    _fields_ = (
+        ("data", c_void_p),
+        ("length", c_size_t),
+        ("capacity", c_size_t),
+        ("allocator", _Allocator),
+    )
+
+
+class Gids:
+    """Asks rcl. ``extension`` is rclpy's."""
+
+    def __init__(self, extension: Any, rcl: Any) -> None:
+        self._extension = extension
+        self._rcl = rcl
+        self._local = threading.local()
+        self._take = rcl.rcl_take_serialized_message
+        self._take.argtypes = (c_void_p, POINTER(_Bytes), POINTER(_Info), c_void_p)
+        self._handle_of = rcl.rcl_publisher_get_rmw_handle
+        self._handle_of.argtypes, self._handle_of.restype = (c_void_p,), c_void_p
+        self._gid_of = rcl.rmw_get_gid_for_publisher
+        self._gid_of.argtypes = (c_void_p, POINTER(_Gid))
+        rcl.rcutils_get_default_allocator.restype = _Allocator
+        rcl.rcutils_uint8_array_init.argtypes = (POINTER(_Bytes), c_size_t, POINTER(_Allocator))
+
+    def of_publisher(self, handle: Any) -> bytes:
+        """Return the gid of a publisher, by its handle; empty if it cannot be told."""
+        gid = _Gid()
+        inner = self._handle_of(handle.pointer)
+        if not inner or self._gid_of(inner, byref(gid)) != _OK:
+            self._rcl.rcutils_reset_error()
+            return b""
+        return bytes(gid.data)
+
+    def take(self, handle: Any, type: Any, raw: bool) -> tuple[Any, bytes]:
+        """Take a message as a subscription's ``take_message`` does; return what that returns, and
+        the gid of the publisher."""
+        info, room = _Info(), self._room()
+        code = self._take(handle.pointer, byref(room), byref(info), None)
+        if code == _NOTHING_THERE:
+            self._rcl.rcutils_reset_error()
+            return None, b""
+        if code != _OK:
+            self._rcl.rcutils_reset_error()
+            return handle.take_message(type, raw), b""
+        data = string_at(room.data, room.length)
+        message = data if raw else self._extension.rclpy_deserialize(data, type)
+        told = {
+            "source_timestamp": info.source_ns,
+            "received_timestamp": info.received_ns,
+            "publication_sequence_number": _number(info.publication),
+            "reception_sequence_number": _number(info.reception),
+        }
+        return (message, told), bytes(info.gid.data)
+
+    def _room(self) -> _Bytes:
+        """Return where this thread takes messages to; it grows with them."""
+        try:
+            room: _Bytes = self._local.room
+        except AttributeError:
+            room = self._local.room = _Bytes()
+            allocator = self._rcl.rcutils_get_default_allocator()
+            self._rcl.rcutils_uint8_array_init(byref(room), 0, byref(allocator))
+        return room
+
+
+def _number(value: int) -> int | None:
+    return None if value == _NO_NUMBER else value
+
+
+def gids(extension: Any) -> Gids | None:
+    """Return who asks the librcl that this process has loaded; None if that one cannot be asked."""
+    lines = Path("/proc/self/maps").read_text(errors="surrogateescape").splitlines()
+    paths = {line.split(maxsplit=5)[-1] for line in lines if "/librcl.so" in line}
+    try:
+        return Gids(extension, CDLL(paths.pop()))
+    except (KeyError, OSError, AttributeError):
+        return None
+
 
 _EVERY_S = 0.05
 _AT_ONCE = 2_000

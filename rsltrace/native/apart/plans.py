@@ -6,12 +6,12 @@ import os
 import sys
 from dataclasses import replace
 
-from rsltrace.adapters.processes.programs import is_python
+from rsltrace.adapters.processes.build import is_python
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.native.apart.children import Start
-from rsltrace.native.apart.order import Order
+from rsltrace.native.apart.wire import Order
 from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
 from rsltrace.run.plans.processes import Processes
 

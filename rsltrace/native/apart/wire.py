@@ -5,16 +5,117 @@ Each process counts its entities and threads from one; the run gives them number
 
 from __future__ import annotations
 
+import io
+import pickle
+import socket
+import struct
+import threading
 from collections.abc import Iterator
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
 from itertools import count
 from typing import Any
 
 from rsltrace.adapters.rclpy.wire.interfaces import message_type
+from rsltrace.job import Job
 from rsltrace.native.ledger import Failed, Logged, Scheduled, Sent, Span, Taken
 from rsltrace.native.things import Thing, Things
+from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.trace.model.entity import Entity, EntityKind
+
+# What the process of an entry is told to do.
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Which entry of a job's ``nodes:`` to run, or one of these: ``command`` to become another
+    program, ``plays_bags`` to play the job's bags.
+
+    ``executor`` is the name of an rclpy class; ``echo`` lets nodes print their log records.
+    ``policy`` and its ``rules`` are those of the run's priorities.
+    """
+
+    job: Job
+    index: int = 0
+    executor: str = "SingleThreadedExecutor"
+    echo: bool = True
+    policy: str | None = None
+    rules: tuple[PriorityRule, ...] | None = None
+    command: tuple[str, ...] = ()
+    plays_bags: bool = False
+    module_path: tuple[str, ...] = ()
+    """Where the run finds modules."""
+
+
+# What a native run and the process of one of its entries say to each other: frames on a socket.
+
+_HEAD = struct.Struct("<I")
+_PART = 1 << 20
+
+Frame = tuple[Any, ...]
+"""A word for what it is about, then values."""
+
+
+class LinkError(Exception):
+    """What came is no frame: something else has written to the socket."""
+
+
+class _PlainValues(pickle.Unpickler):
+    """Reads what a process of user code says: numbers, texts, bytes and lists of them, no objects
+    that run code."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        raise LinkError(f"{module}.{name} is no plain value")
+
+
+class Link:
+    """One end of the socket. Any thread may send; one receives."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._socket = end
+        self._lock = threading.Lock()
+        self._got = bytearray()
+
+    def send(self, *frame: Any) -> None:
+        """Send a frame; it waits for as long as the other end does not read.
+
+        :raises OSError: there is no other end any more.
+        """
+        data = pickle.dumps(frame, protocol=5)
+        with self._lock:
+            self._socket.sendall(_HEAD.pack(len(data)))
+            self._socket.sendall(data)
+
+    def receive(self, *, trusted: bool = False) -> Frame | None:
+        """Wait for a frame; None at the end. ``trusted``: it may have objects in it.
+
+        :raises TimeoutError: the socket has a timeout, and it has passed; nothing is lost then.
+        :raises LinkError: what came is no frame.
+        """
+        got = self._got
+        size = _HEAD.size
+        while len(got) < _HEAD.size or len(got) < (size := _HEAD.size + _HEAD.unpack_from(got)[0]):
+            try:
+                part = self._socket.recv(max(min(size - len(got), _PART), _HEAD.size))
+            except ConnectionResetError:
+                part = b""
+            if not part:
+                return None
+            got += part
+        data = bytes(got[_HEAD.size : size])
+        del got[:size]
+        try:
+            frame = pickle.loads(data) if trusted else _PlainValues(io.BytesIO(data)).load()
+        except Exception as error:
+            raise LinkError(str(error)) from error
+        if not isinstance(frame, tuple) or not frame:
+            raise LinkError("an empty frame")
+        return frame
+
+    def close(self) -> None:
+        """Close this end."""
+        self._socket.close()
+
 
 _LOG = "rcl_interfaces/msg/Log"
 

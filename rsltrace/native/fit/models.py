@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.checks.latency.figures import Durations
+from rsltrace.checks.latency.instances import Durations
 from rsltrace.errors import SetupError
 from rsltrace.simulation.chance.distribution import (
     LONGEST_NS,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.checks.latency.figures import Durations
+from rsltrace.checks.latency.instances import Durations
 from rsltrace.native.fit.models import Model
 from rsltrace.native.fit.parts import Fit
 from rsltrace.trace.model.printable import printable

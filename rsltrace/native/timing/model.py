@@ -15,6 +15,7 @@ from rsltrace.native.timing.observed import ObservedChains, Path
 from rsltrace.native.timing.system import ONCE_NS, Callback, Executor, Order, System, Task
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.scheduling import policy_of_job, scheduling_plan, switches_at_lines
+from rsltrace.simulation.chance.channel import NetworkPlan
 from rsltrace.simulation.chance.distribution import (
     Constant,
     Distribution,
@@ -23,7 +24,6 @@ from rsltrace.simulation.chance.distribution import (
     Series,
     Uniform,
 )
-from rsltrace.simulation.chance.network import NetworkPlan
 from rsltrace.simulation.loop.policy import Candidate, Policy, Priority, RateMonotonic
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
 

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.native.timing.system import Callback
-from rsltrace.simulation.loop.timer import TimerState
-from rsltrace.trace.model.draw import Draw, duration_of
+from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, duration_of
 from rsltrace.trace.native import timings
 from rsltrace.trace.reader import Trace
 

@@ -2,27 +2,323 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
-from rsltrace.replay.one_node.columns import Columns
-from rsltrace.replay.one_node.outputs import Side, changes, outputs_of_node
-from rsltrace.replay.one_node.result import NodeReplayResult
-from rsltrace.replay.one_node.script import check_payloads
-from rsltrace.replay.one_node.session import FedSession, run_fed
+from rsltrace.replay.one_node.outputs import Side, Watch, changes, outputs_of_node
+from rsltrace.replay.one_node.result import Column, Columns, NodeReplayResult
+from rsltrace.replay.one_node.script import RecordedScript, check_payloads
 from rsltrace.replay.one_node.unit import Unit
-from rsltrace.replay.one_node.watch import Watch
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
-from rsltrace.run.plans.scheduling import switches_at_lines
+from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import kept_process
+from rsltrace.run.session import Session
+from rsltrace.simulation.loop.fed import FedLoop, FedOrderedLoop, end_of
+from rsltrace.simulation.loop.loop import EventLoop
+from rsltrace.simulation.loop.policy import Fifo
 from rsltrace.simulation.loop.stop import Stop
+from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
+from rsltrace.simulation.middleware.services import Client
 from rsltrace.trace.format import METADATA_FED
+from rsltrace.trace.model.entity import Entity
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
+
+# A run of one entry of a recorded job, fed with what its nodes got then.
+
+# Which request a recorded response answers. A trace says who got it, and who asked what.
+
+_BEGIN = (EventKind.SERVICE, EventKind.ACTION)
+
+
+class Answers:
+    """The requests of the unit's clients that others have taken, until they are answered."""
+
+    def __init__(self, columns: Columns, is_own: Callable[[Column], Column]) -> None:
+        events, outputs = columns.events, columns.outputs
+        self._columns = columns
+        self._asked: dict[tuple[int, int], tuple[int, int]] = {}
+        """By event and output that asked: the client, and which of its requests it was."""
+        counts: dict[int, int] = {}
+        places = np.flatnonzero((outputs["kind"] == OutputKind.REQUEST) & is_own(outputs["entity"]))
+        for place in places.tolist():
+            event, client = int(outputs["event"][place]), int(outputs["entity"][place])
+            counts[client] = counts.get(client, 0) + 1
+            position = place - int(columns.first_output[event])
+            self._asked[event, position] = client, counts[client]
+        self._got: dict[tuple[int, int], int] = {}
+        """By event and output that answered: the client."""
+        self._open: dict[int, list[tuple[int, int, int]]] = {}
+        """By service: (event that took it, client, number) of requests, oldest first."""
+        self._untaken: dict[int, list[int]] = {}
+        """By client, the numbers of the requests that nobody seems to have taken."""
+        if not self._asked:
+            return
+        own = is_own(events["entity"])
+        for index in np.flatnonzero(own & (events["cause_event"] < len(events))).tolist():
+            row = events[index]
+            cause = int(row["cause_event"]), int(row["cause_output"])
+            self._got.setdefault(cause, int(row["entity"]))
+        for index in np.flatnonzero(~own & np.isin(events["kind"], _BEGIN)).tolist():
+            row = events[index]
+            asked = self._asked.get((int(row["cause_event"]), int(row["cause_output"])))
+            if asked is not None:
+                self._open.setdefault(int(row["entity"]), []).append((index, *asked))
+        taken = {asked[1:] for waiting in self._open.values() for asked in waiting}
+        for client, number in self._asked.values():
+            if (client, number) not in taken:
+                self._untaken.setdefault(client, []).append(number)
+
+    def of(self, event: int, position: int, service: int) -> tuple[int, int] | None:
+        """Return the client (of the recording) that a response goes to, and which of its requests
+        it answers; None if it goes to somebody else. Responses are asked for in their order."""
+        waiting = self._open.get(service, [])
+        for place, (begun, client, number) in enumerate(waiting):
+            if begun == event:
+                del waiting[place]
+                return client, number
+        asked_by = self._got.get((event, position))
+        if asked_by is None:
+            asked_by = self._drawn_for(event, position)
+        for place, (begun, client, number) in enumerate(waiting):
+            if begun < event and client == asked_by:
+                del waiting[place]
+                return client, number
+        # In the trace of one node alone nobody has taken the requests: they are answered in order.
+        numbers = self._untaken.get(asked_by)
+        return (asked_by, numbers.pop(0)) if numbers else None
+
+    def _drawn_for(self, event: int, position: int) -> int:
+        """Return for whom chance decided when a response arrives, or that it does not."""
+        rows = self._columns.outputs_of(event)[position + 1 : position + 2]
+        drawn = len(rows) and rows["kind"][0] == OutputKind.DRAW
+        return int(rows["entity"][0]) if drawn else -1
+
+
+class FedSession(Session):
+    """Runs ``unit`` alone. The stages are those of ``Session``; bags, stop conditions, policy and
+    executors of the job are none of its business: the recording has what came of them."""
+
+    loop: FedLoop
+
+    def __init__(
+        self,
+        plan: Preparation,
+        columns: Columns,
+        unit: Unit,
+        output: Path,
+        *,
+        force: bool = False,
+        echo: bool = False,
+        observer: Observer | None = None,
+    ) -> None:
+        recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
+        super().__init__(
+            plan.job, output, force=force, echo=echo, observer=observer, replay=recorded
+        )
+        self._columns = columns
+        self._unit = unit
+        self._trace = plan.trace
+        self.script = RecordedScript(columns, unit, self._perform)
+        self._answers = Answers(columns, unit.is_own)
+
+    # -- what is different from a run of the whole job --------------------------------------------
+
+    def _open_bags(self, stack: ExitStack, notes: object) -> None:
+        self._bags = []
+        self._notes = ()
+        events = self._columns.events
+        jumps = events["stamp"][events["kind"] == EventKind.CLOCK_JUMP]
+        self.start_ns = self._trace.start_ns
+        if not self._trace.result and len(jumps):
+            self.start_ns = int(jumps[0])
+        self.end_ns = self.script.end_ns
+
+    def _kind_of_loop(self) -> type[EventLoop]:
+        ordered = is_ordered(self.job) or self.job.timer_ties != "creation"
+        return FedOrderedLoop if ordered else FedLoop
+
+    def _order_events(self, stack: ExitStack) -> None:
+        loop = self.loop
+        self._recorded = None
+        loop.script = self.script
+        loop.by_steps, loop.min_step_ns = bool(loop.min_step_ns), 0
+        if isinstance(loop, FedOrderedLoop):
+            plan = scheduling_plan(self.job, self.start_ns, Fifo())
+            self.world.use_scheduling(loop, replace(plan, occupies=False))
+            loop.has_workers = plan.occupies
+            policy = self.job.policy
+            loop.by_policy = policy is not None and policy.order != "fifo"
+
+    def _import_what_is_named(self) -> None:
+        from rsltrace.adapters.stand_ins import StandIns
+
+        job, world = self.job, self.world
+        self._stand_ins = StandIns(world.domain, self._definition)
+        self.loop.stop_conditions = (end_of(self.script, self.loop),)  # type: ignore[assignment]
+        hooks = int(job.hooks.before is not None)
+        nodes = range(hooks, hooks + len(job.nodes))
+        with world.importing():
+            self._entries = []
+            if hooks and 0 in self._unit.entries:
+                self._entries += hook_entries(job, "before", job.hooks.before, lambda: job)
+            wanted = [place - hooks for place in self._unit.entries if place in nodes]
+            self._entries += node_entries(job, wanted)
+            if any(place >= nodes.stop for place in self._unit.entries):
+                self._entries += hook_entries(job, "after", job.hooks.after, world.all_nodes)
+
+    def _payload_filter(self) -> Callable[[str], bool]:
+        return lambda topic: True
+
+    def _open_trace(self, stack: ExitStack, path: Path) -> None:
+        super()._open_trace(stack, path)
+        assert self._writer is not None
+        told = {
+            "node": self._unit.node.name,
+            "entries": ",".join(map(str, self._unit.entries)),
+        }
+        self._writer.add_metadata(METADATA_FED, told)
+        dispatcher = self.world.domain.dispatcher
+        dispatcher.add_observer(_Progress(dispatcher, self.script))
+
+    @property
+    def fed(self) -> int:
+        """How many messages, requests and responses of others there have been."""
+        return self._stand_ins.fed
+
+    def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
+        """Return nothing: rules for other nodes have nothing to do here."""
+        return ()
+
+    def begin(self) -> None:
+        """Construct the unit among the others, and jump to the start."""
+        world, unit = self.world, self._unit
+        entries = dict(zip(unit.entries, self._entries, strict=True))
+        last = 0
+        with self._failures(), self._engaged():
+            world.plan(self._entries, self.start_ns)
+            world.stacks.programs.fed = True
+            for place, event in enumerate(self._columns.constructions):
+                entry = entries.get(unit.entry_of(place))
+                if self._starts_later(unit.entry_of(place)):
+                    if entry is not None:
+                        world.starts.add_at(entry, int(self._columns.events["stamp"][event]))
+                    continue
+                last = event + 1
+                if entry is None:
+                    continue
+                self.script.perform_until(event)
+                if not world.construct(entry):
+                    say_where(self.job, entry, world.error)
+                    break
+            if not self.ended:
+                self.script.perform_until(last)
+                world.jump(self.start_ns)
+                self._has_begun = not self.ended
+
+    def _starts_later(self, place: int) -> bool:
+        """Whether an entry (its place among hooks and nodes) has started after the run had."""
+        index = place - int(self.job.hooks.before is not None)
+        nodes = self.job.nodes
+        return 0 <= index < len(nodes) and nodes[index].start_after is not None
+
+    # -- what others did --------------------------------------------------------------------------
+
+    def _perform(
+        self,
+        event: int,
+        created: list[Entity],
+        sent: list[tuple[int, Any]],
+        busy_ns: int,
+    ) -> None:
+        from rsltrace.adapters.stand_ins import Sent
+
+        found = []
+        for position, row in sent:
+            kind, entity = OutputKind(int(row["kind"])), int(row["entity"])
+            answers = None
+            if kind is OutputKind.RESPONSE:
+                answers = self._answers.of(event, position, entity)
+                if answers is None:
+                    continue
+            data = self._payload(event, position)
+            found.append(Sent(kind, entity, data, int(row["hash"]), answers))
+        self._stand_ins.perform(created, found, busy_ns, self._client)
+
+    def _payload(self, event: int, position: int) -> Callable[[], bytes]:
+        def read() -> bytes:
+            data = self._columns.payload(event, position)
+            if data is None:
+                output = self._trace.outputs_of(event)[position]
+                name = self._trace.entity(output.entity).name
+                raise ReplayError(
+                    f"{self._trace.name} does not hold the messages of {name}, which "
+                    f"{self._unit.node.name} asks for now: record once more with them "
+                    "(record.topics)"
+                )
+            return data
+
+        return read
+
+    def _client(self, recorded: int) -> Client | None:
+        """Return the client of the unit that stands for a recorded one, if it is there."""
+        present = self.script.present(recorded)
+        clients = self.world.domain.graph.clients(self._trace.entity(recorded).name)
+        return next((one for one in clients if one.entity_id == present), None)
+
+    def _definition(self, type_name: str) -> tuple[str, str]:
+        for channel in self._trace.channels.values():
+            if channel.type == type_name:
+                return channel.schema_text, str(channel.metadata.get("topic_type_hash", ""))
+        return "", ""
+
+
+class _Progress(EventObserver):
+    """Tells a script of the unit's entities and events."""
+
+    order = ObserverOrder.SCRIPT
+
+    def __init__(self, dispatcher: Dispatcher, script: RecordedScript) -> None:
+        self._dispatcher = dispatcher
+        self._script = script
+        self._names: dict[int, str] = {0: ""}
+
+    def entity_created(self, entity: Entity) -> None:
+        """Tell of an entity and the name of its node."""
+        if entity.node == entity.id:
+            self._names[entity.id] = entity.name
+        self._script.met(entity, self._names.get(entity.node, ""))
+
+    def after_event(self) -> None:
+        """Tell of an event that is not done for others."""
+        event = self._dispatcher.event
+        if event.kind != EventKind.BAG:
+            self._script.happened(event.kind, event.entity, self._dispatcher.loop.now_ns)
+
+
+def run_fed(session: FedSession, watch: Watch | None = None) -> RunResult:
+    """Run a session to its end."""
+    with session:
+        if watch is not None:
+            watch.attach(session)
+        session.begin()
+        if not session.ended:
+            session.go_on()
+        return session.finish()
+
 
 CHANGED = Stop("the first output that is not as recorded", 1)
 

@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
 from rsltrace.replay.one_node.result import NodeReplayResult, OutputChange
-from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.model.stamp import format_seconds
-from rsltrace.trace.words.table import table
+from rsltrace.trace.model.printable import format_seconds, printable, shortened
+from rsltrace.trace.words.phrases import table
 
 _ROWS = 15
 _WIDTH = 40

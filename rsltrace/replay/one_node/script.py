@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from rsltrace.errors import ReplayError
-from rsltrace.replay.one_node.columns import SENT, Columns
+from rsltrace.replay.one_node.result import SENT, Columns
 from rsltrace.replay.one_node.unit import Unit
 from rsltrace.simulation.loop.fed import NEVER, Step
-from rsltrace.trace.model.draw import Draw, duration_of
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, Draw, EventKind, OutputKind, duration_of
 
 _ENDPOINTS = (
     EntityKind.NODE,

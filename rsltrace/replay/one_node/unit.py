@@ -14,7 +14,7 @@ import numpy as np
 
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import Job
-from rsltrace.replay.one_node.columns import SENT, Column, Columns
+from rsltrace.replay.one_node.result import SENT, Column, Columns
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.job import Job, load_job
-from rsltrace.replay.job_folder import without_bags
 from rsltrace.replay.one_node.from_bag import replay_from_bag
 from rsltrace.replay.one_node.replaying import replay_node
 from rsltrace.replay.one_node.result import NodeReplayResult
-from rsltrace.replay.preparation import prepared
+from rsltrace.replay.preparation import prepared, without_bags
 
 
 def is_job(path: Path) -> bool:

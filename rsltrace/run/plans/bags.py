@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.job.values.names import check_topic
-from rsltrace.run.plans.stopping import end_ns_of, has_stop
+from rsltrace.run.plans.scheduling import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.stamp import NS_PER_S, format_duration, format_seconds
+from rsltrace.trace.model.printable import NS_PER_S, format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle
@@ -26,8 +26,7 @@ if TYPE_CHECKING:
     from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.trace.recordings import Bag
     from rsltrace.trace.recordings.playback import Playback
-    from rsltrace.trace.recordings.storage import StoredTopic
-    from rsltrace.trace.recordings.topic import BagTopic
+    from rsltrace.trace.recordings.topic import BagTopic, StoredTopic
 
 PLAYER = "rosbag2_player"
 """The node that publishes what bags have, named as ``ros2 bag play`` names its own."""

@@ -17,7 +17,7 @@ from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 
-from rsltrace.adapters.processes.programs import is_compiled, is_python, why_not_run
+from rsltrace.adapters.processes.build import is_compiled, is_python, why_not_run
 from rsltrace.adapters.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
 from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.workspace.imports import (
@@ -29,7 +29,7 @@ from rsltrace.adapters.workspace.imports import (
 from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
-from rsltrace.run.plans.target import load_target
+from rsltrace.run.plans.scheduling import load_target
 from rsltrace.run.process import user_modules
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.simulation.middleware.faults import MessageFault, TopicFaults
+from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.faults import NodeFaults

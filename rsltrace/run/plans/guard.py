@@ -19,12 +19,17 @@ from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import READERS, show_original
-from rsltrace.guard.virtual.pygame_clock import pygame_clock
-from rsltrace.guard.virtual.pytest_modules import REWRITES, rewritten_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
-from rsltrace.guard.virtual.tbb_threads import one_tbb_thread
-from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
-from rsltrace.guard.virtual.torch_streams import TorchStreams, torch_streams
+from rsltrace.guard.virtual.tbb_threads import (
+    COMPILES,
+    REWRITES,
+    TorchStreams,
+    one_tbb_thread,
+    plain_in_graphs,
+    pygame_clock,
+    rewritten_in_pytest,
+    torch_streams,
+)
 from rsltrace.guard.virtual.user_modules import user_modules
 from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
 from rsltrace.job import Job, NodeSpec, policy_of

@@ -11,15 +11,16 @@ from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
-from rsltrace.adapters.processes.build import Library, library
-from rsltrace.adapters.processes.door import Interfaces, ProcessDoor, Program
-from rsltrace.adapters.processes.programs import (
+from rsltrace.adapters.processes.build import (
+    Library,
     interpreter,
     is_compiled,
     is_python,
+    library,
     program,
     why_not_run,
 )
+from rsltrace.adapters.processes.door import Interfaces, ProcessDoor, Program
 from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.wire.interfaces import (
@@ -31,9 +32,9 @@ from rsltrace.adapters.workspace.imports import unbuilt_names, unbuilt_prefix
 from rsltrace.errors import JobError, RunError, SetupError
 from rsltrace.guard.pin import pinned_variables
 from rsltrace.job import Job, NodeSpec
-from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
-from rsltrace.simulation.chance.clock import ClockModel
+from rsltrace.run.plans.network import clocks_of
+from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.printable import printable
 from rsltrace.trace.model.regular_file import not_regular

@@ -12,13 +12,31 @@ from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.run.plans.scheduling import of_order, own_policy
 from rsltrace.simulation.chance.stream import Stream
-from rsltrace.simulation.loop.choices import Choices, decoded
 from rsltrace.simulation.loop.loop import EventLoop
-from rsltrace.simulation.loop.observed_order import CALLBACKS, ObservedCallback, ObservedOrder
 from rsltrace.simulation.loop.ordered import OrderedLoop
-from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
-from rsltrace.simulation.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
-from rsltrace.simulation.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.simulation.loop.policy import (
+    After,
+    Candidate,
+    Choices,
+    Departure,
+    Departures,
+    Fifo,
+    Moment,
+    Pct,
+    Policy,
+    Priority,
+    PriorityRule,
+    decoded,
+)
+from rsltrace.simulation.loop.recorded import (
+    CALLBACKS,
+    THE_RUN,
+    ObservedCallback,
+    ObservedOrder,
+    Recorded,
+    RecordedEvent,
+    described,
+)
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.native import is_native
@@ -27,11 +45,10 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain
-    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
-    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
-"""What the policy of the run has chosen; see ``rsltrace.simulation.loop.choices``."""
+"""What the policy of the run has chosen; see ``rsltrace.simulation.loop.policy``."""
 ATTACHMENT_POLLS = "rsltrace/polls"
 """From when on executors had polling points, see ``OrderedLoop.polls``."""
 
@@ -42,8 +59,7 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
-    from rsltrace.simulation.middleware.events.observed_run import ObservedRun
-    from rsltrace.simulation.middleware.events.recorded_run import RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
         return None

@@ -2,28 +2,82 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import JobError
-from rsltrace.job import Job, locate
+from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
+from rsltrace.errors import JobError, RsltraceError, did_you_mean
+from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.parts.scheduling import EVERY_LINE, PolicySpec
+from rsltrace.job.values.times import format_size
 from rsltrace.run.plans.network import distribution_of
-from rsltrace.run.plans.target import load_target
 from rsltrace.simulation.chance.stream import Stream
 from rsltrace.simulation.loop.policy import (
+    After,
+    Departure,
+    Departures,
     Fifo,
+    Pct,
     Permutation,
     Policy,
     Priority,
     PriorityRule,
     RateMonotonic,
 )
-from rsltrace.simulation.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.simulation.loop.stop import (
+    Progress,
+    Stop,
+    StopCondition,
+    stop_after_events,
+    stop_at,
+    stop_when,
+    stop_when_quiet,
+)
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
+from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.trace.model.printable import format_seconds
 
 if TYPE_CHECKING:
+    from rsltrace.adapters.rclpy.entry import Entry
+    from rsltrace.adapters.rclpy.world import World
     from rsltrace.simulation.middleware.scheduling import SchedulingPlan
+
+# What a job names as ``module:attribute``.
+
+
+def load_target(target: str, *, where: str) -> Any:
+    """Import ``module:attribute``.
+
+    :raises JobError: if there is no such module or attribute, or it cannot be called.
+    """
+    module_name, _, attribute = target.partition(":")
+    try:
+        value: Any = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (module_name + ".").startswith(error.name + "."):
+            raise JobError(
+                f"there is no module {module_name!r} (looked in search_path and in Python's own "
+                "path); check the name, or add its folder to search_path",
+                where=where,
+            ) from error
+        raise JobError(cannot_import(module_name, error), where=where) from error
+    except RsltraceError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise JobError(import_raised(module_name, error, text_of(error)), where=where) from error
+    for part in attribute.split("."):
+        try:
+            value = getattr(value, part)
+        except AttributeError as error:
+            hint = did_you_mean(part, (n for n in dir(value) if not n.startswith("_")))
+            raise JobError(
+                f"module {module_name!r} has no {attribute!r}{hint}", where=where
+            ) from error
+    if not callable(value):
+        raise JobError(f"{target} is a {type(value).__qualname__}, not callable", where=where)
+    return value
 
 
 def is_ordered(job: Job) -> bool:
@@ -149,3 +203,94 @@ def own_policy(function: Any, where: str) -> Policy:
             where=where,
         )
     return policy  # type: ignore[no-any-return]
+
+
+# From a job's ``stop:`` to the conditions that the loop asks.
+
+_Context = Callable[[], AbstractContextManager[None]]
+
+
+def end_ns_of(job: Job, start_ns: int) -> int | None:
+    """Return the latest simulated time the run can reach, or None if time does not end it."""
+    ends = []
+    if job.stop.duration_ns is not None:
+        ends.append(start_ns + job.stop.duration_ns)
+    if job.stop.timeout_ns is not None:
+        ends.append(start_ns + job.stop.timeout_ns)
+    if job.stop.time_ns is not None:
+        ends.append(job.stop.time_ns)
+    return min(ends, default=None)
+
+
+def stop_with(world: World, entries: Sequence[Entry]) -> None:
+    """Let the run end when an entry has ended that is required."""
+    required = {entry.key for entry in entries if entry.required}
+    loop = world.domain.loop
+
+    def told(what: str, key: str) -> None:
+        if what == "ended" and key in required and loop.stopped is None:
+            loop.stop(Stop(f"{key} has ended, which the run requires"))
+
+    if required:
+        world.stacks.programs.listeners.append(told)
+
+
+def stop_conditions(
+    job: Job,
+    start_ns: int,
+    outside_events: _Context = nullcontext,
+) -> Iterator[StopCondition]:
+    """Yield the conditions of a job; its stop function runs within ``outside_events()``.
+
+    :raises JobError: if the stop function cannot be imported.
+    """
+    stop = job.stop
+    if stop.duration_ns is not None:
+        reason = f"duration of {format_seconds(stop.duration_ns)} s"
+        yield stop_at(start_ns + stop.duration_ns, reason)
+    if stop.timeout_ns is not None:
+        reason = f"timeout of {format_seconds(stop.timeout_ns)} s"
+        yield stop_at(start_ns + stop.timeout_ns, reason, exit_code=1)
+    if stop.time_ns is not None:
+        yield stop_at(stop.time_ns, f"time {format_seconds(stop.time_ns)} s")
+    if stop.events is not None:
+        yield stop_after_events(stop.events)
+    if stop.quiescence_ns is not None:
+        yield stop_when_quiet(
+            stop.quiescence_ns, f"quiet for {format_seconds(stop.quiescence_ns)} s"
+        )
+    if stop.function is not None:
+        function: Any = stop.function
+        name = str(function)
+        if isinstance(function, str):
+            with showing_line(job, ("stop", "function")):
+                function = load_target(function, where=locate(job, ("stop", "function")))
+        else:
+            name = f"{function.__module__}:{function.__qualname__}"
+        yield stop_when(_within(outside_events, function), name)
+
+
+def stop_at_size(size: int, written: Callable[[], int]) -> StopCondition:
+    """Stop once ``written()`` bytes are as many as ``size``."""
+
+    def condition(progress: Progress) -> Stop | None:
+        return Stop(f"a trace of {format_size(size)}") if written() >= size else None
+
+    return condition
+
+
+def _within(
+    context: _Context, function: Callable[[Progress], object]
+) -> Callable[[Progress], object]:
+    def call(progress: Progress) -> object:
+        with context():
+            return function(progress)
+
+    return call
+
+
+def has_stop(job: Job) -> bool:
+    """Return whether the job says itself when it ends; otherwise its bags do."""
+    if job.stop.topic is not None or job.stop.size is not None:
+        return True
+    return any(True for _ in stop_conditions(job, 0))

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 
 from rsltrace.errors import BisectError
-from rsltrace.search.bisect.judges import Check
 from rsltrace.search.bisect.repository import Commit
-from rsltrace.search.bisect.runs import Runner
+from rsltrace.search.bisect.runs import Check, Runner
 from rsltrace.search.perturb import Recorded
 
 _FIRST = re.compile(r"^([0-9a-f]{40,64}) is the first bad commit$", re.MULTILINE)

@@ -7,13 +7,15 @@ differs before that (which the copy finds), is run from the beginning, and the a
 
 from __future__ import annotations
 
+import fcntl
+import json
 import os
 import select
 import signal
 import socket
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -22,13 +24,55 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import die_with_parent, end_process, fork_beside, open_descriptors, why_not
 from rsltrace.line_protocol import Lines
-from rsltrace.search.explore.copies import answer_and_end, source_of, take_ends
-from rsltrace.search.explore.trial import Trial
+from rsltrace.search.explore.trial import JobSource, Trial
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
     from rsltrace.search.explore.outcome import Wants
     from rsltrace.search.explore.steps import Watch
+
+# What a copy of a worker's process does: it makes one run, answers, and ends.
+
+_HIGH = 900
+"""Descriptors from here on are not those that nodes get first."""
+
+
+def take_ends(tell: int, say: int) -> int:
+    """Have what is printed go to ``say``; return a high descriptor that answers as ``tell`` does.
+    Both stay open."""
+    os.dup2(say, 2)
+    return fcntl.fcntl(tell, fcntl.F_DUPFD_CLOEXEC, _HIGH)
+
+
+def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
+    """Write what a run answers, or what it was in trouble with, and end this process."""
+    status = 1
+    try:
+        try:
+            answer = run()
+        except RsltraceError as error:
+            answer = {"trouble": str(error)}
+        except OSError as error:
+            of = f": {error.filename}" if error.filename else ""
+            answer = {"trouble": f"{error.strerror or error}{of}"}
+        data = json.dumps(answer).encode() + b"\n"
+        while data:
+            data = data[os.write(tell, data) :]
+        status = 0
+    except BaseException:
+        import traceback
+
+        with suppress(BaseException):
+            os.write(2, traceback.format_exc().encode())
+    finally:
+        end_process(status)
+
+
+def source_of(task: dict[str, Any]) -> JobSource:
+    """Return the job that a task is about."""
+    job = task["job"]
+    return JobSource(**{**job, "overrides": tuple((one, two) for one, two in job["overrides"])})
+
 
 _IN_COMMON: dict[str, Mapping[str, Any]] = {
     "policy": {"policy": {"departures": []}},

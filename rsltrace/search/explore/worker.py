@@ -26,8 +26,7 @@ from rsltrace.forking import die_with_parent, other_threads
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.pin import pin
 from rsltrace.line_protocol import Lines
-from rsltrace.search.explore.copies import answer_and_end, source_of, take_ends
-from rsltrace.search.explore.prefix import Prefixes
+from rsltrace.search.explore.prefix import Prefixes, answer_and_end, source_of, take_ends
 from rsltrace.search.explore.trial import CRASH, TIMEOUT, Failure, Trial, TrialResult
 
 _PIECE_BYTES = 1 << 16
@@ -72,7 +71,7 @@ def main(words: list[str]) -> None:
 def _warm_up(task: dict[str, Any], libraries: list[str]) -> None:
     """Import the libraries that a run has imported, so that the next one need not.
 
-    That is no part of a run (``rsltrace.guard.library_imports``); user code is not imported.
+    That is no part of a run (``rsltrace.guard.libraries``); user code is not imported.
     """
     with suppress(RsltraceError):
         source_of(task).job()

@@ -6,12 +6,54 @@ one leaves all others as they were, which a generator shared by all cannot promi
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
 from hashlib import blake2b, shake_128
 from itertools import chain
+from math import frexp, ldexp
 
 import numpy as np
 import numpy.typing as npt
+
+# Logarithm and exponential with the same last bit on every machine.
+#
+# C libraries differ in the last bit of ``log`` and ``exp``. These use only operations that IEEE
+# 754 rounds correctly, in one fixed order; they are good to about 1e-15, which is all that is
+# needed.
+
+_SQRT_HALF = 0.7071067811865476
+_LN2_HIGH = 0.693147180369123816490
+_LN2_LOW = 1.90821492927058770002e-10
+_LOG2_E = 1.4426950408889634
+_LOG_TERMS = tuple(1.0 / k for k in range(25, 0, -2))
+_EXP_TERMS = tuple(1.0 / k for k in range(16, 0, -1))
+
+
+def log(x: float) -> float:
+    """Return the natural logarithm of ``x > 0``, by the series of the inverse tanh."""
+    fraction, exponent = frexp(x)
+    if fraction < _SQRT_HALF:
+        fraction *= 2.0
+        exponent -= 1
+    s = (fraction - 1.0) / (fraction + 1.0)
+    square = s * s
+    total = 0.0
+    for coefficient in _LOG_TERMS:
+        total = total * square + coefficient
+    return exponent * _LN2_HIGH + (2.0 * s * total + exponent * _LN2_LOW)
+
+
+def exp(x: float) -> float:
+    """Return e to the power of ``x`` (|x| up to 700), by Taylor's series of what is left of it."""
+    exponent = int(x * _LOG2_E + (0.5 if x >= 0.0 else -0.5))
+    rest = (x - exponent * _LN2_HIGH) - exponent * _LN2_LOW
+    total = 1.0
+    for reciprocal in _EXP_TERMS:
+        total = 1.0 + rest * reciprocal * total
+    return ldexp(total, exponent)
+
 
 _BLOCK_BYTES = 8 * 64
 _BLOCKS_MAX = 8
@@ -67,3 +109,75 @@ class Stream:
             blocks = min(2 * blocks, _BLOCKS_MAX)
             bits = np.frombuffer(b"".join(digests), dtype="<u8").astype(np.uint64)
             yield (bits >> np.uint64(12) | _ONE).view(np.float64) - _LESS
+
+
+# A clock that is wrong: offset, drift, and jumps that are given or drawn.
+
+
+@dataclass(frozen=True, slots=True)
+class ClockModel:
+    """What is wrong with a clock. Times are nanoseconds; those of jumps count from the start.
+
+    ``random_every_ns`` is the mean time between random jumps (0: none), uniform up to
+    ``random_most_ns`` in both directions.
+    """
+
+    offset_ns: int = 0
+    drift: Fraction = Fraction(0)
+    jumps: tuple[tuple[int, int], ...] = ()
+    random_every_ns: int = 0
+    random_most_ns: int = 0
+
+
+class WrongClock:
+    """What one node's clock shows. Exact: no floats take part after the draws."""
+
+    def __init__(self, model: ClockModel, stream: Stream, start_ns: int) -> None:
+        self._model = model
+        self._start_ns = start_ns
+        self._given_at = [at_ns for at_ns, _ in model.jumps]
+        self._given_sum = _sums([by_ns for _, by_ns in model.jumps])
+        self._uniform = stream.uniform
+        self._drawn_at: list[int] = []
+        self._drawn_sum = [0]
+        self._drawn_until_ns = 0
+        self._told = 0
+
+    def shows(self, now_ns: int) -> int:
+        """Return what the clock shows at simulated time ``now_ns``."""
+        model = self._model
+        since_ns = now_ns - self._start_ns
+        drift_ns = since_ns * model.drift.numerator // model.drift.denominator
+        wrong_ns = model.offset_ns + drift_ns
+        wrong_ns += self._given_sum[bisect_right(self._given_at, since_ns)]
+        if model.random_every_ns:
+            self._draw_until(since_ns)
+            wrong_ns += self._drawn_sum[bisect_right(self._drawn_at, since_ns)]
+        return max(now_ns + wrong_ns, 0)
+
+    def set_since(self, now_ns: int) -> int:
+        """Return by how much random jumps have set the clock since this was last asked."""
+        if not self._model.random_every_ns:
+            return 0
+        since_ns = now_ns - self._start_ns
+        self._draw_until(since_ns)
+        count = max(bisect_right(self._drawn_at, since_ns), self._told)
+        before, self._told = self._told, count
+        return self._drawn_sum[count] - self._drawn_sum[before]
+
+    def _draw_until(self, since_ns: int) -> None:
+        """Draw the jumps up to a time: gaps are exponential."""
+        model = self._model
+        while self._drawn_until_ns <= since_ns:
+            gap_ns = int(-log(self._uniform()) * model.random_every_ns) + 1
+            size_ns = int((2.0 * self._uniform() - 1.0) * model.random_most_ns)
+            self._drawn_until_ns += gap_ns
+            self._drawn_at.append(self._drawn_until_ns)
+            self._drawn_sum.append(self._drawn_sum[-1] + size_ns)
+
+
+def _sums(values: Sequence[int]) -> list[int]:
+    sums = [0]
+    for value in values:
+        sums.append(sums[-1] + value)
+    return sums

@@ -13,10 +13,9 @@ from heapq import heappop
 from typing import Any
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.loop.choices import Choices
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
-from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy
-from rsltrace.simulation.loop.timer import TimerState
+from rsltrace.simulation.loop.policy import Candidate, Choices, Fifo, Moment, Policy
+from rsltrace.simulation.loop.timer_queue import TimerState
 
 
 @dataclass(eq=False)

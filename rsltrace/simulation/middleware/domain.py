@@ -15,17 +15,17 @@ from rsltrace.simulation.middleware.events.failure import FailuresEndTheRun
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.simulation.middleware.publisher import Publisher
-from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Qos
-from rsltrace.simulation.middleware.services import Client, Service
-from rsltrace.simulation.middleware.subscription import Subscription
-from rsltrace.simulation.middleware.timer import Timer
-from rsltrace.simulation.middleware.transport import (
+from rsltrace.simulation.middleware.publisher import (
     MessageFilter,
+    Publisher,
     TopicObservers,
     Transport,
     Watcher,
 )
+from rsltrace.simulation.middleware.qos.policies import DEFAULT_QOS, Qos
+from rsltrace.simulation.middleware.services import Client, Service
+from rsltrace.simulation.middleware.subscription import Subscription
+from rsltrace.simulation.middleware.timer import Timer
 
 
 class Domain:

@@ -2,8 +2,132 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import partial
+from pathlib import PurePath
+from types import CodeType, CoroutineType, FunctionType, MethodType
+
+# Single messages that go wrong, by their number on a topic: lost, late, or twice.
+
+
+@dataclass(frozen=True, slots=True)
+class MessageFault:
+    """What becomes of message ``number`` (from 1) of a topic on its way to the nodes that the glob
+    ``to`` fits: it is lost if ``is_lost``, ``late_ns`` late, and comes again ``copy_ns`` after that
+    (-1: once)."""
+
+    number: int
+    to: str = "*"
+    is_lost: bool = False
+    late_ns: int = 0
+    copy_ns: int = -1
+
+
+class TopicFaults:
+    """The faults of one topic. Its publishers say when they send, its links what that means for
+    them. ``reached`` is how many messages there have been."""
+
+    def __init__(self, faults: Sequence[MessageFault]) -> None:
+        self._by_number: dict[int, list[MessageFault]] = {}
+        self.reached = 0
+        self._present: list[MessageFault] = []
+        self.add(faults)
+
+    def add(self, faults: Sequence[MessageFault]) -> None:
+        """Have more of them, of messages that are yet to come."""
+        for fault in faults:
+            self._by_number.setdefault(fault.number, []).append(fault)
+
+    def begin(self) -> None:
+        """Take note that the next message is about to be sent to everybody."""
+        self.reached += 1
+        self._present = self._by_number.get(self.reached, [])
+
+    def end(self) -> None:
+        """Take note that it has been: what is sent to single ones is an older message."""
+        self._present = []
+
+    def for_node(self, name: str) -> MessageFault | None:
+        """Return what becomes of the present message on its way to a node, None if nothing."""
+        fitting = [fault for fault in self._present if fnmatchcase(name, fault.to)]
+        if not fitting:
+            return None
+        copies = [fault.copy_ns for fault in fitting if fault.copy_ns >= 0]
+        return MessageFault(
+            self.reached,
+            name,
+            is_lost=any(fault.is_lost for fault in fitting),
+            late_ns=sum(fault.late_ns for fault in fitting),
+            copy_ns=max(copies, default=-1),
+        )
+
+
+class FaultsOfAll(dict[str, TopicFaults]):
+    """Faults of every topic that somebody asks for: there may be some later."""
+
+    def get(self, topic: str, default: object = None) -> TopicFaults:
+        """Return those of a topic, which may be none so far."""
+        return self.setdefault(topic, TopicFaults(()))
+
+
+# Where the code of a callback is: file and line, in words that hold on any machine.
+
+_WRAPPED_MAX = 50
+
+
+def source_of(callback: object) -> str:
+    """Return ``package/module.py:24`` of the function that a callback runs in the end, or "".
+
+    The line is that of ``def``, or of its first decorator. The file is named as it is imported, so
+    that traces do not differ by the folder in which they were made.
+    """
+    found = function_of(callback)
+    if found is None:
+        return ""
+    code, names = found
+    return f"{file_of(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
+
+
+def function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:
+    """Return the code that a callback runs in the end, with its module's names; None if unknown.
+
+    Goes through methods, partials, decorators and callable objects (which may answer anything).
+    """
+    for _ in range(_WRAPPED_MAX):
+        if isinstance(callback, partial):
+            callback = callback.func
+        elif isinstance(callback, MethodType):
+            callback = callback.__func__
+        elif isinstance(callback, FunctionType):
+            wrapped = callback.__dict__.get("__wrapped__")
+            if wrapped is None:
+                return callback.__code__, callback.__globals__
+            callback = wrapped
+        elif isinstance(callback, CoroutineType):
+            frame = callback.cr_frame
+            return (callback.cr_code, frame.f_globals) if frame is not None else None
+        elif isinstance(callback, type):
+            callback = callback.__init__  # type: ignore[misc]
+        else:
+            callbacks = (vars(one).get("__call__") for one in type(callback).__mro__)
+            callback = next((one for one in callbacks if one is not None), None)
+            if not isinstance(callback, FunctionType):
+                return None
+    return None
+
+
+def file_of(code: CodeType, names: Mapping[str, object]) -> str:
+    """Return a code's file as it is imported, ``package/module.py``: the same on any machine."""
+    path = PurePath(code.co_filename)
+    module = names.get("__name__")
+    if isinstance(module, str):
+        package = PurePath(*module.split("."))
+        for tail in (package.with_suffix(".py"), package / "__init__.py"):
+            if path.parts[-len(tail.parts) :] == tail.parts:
+                return tail.as_posix()
+    return path.name
 
 
 def _unknown() -> tuple[str, str]:

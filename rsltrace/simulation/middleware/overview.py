@@ -13,8 +13,8 @@ from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible_policies
 from rsltrace.simulation.middleware.qos.timing import finite
 from rsltrace.simulation.middleware.subscription import Subscription
-from rsltrace.trace.model.built_in import NODE_SERVICES, NODE_TOPICS
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.model.operation import NODE_SERVICES, NODE_TOPICS
+from rsltrace.trace.model.printable import format_duration
 
 _ACTION = "/_action/"
 _CLOCK = "/clock"

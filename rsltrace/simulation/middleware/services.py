@@ -6,11 +6,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.entity import Receiver, callback_name
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
+from rsltrace.simulation.middleware.publisher import Transport
 from rsltrace.simulation.middleware.qos.policies import Qos
-from rsltrace.simulation.middleware.receiver import Receiver
-from rsltrace.simulation.middleware.transport import Transport
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.model.entity import EntityKind

@@ -6,13 +6,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
+from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.qos.policies import Qos
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
 from rsltrace.simulation.middleware.qos.timing import Deadline, finite
-from rsltrace.simulation.middleware.receiver import Receiver
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.simulation.loop.timer import TimerState
+from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.trace.chain import hash64

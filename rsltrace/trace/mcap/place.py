@@ -22,7 +22,7 @@ def open_source(place: Path | str) -> ByteSource:
 
         return open_remote(place)
     if _ADDRESS_AS_PATH.match(str(place)) and not Path(place).exists():
-        from rsltrace.trace.mcap.address import public
+        from rsltrace.trace.mcap.source import public
 
         address = public(str(place).replace(":/", "://", 1))
         raise TraceError(f"{address} is an address, which only `rsltrace diff` reads; download it")

@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from rsltrace.errors import SetupError, TraceError
-from rsltrace.trace.mcap import limits
-from rsltrace.trace.mcap.address import public, without_secrets
-from rsltrace.trace.mcap.source import beyond_end
+from rsltrace.trace.mcap import records as limits
+from rsltrace.trace.mcap.source import beyond_end, public, without_secrets
 
 T = TypeVar("T")
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from rsltrace.trace.mcap.checksum import crc32
-from rsltrace.trace.mcap.limits import SUMMARY_BYTES_MAX
 from rsltrace.trace.mcap.records import (
     MAGIC,
     RECORD_HEAD,
+    SUMMARY_BYTES_MAX,
     Channel,
     ChunkIndex,
     CutOff,

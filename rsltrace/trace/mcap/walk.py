@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from mcap.opcode import Opcode
 
-from rsltrace.trace.mcap.limits import RECORD_BYTES_MAX
-from rsltrace.trace.mcap.records import MAGIC, RECORD_HEAD, Damaged, Fields, Span
+from rsltrace.trace.mcap.records import MAGIC, RECORD_BYTES_MAX, RECORD_HEAD, Damaged, Fields, Span
 from rsltrace.trace.mcap.source import ByteSource
 
 _BLOCK_BYTES = 1 << 20

@@ -2,9 +2,75 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import json
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+
+from rsltrace.trace.model.printable import printable
+
+# Functions of rclpy that no simulation calls, because the loop does their work itself.
+#
+# Whoever replaces one (a monitoring library, say) waits in vain: a run tells of it, and so does
+# ``audit``.
+
+_TAKES = (
+    *("_take_timer", "_take_subscription", "_take_client", "_take_service"),
+    *("_take_guard_condition", "_take_waitable", "_make_handler", "can_execute"),
+    "_wait_for_ready_callbacks",
+)
+EXECUTOR = "rclpy.executors.Executor"
+_GROUP = ("can_execute", "beginning_execution", "ending_execution")
+
+NEVER_CALLED: dict[str, tuple[str, ...]] = {
+    **dict.fromkeys(
+        (
+            EXECUTOR,
+            "rclpy.executors.SingleThreadedExecutor",
+            "rclpy.executors.MultiThreadedExecutor",
+        ),
+        _TAKES,
+    ),
+    "rclpy.callback_groups.MutuallyExclusiveCallbackGroup": _GROUP,
+    "rclpy.callback_groups.ReentrantCallbackGroup": _GROUP,
+}
+"""The methods by the names of their classes. A subclass of a callback group is asked, and so is an
+executor's ``wait_for_ready_callbacks``."""
+
+
+# Calls that waited until the end of a run, as a trace keeps them.
+
+_KEPT = 10
+_HELD_KEPT = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class EndlessWait:
+    """A call that waited until the end of a run and that no time would have ended: since when (ns),
+    who waited for what, and the ids of the entities it ``held`` back meanwhile."""
+
+    since_ns: int
+    text: str
+    held: tuple[int, ...] = ()
+
+
+def kept_waits(waits: Iterable[EndlessWait]) -> dict[str, str]:
+    """Return what the result of a run says of its waits."""
+    kept = [(one.since_ns, one.text, one.held[:_HELD_KEPT]) for one in waits][:_KEPT]
+    return {"waits": json.dumps(kept)} if kept else {}
+
+
+def waits_of(result: Mapping[str, str]) -> list[EndlessWait]:
+    """Return the waits of a result, each in one line; none if they were not written by us."""
+    try:
+        return [
+            EndlessWait(
+                int(since), printable(" ".join(str(text).split())), tuple(int(one) for one in held)
+            )
+            for since, text, held in json.loads(result.get("waits", "[]"))
+        ]
+    except (ValueError, TypeError):
+        return []
 
 
 class Source(str, Enum):

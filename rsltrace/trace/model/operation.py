@@ -2,7 +2,50 @@
 
 from __future__ import annotations
 
+import re
 import struct
+
+from rsltrace.trace.model.entity import Entity, EntityKind
+
+# What rclpy makes for every node: most entities of most runs, and hardly ever of interest.
+
+NODE_TOPICS = frozenset(("/rosout", "/parameter_events"))
+NODE_SERVICES = frozenset(
+    (
+        "describe_parameters",
+        "get_parameter_types",
+        "get_parameters",
+        "get_type_description",
+        "list_parameters",
+        "set_parameters",
+        "set_parameters_atomically",
+    )
+)
+
+
+def is_built_in(entity: Entity) -> bool:
+    """Whether rclpy made ``entity`` without being asked: publishers of log and parameter events,
+    and the parameter services."""
+    if entity.kind is EntityKind.PUBLISHER:
+        return entity.name in NODE_TOPICS
+    return entity.kind is EntityKind.SERVICE and entity.name.rpartition("/")[2] in NODE_SERVICES
+
+
+# How deep brackets are nested in a text: YAML parsers take time with the square of it.
+
+NESTING_MAX = 100
+_BRACKETS = re.compile(r"[][{}]")
+
+
+def nested_too_deep(text: str) -> int:
+    """Return where brackets are nested more than ``NESTING_MAX`` deep, -1 if nowhere."""
+    depth = 0
+    for found in _BRACKETS.finditer(text):
+        depth = depth + 1 if found[0] in "[{" else max(depth - 1, 0)
+        if depth > NESTING_MAX:
+            return found.start()
+    return -1
+
 
 TIMER_CANCEL = 1
 TIMER_RESET = 2

@@ -2,22 +2,65 @@
 
 from __future__ import annotations
 
+import sqlite3
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from urllib.parse import quote
 
 from rsltrace.errors import BagError
-from rsltrace.trace.mcap.limits import FILE_BYTES_MIN, FILE_GROWTH_MAX
+from rsltrace.trace.mcap.records import FILE_BYTES_MIN, FILE_GROWTH_MAX
 from rsltrace.trace.mcap.records import MAGIC as MCAP_MAGIC
+from rsltrace.trace.model.printable import format_seconds
 from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.recordings.mcap_file import McapFile
 from rsltrace.trace.recordings.metadata import NAME, read_metadata
 from rsltrace.trace.recordings.sqlite_file import MAGIC as SQLITE_MAGIC
 from rsltrace.trace.recordings.sqlite_file import SqliteFile
-from rsltrace.trace.recordings.sqlite_recover import recover_database
-from rsltrace.trace.recordings.storage import Storage
-from rsltrace.trace.recordings.topic import BagQos
+from rsltrace.trace.recordings.topic import BagQos, Storage
+
+# What can be read of a database that was cut off: copied, row by row, into a whole one.
+#
+# Rows are taken in the order they were written, so what is lost is the end of the recording.
+
+_TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
+
+
+def recover_database(path: Path, target: Path) -> str:
+    """Copy what is readable of ``path`` to ``target``; return how much it is, or nothing."""
+    messages, end_ns = 0, 0
+    source = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+    copy = sqlite3.connect(target)
+    try:
+        # Without this, sqlite refuses a file that is shorter than its header says.
+        source.execute("PRAGMA writable_schema = ON")
+        for table in _TABLES:
+            row = source.execute(
+                "SELECT sql FROM sqlite_master WHERE type = 'table' AND name = ?", (table,)
+            ).fetchone()
+            if row is None:
+                continue
+            copy.execute(row[0])
+            try:
+                for values in source.execute(f"SELECT * FROM {table} NOT INDEXED ORDER BY rowid"):
+                    marks = ", ".join("?" * len(values))
+                    copy.execute(f"INSERT INTO {table} VALUES ({marks})", values)
+            except (sqlite3.Error, UnicodeDecodeError, OverflowError):
+                if table != "messages":
+                    raise  # without the topics, nothing plays
+        copy.execute("CREATE INDEX timestamp_idx ON messages (timestamp ASC)")
+        copy.commit()
+        ((messages, end_ns),) = copy.execute("SELECT COUNT(*), MAX(timestamp) FROM messages")
+    except (sqlite3.Error, UnicodeDecodeError, OverflowError):
+        return ""
+    finally:
+        source.close()
+        copy.close()
+    if not messages or not isinstance(end_ns, int):
+        return ""
+    return f"the first {messages} messages, up to log time {format_seconds(end_ns)},"
+
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

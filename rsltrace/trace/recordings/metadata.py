@@ -8,10 +8,9 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from rsltrace.errors import BagError
-from rsltrace.trace.mcap.limits import METADATA_YAML_BYTES_MAX
-from rsltrace.trace.model.nesting import nested_too_deep
-from rsltrace.trace.recordings.qos import parse_qos
-from rsltrace.trace.recordings.topic import BagQos
+from rsltrace.trace.mcap.records import METADATA_YAML_BYTES_MAX
+from rsltrace.trace.model.operation import nested_too_deep
+from rsltrace.trace.recordings.topic import BagQos, parse_qos
 
 NAME = "metadata.yaml"
 _RECORDING = re.compile(r"\.(mcap|db3)(\.zstd)?$")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from functools import cached_property, partial
 from itertools import takewhile
 from pathlib import Path
@@ -12,13 +14,43 @@ from types import TracebackType
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
-from rsltrace.trace.mcap.limits import MESSAGE_BYTES_MAX
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX
+from rsltrace.trace.model.printable import format_duration
 from rsltrace.trace.recordings.files import ZSTD_MAGIC, BagFiles, open_files
 from rsltrace.trace.recordings.merge import Message, Piece, merge
-from rsltrace.trace.recordings.select import select_topics, unmatched
-from rsltrace.trace.recordings.storage import Extent, Storage, StoredTopic
-from rsltrace.trace.recordings.topic import BagTopic
+from rsltrace.trace.recordings.topic import BagTopic, Extent, Storage, StoredTopic
+
+# Which topics of a bag play: shell globs over their names.
+
+
+def select_topics(
+    names: Sequence[str], topics: Sequence[str], exclude: Sequence[str], bag: str
+) -> set[str]:
+    """Return the names that match one of ``topics`` (none given: all) and none of ``exclude``.
+
+    ``*`` matches ``/`` too. Raises ``BagError`` listing the topics there are when a glob of
+    ``topics`` matches nothing, or nothing is left.
+    """
+    there_are = f"the bag has {', '.join(sorted(set(names))) or 'no topics'}"
+    for glob in unmatched(topics, names):
+        close = difflib.get_close_matches(glob, names, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else there_are
+        raise BagError(f"{bag}: no topic matches {glob!r}: {hint}", glob=glob)
+    selected = {
+        name
+        for name in names
+        if (not topics or any(fnmatchcase(name, glob) for glob in topics))
+        and not any(fnmatchcase(name, glob) for glob in exclude)
+    }
+    if not selected:
+        raise BagError(f"{bag}: every topic is excluded: {there_are}")
+    return selected
+
+
+def unmatched(globs: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the globs that match none of the names."""
+    return tuple(g for g in globs if not any(fnmatchcase(name, g) for name in names))
+
 
 STAMP_NS_MAX = 2**63 - 1
 

@@ -14,8 +14,7 @@ from urllib.parse import quote
 
 from rsltrace.errors import BagError
 from rsltrace.trace.recordings.merge import Message
-from rsltrace.trace.recordings.qos import parse_qos
-from rsltrace.trace.recordings.storage import Extent, StoredTopic
+from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
 
 MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100

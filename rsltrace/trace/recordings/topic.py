@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Protocol
+
+from rsltrace.trace.model.operation import nested_too_deep
+from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.recordings.merge import Message
 
 DURATION_INFINITE_NS = 2**63 - 1
 """A QoS duration without end, as ROS 2 writes it."""
@@ -52,3 +59,154 @@ class BagTopic:
         """What all recorded publishers offered alike, or ``None`` when unknown or at odds."""
         distinct = set(self.offered_qos)
         return next(iter(distinct)) if len(distinct) == 1 else None
+
+
+# Reading ``offered_qos_profiles``, whose form has changed with rosbag2's versions.
+#
+# It is a YAML text (in storage files, and in metadata.yaml up to version 8) or a list already
+# parsed (metadata.yaml from version 9); policies are numbers (up to version 8) or words.
+
+# In the order of the enumerations in rmw/types.h.
+HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
+RELIABILITY = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+DURABILITY = ("system_default", "transient_local", "volatile", "unknown", "best_available")
+LIVELINESS = (
+    "system_default",
+    "automatic",
+    "manual_by_node",
+    "manual_by_topic",
+    "unknown",
+    "best_available",
+)
+
+# How DDS, and ROS 2 until Galactic, wrote a duration without end.
+_DDS_INFINITE = (0x7FFFFFFF, 0xFFFFFFFF)
+
+
+def parse_qos(profiles: object) -> tuple[BagQos, ...]:
+    """Return the profiles in a YAML text or parsed list. Raises ``ValueError`` when it is neither.
+
+    What a profile leaves out is "unknown" or 0, as for a publisher that did not say.
+    """
+    if isinstance(profiles, str):
+        return _parse_text(profiles)
+    if profiles is None:
+        return ()
+    if not isinstance(profiles, list):
+        raise ValueError(f"a list of QoS profiles was expected, not {profiles!r}")
+    return tuple(_profile(item) for item in profiles)
+
+
+# A recording repeats the same few texts for its many topics, and parsing YAML is slow.
+@lru_cache(maxsize=256)
+def _parse_text(text: str) -> tuple[BagQos, ...]:
+    if not text.strip():
+        return ()
+    if nested_too_deep(text) >= 0:
+        raise ValueError("the QoS profiles are nested too deeply")
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        value = YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, RecursionError) as error:
+        raise ValueError(f"the QoS profiles are not YAML: {error}") from None
+    if isinstance(value, str):
+        raise ValueError(f"a list of QoS profiles was expected, not {value!r}")
+    return parse_qos(value)
+
+
+def _profile(item: object) -> BagQos:
+    if not isinstance(item, dict):
+        raise ValueError(f"a QoS profile was expected, not {item!r}")
+    depth = item.get("depth", 0)
+    return BagQos(
+        history=_policy(item.get("history"), HISTORY),
+        depth=depth if isinstance(depth, int) else 0,
+        reliability=_policy(item.get("reliability"), RELIABILITY),
+        durability=_policy(item.get("durability"), DURABILITY),
+        deadline_ns=_duration_ns(item.get("deadline")),
+        lifespan_ns=_duration_ns(item.get("lifespan")),
+        liveliness=_policy(item.get("liveliness"), LIVELINESS),
+        liveliness_lease_duration_ns=_duration_ns(item.get("liveliness_lease_duration")),
+        avoid_ros_namespace_conventions=item.get("avoid_ros_namespace_conventions") is True,
+    )
+
+
+def _policy(value: object, words: tuple[str, ...]) -> str:
+    if isinstance(value, int) and 0 <= value < len(words):
+        return words[value]
+    if isinstance(value, str) and value.lower() in words:
+        return value.lower()
+    return "unknown"
+
+
+def _duration_ns(value: Any) -> int:
+    if not isinstance(value, dict):
+        return 0
+    sec, nsec = value.get("sec", 0), value.get("nsec", 0)
+    if not isinstance(sec, int) or not isinstance(nsec, int):
+        return 0
+    if (sec, nsec) == _DDS_INFINITE:
+        return DURATION_INFINITE_NS
+    return min(max(sec * NS_PER_S + nsec, 0), DURATION_INFINITE_NS)
+
+
+# What a bag needs from a storage format: one file of it, as topics and pieces.
+
+
+@dataclass(frozen=True, slots=True)
+class StoredTopic:
+    """A topic (in MCAP: a channel) of one storage file; ``id`` is the file's own."""
+
+    id: int
+    name: str
+    type_name: str
+    serialization_format: str
+    offered_qos: tuple[BagQos, ...]
+    message_count: int
+    schema_text: str | None
+    schema_encoding: str
+    type_hash: str
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """A part of a storage file that is read as one: its place and the times it may hold."""
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+
+
+class Storage(Protocol):
+    """One open storage file. Every method raises ``BagError`` naming the file.
+
+    ``wanted`` maps the file's topic ids to the indices given to messages; messages before
+    ``first_ns`` are left out.
+    """
+
+    topics: list[StoredTopic]
+    message_count: int
+    start_ns: int
+    end_ns: int
+    cut_off: str
+    """What is left of a file that was cut off, in words; empty for a whole one."""
+    with_publish_time: bool
+    """Set it to get the publish time in front of each message: 8 bytes, little-endian."""
+
+    def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
+        """Return the parts that may hold wanted messages, in file order."""
+
+    def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
+        """Yield the wanted messages of a part in time order, equal times in file order."""
+
+    def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
+        """Return how many wanted messages there are."""
+
+    def last_ns(self, wanted: Mapping[int, int], first_ns: int) -> int | None:
+        """Return the time of the last wanted message."""
+
+    def close(self) -> None:
+        """Close the file."""

@@ -11,13 +11,13 @@ import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.trace.cdr import STAND_IN_TYPE
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
-from rsltrace.trace.model.placeholders import NO_FIELD
+from rsltrace.trace.model.printable import NO_FIELD
 from rsltrace.trace.tables.rows import Labels, Source, node_names, whole_numbers
 from rsltrace.trace.tables.table import Table
-from rsltrace.trace.wide_texts import STAND_IN_TYPE
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20

@@ -6,10 +6,16 @@ import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from rsltrace.trace.model.code_line import CodeLine
-from rsltrace.trace.model.draw import is_switch
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import (
+    NO_SEQUENCE,
+    CodeLine,
+    Event,
+    EventKind,
+    Output,
+    OutputKind,
+    is_switch,
+)
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.logs import log_record
 

@@ -4,9 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.printable import printable
+
+# Names and levels as people type them, in filters and in breakpoints.
+
+LOG_LEVELS = {"debug": 10, "info": 20, "warn": 30, "warning": 30, "error": 40, "fatal": 50}
+
+
+def is_named(pattern: str, name: str) -> bool:
+    """Whether a name is meant: a glob matches it whole, ``/x`` is it, ``x`` is contained in it."""
+    if any(c in pattern for c in "*?["):
+        return fnmatchcase(name, pattern)
+    if pattern.startswith("/"):
+        return name == pattern
+    return pattern.casefold() in name.casefold()
+
 
 RUN_NAME = "(run)"
 """Stands for a node where something belongs to the run itself."""

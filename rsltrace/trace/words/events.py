@@ -2,18 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import groupby
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.built_in import is_built_in
-from rsltrace.trace.model.draw import draw_text, is_switch
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind, draw_text, is_switch
+from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.printable import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityNames
+from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.logs import log_record
-from rsltrace.trace.words.outputs import counted, output_text
+
+# What an output is, in a few words, as far as its record tells: without its payload.
+
+_NAMELESS = frozenset((OutputKind.LOG, OutputKind.EXCEPTION, OutputKind.SHUTDOWN))
+"""Kinds of which one says what, not of whom: the event's node."""
+
+
+def output_text(kind: int, name: str, entity_kind: str) -> str:
+    """Return ``/odom``, ``call /plan``, ``reply /plan``, ``new publisher /map``, ``log``, …
+
+    ``name`` and ``entity_kind`` are those of the entity that the output belongs to.
+    """
+    if kind == OutputKind.MESSAGE:
+        return name
+    if kind == OutputKind.REQUEST:
+        return f"call {name}"
+    if kind == OutputKind.RESPONSE:
+        return f"reply {name}"
+    if kind == OutputKind.ENTITY:
+        return f"new {entity_kind} {name}".rstrip()
+    if kind in _NAMELESS:
+        return kind_label(OutputKind, kind)
+    return f"{kind_label(OutputKind, kind)} {name}".rstrip()
+
+
+def counted(texts: Iterable[str]) -> Iterator[str]:
+    """Yield texts; of equal ones next to each other, one and how many: ``/odom ×3``."""
+    for text, same in groupby(texts):
+        count = sum(1 for _ in same)
+        yield text if count == 1 else f"{text} ×{count}"
+
 
 _WITHOUT_DETAIL = frozenset(
     (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.ENTITY)

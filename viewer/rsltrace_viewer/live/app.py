@@ -8,18 +8,50 @@ from typing import Any, ClassVar, TypeVar
 
 from textual.app import ComposeResult
 from textual.binding import Binding
+from textual.content import Content
+from textual.widgets import Static
 from textual.worker import get_current_worker
 
+from rsltrace.debug.checkpoints import Breakpoint
 from rsltrace.debug.client import DebugSession
-from rsltrace.debug.positions import Breakpoint
 from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, Stop, Superseded
-from rsltrace_viewer.live.panels import BreakpointsPanel
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import LIVE_KEYS
-from rsltrace_viewer.terminal.screens.pick import PickScreen
+from rsltrace_viewer.terminal.screens.report import PickScreen
 from rsltrace_viewer.terminal.widgets.prompt import Prompt, Question
+
+# What a live screen has besides: the breakpoints.
+
+_SHOWN_MAX = 4
+
+
+class BreakpointsPanel(Static):
+    """The breakpoints, and which of them has stopped the run."""
+
+    DEFAULT_CSS = """
+    BreakpointsPanel { height: auto; background: $surface; border-top: solid $panel; padding: 0 1;
+                  border-title-color: $text-muted; }
+    """
+
+    def show(self, found: Sequence[Breakpoint], hit: int | None) -> None:
+        """Show breakpoints; ``hit`` is the number of the one at which the run stands."""
+        self.border_title = "breakpoints"
+        if not found:
+            self.update(Content.styled("none: B sets one, as in /odom: twist.x > 3", "$text-muted"))
+            return
+        first = max(len(found) - _SHOWN_MAX, 0)
+        lines = []
+        for one in found[first:]:
+            sign = "▶" if one.number == hit else "●"
+            style = "bold $text-error" if one.number == hit else ""
+            lines.append(Content.styled(printable(f"{sign} {one.number}  {one.text}"), style))
+        if first:
+            lines[0] = Content.styled(f"… {first + 1} more", "$text-muted")
+        self.update(Content("\n").join(lines))
+
 
 T = TypeVar("T")
 

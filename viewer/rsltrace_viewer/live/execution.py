@@ -12,8 +12,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+from rsltrace.debug.checkpoints import Breakpoint, Stopped
 from rsltrace.debug.client import DebugSession
-from rsltrace.debug.positions import Breakpoint, Stopped
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import Source

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.live.execution import Executed
-from rsltrace_viewer.model.inspector.lines import Line, Role
+from rsltrace_viewer.model.inspector.message_tree import Line, Role
 from rsltrace_viewer.session import Session
 
 

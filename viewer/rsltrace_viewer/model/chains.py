@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.checks.latency.figures import Figures
+from rsltrace.checks.latency.instances import Figures
 from rsltrace.checks.latency.measure import Latencies, measuring
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import RsltraceError, TraceError

@@ -11,8 +11,7 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.view import Ints, View
-from rsltrace_viewer.model.windows import Window
+from rsltrace_viewer.model.view import Ints, View, Window
 
 
 class Comparison:

@@ -2,19 +2,79 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.model.printable import printable
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.model.printable import format_duration, printable
 from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings import open_bag
 from rsltrace.trace.recordings.metadata import NAME as METADATA
+
+# Where one has been, to go back and forward through, and the events one marked.
+#
+# Events, not places: these change as two runs are aligned, and with which run is shown.
+
+Event = tuple[bool, int]
+"""An event: whether it is of run b, and its index."""
+
+_KEPT = 500
+
+
+class History:
+    """Events visited. Going somewhere new after going back drops what lay ahead, as in browsers."""
+
+    def __init__(self) -> None:
+        self._back: list[Event] = []
+        self._ahead: list[Event] = []
+
+    def leave(self, event: Event) -> None:
+        """Remember ``event`` before jumping away from it."""
+        if not self._back or self._back[-1] != event:
+            self._back.append(event)
+            del self._back[:-_KEPT]
+        self._ahead.clear()
+
+    def back(self, event: Event) -> Event | None:
+        """Return where to go back to from ``event``; None at the beginning."""
+        while self._back and self._back[-1] == event:
+            self._back.pop()
+        if not self._back:
+            return None
+        self._ahead.append(event)
+        return self._back.pop()
+
+    def forward(self, event: Event) -> Event | None:
+        """Return where one came back from; None if there is nothing ahead."""
+        if not self._ahead:
+            return None
+        self._back.append(event)
+        return self._ahead.pop()
+
+
+class Marks:
+    """Marked events. A row of two runs is marked with all events in it."""
+
+    def __init__(self) -> None:
+        self.events: set[Event] = set()
+
+    def of(self, row: Iterable[Event]) -> bool:
+        """Return whether an event of a row is marked."""
+        return bool(self.events) and not self.events.isdisjoint(row)
+
+    def toggle(self, row: Iterable[Event]) -> bool:
+        """Set or remove the mark of a row; return whether it is set now."""
+        row = set(row)
+        if self.of(row):
+            self.events -= row
+            return False
+        self.events |= row
+        return True
+
 
 _LOOKED_AT_MAX = 200
 _OPENED_BYTES_MAX = 64 << 20

@@ -19,8 +19,7 @@ from rsltrace.trace.model.event import EventFlag, EventKind
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.model.lanes import KIND_LETTERS, Counted, Lettered
 from rsltrace_viewer.model.run import Run, Segment
-from rsltrace_viewer.model.steady import Floats, ends_of, spread
-from rsltrace_viewer.model.windows import Window, step_below, step_from
+from rsltrace_viewer.model.view import Floats, Window, ends_of, spread, step_below, step_from
 
 _EXACT_SEGMENTS = 6
 _PIECES_MAX = 32

@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.lanes import Lanes, drawn, lettered
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.view import View
-from rsltrace_viewer.model.windows import Window
+from rsltrace_viewer.model.view import View, Window
 
 
 class LaneWindow:

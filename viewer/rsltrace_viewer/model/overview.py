@@ -9,14 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.counts import Series
-from rsltrace.trace.model.built_in import is_built_in
-from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.trace.contents import Series
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import Draw, EventFlag, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.logs import LEVEL_WARN
-from rsltrace.trace.words.silent_topics import silent_topics
+from rsltrace.trace.words.logs import LEVEL_WARN, silent_topics
 from rsltrace_viewer.model.logs import Logs
 from rsltrace_viewer.model.run import Run, Segment
 

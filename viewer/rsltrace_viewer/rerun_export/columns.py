@@ -6,8 +6,8 @@ them here keeps texts as Arrow arrays all the way, which its own column helpers 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,8 +16,36 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
+from rsltrace_viewer.rerun_export.moments import join
+
 if TYPE_CHECKING:
     from rerun import ComponentDescriptor
+
+# Colours: by topic in one run; by run, with shades by topic, in two; neutral for lanes, so that
+# red and green are left to what differs and what agrees.
+#
+# Blue and orange are told apart by people who do not see all colours, and on paper.
+
+_BY_TOPIC = (0x4FC3F7FF, 0xFFB74DFF, 0x81C784FF, 0xE57373FF, 0xBA68C8FF, 0xFFF176FF, 0xA1887FFF)
+_BY_RUN = {
+    "a": (0x4FA3FFFF, 0x1F6FEBFF, 0x9CCBFFFF, 0x5E7CE2FF),
+    "b": (0xFF9D3BFF, 0xE06C00FF, 0xFFC98FFF, 0xC98A2BFF),
+}
+
+
+def colour(root: str, number: int) -> int:
+    """Return the colour (0xRRGGBBAA) of topic or curve ``number`` in a run (``a``, ``b`` or "")."""
+    shades = _BY_RUN.get(root, _BY_TOPIC)
+    return shades[number % len(shades)]
+
+
+_LANES = (0x5B7083FF, 0x8296A8FF, 0x46586AFF, 0x6C7F93FF, 0x9BAAB8FF)
+
+
+def lane(number: int) -> int:
+    """Return the colour (0xRRGGBBAA) of callback ``number`` of a node."""
+    return _LANES[number % len(_LANES)]
+
 
 Column = tuple["ComponentDescriptor | str", pa.Array]
 """A component (or the name of one of ours) with its values: one per row, or a list per row."""
@@ -122,3 +150,57 @@ def vectors(values: npt.NDArray[np.floating[Any]]) -> pa.Array:
 def constant(value: Any, rows: int, kind: pa.DataType | None = None) -> pa.Array:
     """Return ``value`` in every row."""
     return pa.repeat(pa.scalar(value, type=kind), rows)
+
+
+# Coordinate frames: which there are, how they hang together, and what a view can show of them.
+#
+# A three-dimensional view shows what is connected to its frame; anything else in it is an error.
+# So there is one view per tree of frames, looking from the tree's root. With two runs every frame
+# has the run's prefix (``a/odom``), since Rerun knows frames by name wherever they are; the roots
+# of the same name are joined, so that both runs are in one picture.
+
+
+@dataclass(slots=True)
+class FrameTree:
+    """What was seen of the frames of one run, by names without the run's prefix."""
+
+    parents: dict[str, str] = field(default_factory=dict)
+    frames: dict[str, str] = field(default_factory=dict)
+    """By entity path, the frame its data is in."""
+    drawn: set[str] = field(default_factory=set)
+    """Paths at which there is something to see in three dimensions."""
+
+    def add_edge(self, parent: str, child: str) -> None:
+        """Note that a transform places ``child`` in ``parent``."""
+        if parent and child and parent != child:
+            self.parents.setdefault(child, parent)
+
+    def root_of(self, frame: str) -> str:
+        """Return the frame at the top of the tree that ``frame`` is in."""
+        seen = {frame}
+        while (parent := self.parents.get(frame)) is not None and parent not in seen:
+            seen.add(parent)
+            frame = parent
+        return frame
+
+    def by_root(self) -> dict[str, list[str]]:
+        """Return, by root frame, the paths of what is drawn in its tree; most first."""
+        result: dict[str, list[str]] = {}
+        for path, frame in self.frames.items():
+            if path in self.drawn:
+                result.setdefault(self.root_of(frame), []).append(path)
+        return dict(sorted(result.items(), key=lambda item: -len(item[1])))
+
+
+def joining_chunks(prefixes: list[str], trees: list[FrameTree]) -> Iterator[Chunk]:
+    """Yield what joins the root frames of several runs: ``a/odom`` and ``b/odom`` in ``odom``."""
+    for prefix, tree in zip(prefixes, trees, strict=True):
+        for root in tree.by_root():
+            yield from make_chunk(
+                join("frames", root or "(none)", prefix),
+                (),
+                (
+                    (rr.Transform3D.descriptor_parent_frame(), pa.array([root])),
+                    (rr.Transform3D.descriptor_child_frame(), pa.array([f"{prefix}/{root}"])),
+                ),
+            )

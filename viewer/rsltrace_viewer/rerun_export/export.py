@@ -16,10 +16,14 @@ from rsltrace.errors import OutputError
 from rsltrace.trace.model.regular_file import in_the_way
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for
-from rsltrace_viewer.rerun_export.distance import Distances, distance_chunks
-from rsltrace_viewer.rerun_export.divergence import Marks, divergence_chunks, marks_of
-from rsltrace_viewer.rerun_export.frames import joining_chunks
+from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for, joining_chunks
+from rsltrace_viewer.rerun_export.divergence import (
+    Distances,
+    Marks,
+    distance_chunks,
+    divergence_chunks,
+    marks_of,
+)
 from rsltrace_viewer.rerun_export.layout import blueprint
 from rsltrace_viewer.rerun_export.run import export_run
 from rsltrace_viewer.rerun_export.sdk import APPLICATION_ID

@@ -16,8 +16,8 @@ import rerun.blueprint as rrb
 from rerun.blueprint.api import Container, View
 
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
-from rsltrace_viewer.rerun_export.distance import Distances, Key, curve_keys
-from rsltrace_viewer.rerun_export.paths import NO_NODE
+from rsltrace_viewer.rerun_export.divergence import Distances, Key, curve_keys
+from rsltrace_viewer.rerun_export.moments import NO_NODE
 from rsltrace_viewer.rerun_export.run import Shown
 
 if TYPE_CHECKING:

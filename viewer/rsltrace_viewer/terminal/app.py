@@ -15,18 +15,15 @@ from textual.widget import Widget
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
-from rsltrace_viewer.model.history import Event
+from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
+from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import place_of_output, source_of
 from rsltrace_viewer.session import BOTH, RUN_A, RUN_B, Session
-from rsltrace_viewer.terminal.background import walk
-from rsltrace_viewer.terminal.editor import edit
-from rsltrace_viewer.terminal.follow import Follow
+from rsltrace_viewer.terminal.choose import edit, parse_index, question_of
+from rsltrace_viewer.terminal.follow import Follow, RerunFollower, walk
 from rsltrace_viewer.terminal.keys import KEYS, keys_of
-from rsltrace_viewer.terminal.questions import parse_index, question_of
-from rsltrace_viewer.terminal.rerun_follower import RerunFollower
 from rsltrace_viewer.terminal.screens.help import HelpScreen
 from rsltrace_viewer.terminal.screens.overview import Choice, OverviewScreen
 from rsltrace_viewer.terminal.shell import SHARES, WIDE

@@ -2,18 +2,130 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+import shutil
+import subprocess
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from textual.app import App, ComposeResult
+from textual.app import App, ComposeResult, SuspendNotSupported
 from textual.binding import Binding, BindingType
 from textual.content import Content
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rsltrace_viewer.model.cells import cells, fit
+from rsltrace.trace.words.phrases import parse_time_in_run
 from rsltrace_viewer.model.folder import Found
+from rsltrace_viewer.model.query.parser import completions
+from rsltrace_viewer.model.view import cells, fit
+from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.widgets.prompt import Question
+
+# What the viewer asks for, and which answers are good: a search, a filter, a time, an index.
+
+
+def question_of(kind: str, session: Session) -> Question:
+    """Return the question of a kind: ``search``, ``filter``, ``time`` or ``index``."""
+
+    def check_query(text: str) -> object:
+        return session.parse(text)
+
+    def complete(text: str) -> list[str]:
+        found = (completions(text, run) for run in session.runs.values())
+        return list(dict.fromkeys(chain.from_iterable(found)))
+
+    questions = {
+        "search": Question(
+            "search",
+            "search",
+            "a word, or node: topic: kind: text: level: … as in a filter; Enter finds the next",
+            "",
+            check_query,
+            complete,
+        ),
+        "filter": Question(
+            "filter",
+            "filter",
+            "node: topic: kind: level: time: text: …  Tab completes, empty shows all",
+            session.filter_text,
+            check_query,
+            complete,
+        ),
+        "time": Question(
+            "time",
+            "go to time",
+            "seconds after the start, or 20ms, 3us; @ and a simulated time",
+            "",
+            parse_time_in_run,
+        ),
+        "index": Question("index", "go to event", _numbers(session), "", parse_index),
+    }
+    return questions[kind]
+
+
+def _numbers(session: Session) -> str:
+    """Return which events there are: ``0 to 99``, of two runs ``a 0 to 99, b 0 to 98``."""
+    shown = session.shown.items()
+    return ", ".join(
+        f"{name + ' ' if len(shown) > 1 else ''}0 to {max(run.count - 1, 0)}" for name, run in shown
+    )
+
+
+def parse_index(text: str) -> tuple[str, int]:
+    """Return the run (``a``, ``b``; empty: not said) and the number of an event. Raises
+    ValueError."""
+    cleaned = text.strip().replace(",", "").replace("_", "").lstrip("#")
+    name = cleaned[:1].lower() if cleaned[:1].lower() in ("a", "b") else ""
+    number = cleaned[len(name) :].strip()
+    if not number.isdecimal():
+        raise ValueError(f"{text!r} is no whole number")
+    return name, int(number)
+
+
+# Opening a file in the user's editor, while the viewer waits.
+
+_COMMON = ("sensible-editor", "nano", "vim", "vi")
+_WITH_GOTO = ("code", "codium", "code-insiders", "cursor")
+_WITH_COLON = ("subl", "hx", "helix", "zed", "zeditor")
+
+
+def edit(app: App[Any], path: Path, line: int) -> str:
+    """Open ``path`` at ``line`` and wait for the editor; return what went wrong, or nothing."""
+    try:
+        editor = _editor()
+    except ValueError as error:
+        return f"$VISUAL or $EDITOR cannot be understood: {error}"
+    if not editor:
+        return "no editor: set $VISUAL or $EDITOR"
+    try:
+        with app.suspend():
+            done = subprocess.run(command(editor, path, line), check=False)
+    except SuspendNotSupported:
+        return "an editor can only be opened from a terminal"
+    except OSError as error:
+        return f"{editor[0]}: {error.strerror or error}"
+    return "" if done.returncode == 0 else f"{editor[0]} ended with {done.returncode}"
+
+
+def command(editor: list[str], path: Path, line: int) -> list[str]:
+    """Return the command that opens a file at a line in an editor, as that editor wants it."""
+    name = Path(editor[0]).name
+    if name in _WITH_GOTO:
+        return [*editor, "--goto", f"{path}:{line}"]
+    if name in _WITH_COLON:
+        return [*editor, f"{path}:{line}"]
+    return [*editor, f"+{line}", str(path)]
+
+
+def _editor() -> list[str]:
+    for name in ("VISUAL", "EDITOR"):
+        if chosen := shlex.split(os.environ.get(name, "")):
+            return chosen
+    return next(([found] for name in _COMMON if (found := shutil.which(name))), [])
+
 
 _MARK = 4
 _FRAME = 4

@@ -24,7 +24,7 @@ from rsltrace.trace.model.printable import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.source import Source, source_of
 from rsltrace_viewer.session import Session
-from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.follow import walk
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar, verdict_lines
 from rsltrace_viewer.terminal.widgets.inspector import Inspector

@@ -8,8 +8,8 @@ from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.inspector.event import summary_line
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.session import SEEK, Sought
-from rsltrace_viewer.terminal.background import walk
-from rsltrace_viewer.terminal.screens.pick import PickScreen
+from rsltrace_viewer.terminal.follow import walk
+from rsltrace_viewer.terminal.screens.report import PickScreen
 from rsltrace_viewer.terminal.shell import Shell
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 

@@ -7,11 +7,57 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions, visit_all
+from rsltrace.adapters.launch.api.basics import (
+    Action,
+    Condition,
+    LaunchContext,
+    as_substitutions,
+    visit_all,
+)
 from rsltrace.adapters.launch.api.packages import missing_package
 from rsltrace.adapters.launch.api.sources import LaunchDescriptionSource
+from rsltrace.adapters.launch.substitution import truth
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
+
+# ``launch.conditions``.
+
+
+class IfCondition(Condition):
+    """Holds if a text is true."""
+
+    def __init__(self, predicate_expression: Any) -> None:
+        expression = as_substitutions(predicate_expression)
+        super().__init__(predicate=lambda context: truth(context.text(expression)))
+
+
+class UnlessCondition(IfCondition):
+    """Holds if a text is false."""
+
+    def evaluate(self, context: LaunchContext) -> bool:
+        """Return whether it is false."""
+        return not super().evaluate(context)
+
+
+class LaunchConfigurationEquals(Condition):
+    """Holds if a launch argument has a value; None: if there is no such argument."""
+
+    def __init__(self, launch_configuration_name: str, expected_value: Any) -> None:
+        super().__init__()
+        self._name, self._expected = launch_configuration_name, expected_value
+
+    def evaluate(self, context: LaunchContext) -> bool:
+        """Return whether it has."""
+        value = context.launch_configurations.get(self._name)
+        return value == context.optional(self._expected)
+
+
+class LaunchConfigurationNotEquals(LaunchConfigurationEquals):
+    """Holds if a launch argument has another value."""
+
+    def evaluate(self, context: LaunchContext) -> bool:
+        """Return whether it has."""
+        return not super().evaluate(context)
 
 
 class IncludeLaunchDescription(Action):
@@ -133,10 +179,14 @@ class LogInfo(Action):
 
 
 __all__ = [
+    "IfCondition",
     "IncludeLaunchDescription",
+    "LaunchConfigurationEquals",
+    "LaunchConfigurationNotEquals",
     "LogInfo",
     "MissingModuleError",
     "OpaqueCoroutine",
     "OpaqueFunction",
     "TimerAction",
+    "UnlessCondition",
 ]

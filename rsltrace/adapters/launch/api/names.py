@@ -19,7 +19,6 @@ from typing import Any
 from rsltrace.adapters.launch.api import (
     actions,
     basics,
-    conditions,
     events,
     nav2,
     nodes,
@@ -28,6 +27,7 @@ from rsltrace.adapters.launch.api import (
     sources,
     substitutions,
 )
+from rsltrace.adapters.launch.api import actions as conditions
 from rsltrace.errors import JobError
 
 _ROOTS = ("launch", "launch_ros", "launch_xml", "launch_yaml", "nav2_common")

@@ -17,8 +17,8 @@ from rsltrace.adapters.launch.api.basics import (
     SubstitutionFailure,
     as_substitutions,
 )
+from rsltrace.adapters.launch.model import yaml_value
 from rsltrace.adapters.launch.substitution import truth
-from rsltrace.adapters.launch.values import yaml_value
 
 
 class _OfFile(Substitution):

@@ -16,8 +16,13 @@ from rsltrace.adapters.launch.api.basics import (
 from rsltrace.adapters.launch.api.events import later
 from rsltrace.adapters.launch.api.packages import names_missing_package
 from rsltrace.adapters.launch.api.parameters import evaluated_parameters
-from rsltrace.adapters.launch.model import LaunchedNode, Surroundings, respawning
-from rsltrace.adapters.launch.scope import absolute_namespace, full_name
+from rsltrace.adapters.launch.model import (
+    LaunchedNode,
+    Surroundings,
+    absolute_namespace,
+    full_name,
+    respawning,
+)
 from rsltrace.adapters.launch.substitution import truth
 
 _WITHOUT_MEANING = frozenset(

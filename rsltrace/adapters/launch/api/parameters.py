@@ -9,15 +9,15 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, get_args
 
-from rsltrace.adapters.launch import scope
+from rsltrace.adapters.launch import model as scope
 from rsltrace.adapters.launch.api.basics import (
     LaunchContext,
     Substitution,
     as_substitutions,
 )
 from rsltrace.adapters.launch.api.packages import missing_package
+from rsltrace.adapters.launch.model import typed, yaml_value
 from rsltrace.adapters.launch.parameter_files import parameters_for, substituted_parameters
-from rsltrace.adapters.launch.values import typed, yaml_value
 
 _SCALARS = (bool, int, float, str)
 _NUMBER = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")

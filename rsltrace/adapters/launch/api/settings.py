@@ -8,8 +8,7 @@ from typing import Any
 
 from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions
 from rsltrace.adapters.launch.api.parameters import ParameterFile, parameter_value, plain_value
-from rsltrace.adapters.launch.model import ENVIRONMENT, Argument
-from rsltrace.adapters.launch.scope import Scope, joined_namespace
+from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, Scope, joined_namespace
 from rsltrace.errors import JobError
 
 

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.goal_handle import GoalHandle
-from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, GoalService
+from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, GoalHandle, GoalService
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.adapters.rclpy.stacks.tasks import start_coroutine

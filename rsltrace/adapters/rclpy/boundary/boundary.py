@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
-from rsltrace.adapters.rclpy.actions.goal_handle import GoalHandle
+from rsltrace.adapters.rclpy.actions.parts import GoalHandle
 from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
 from rsltrace.adapters.rclpy.boundary.early_init import check_process
@@ -26,16 +26,15 @@ from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of
-from rsltrace.adapters.rclpy.handles.ros_timers import RosTimerHandle
 from rsltrace.adapters.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
     TypeDescriptionServiceHandle,
 )
-from rsltrace.adapters.rclpy.handles.timers import TimerHandle
+from rsltrace.adapters.rclpy.handles.timers import RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types

@@ -6,21 +6,27 @@ The reference ``_rclpy`` is exchanged in every loaded rclpy module and in
 
 from __future__ import annotations
 
+import importlib
+import inspect
+import os
+import re
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from functools import wraps
+from importlib.machinery import ModuleSpec
+from importlib.util import find_spec, module_from_spec
 from pathlib import Path
+from types import FrameType, ModuleType
 from typing import Any
 
+import numpy as np
+
 from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
-from rsltrace.adapters.rclpy.actions.goal_handle import GoalHandle
+from rsltrace.adapters.rclpy.actions.parts import GoalHandle
 from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.boundary.boundary import Boundary
-from rsltrace.adapters.rclpy.boundary.log_callers import quick_log_callers
-from rsltrace.adapters.rclpy.boundary.quick_id_texts import quick_id_texts
-from rsltrace.adapters.rclpy.boundary.quick_publish import quick_publish
-from rsltrace.adapters.rclpy.boundary.release import check_release
-from rsltrace.adapters.rclpy.boundary.type_support import load_type_support
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
@@ -36,6 +42,270 @@ from rsltrace.adapters.rclpy.handles.services import (
 from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
 from rsltrace.errors import SetupError, UnsupportedError
+from rsltrace.guard.guard import engage
+
+# Who logs: rclpy's logger looks for its caller at every call, here it does once per source file.
+#
+# rclpy walks up the stack with ``inspect.getframeinfo``, which reads source files, and
+# ``os.path.realpath``: half a millisecond, of which nothing but the line can be new. What it finds
+# (and so what ``once``, ``skip_first`` and throttles go by) is the same here.
+
+_FIELDS = ("function_name", "file_path", "line_number", "last_index")
+
+
+@contextmanager
+def quick_log_callers() -> Iterator[None]:
+    """Let rclpy's logger find its callers quickly within the ``with`` block."""
+    from rclpy.impl import rcutils_logger
+
+    logger: Any = rcutils_logger
+    real = logger.CallerId
+    if getattr(real, "_fields", None) == _FIELDS:  # else it is of a release that is not known here
+        logger.CallerId = _log_callers_quick(logger, real)
+    try:
+        yield
+    finally:
+        logger.CallerId = real
+
+
+def _log_callers_quick(logger: Any, real: Any) -> Any:
+    """Return a ``CallerId`` that does what ``real`` does and remembers what it knows of files."""
+    internal: list[str] = []
+    """What was in rclpy's list of its own files when ``places`` was made; others may add theirs."""
+    places: dict[str, str | None] = {}
+    """Absolute paths by the names in code objects; None for files of rclpy's logging."""
+    make = tuple.__new__
+
+    def place_of(frame: FrameType) -> str | None:
+        with engage(None):  # the logger's look at source files is no finding
+            path = os.path.abspath(inspect.getframeinfo(frame).filename)
+            is_internal = logger._find_caller(frame) is not frame
+        return None if is_internal else path
+
+    class CallerId(real):  # type: ignore[misc]
+        __slots__ = ()
+
+        def __new__(cls, frame: FrameType | None = None) -> Any:
+            if frame:
+                return super().__new__(cls, frame)
+            if logger._internal_callers != internal:
+                places.clear()
+                internal[:] = logger._internal_callers
+            above: FrameType | None = sys._getframe(1)
+            while above is not None:
+                code = above.f_code
+                file = code.co_filename
+                try:
+                    place = places[file]
+                except KeyError:
+                    place = place_of(above)
+                    if os.path.isabs(file):  # others depend on the working directory
+                        places[file] = place
+                if place is not None:
+                    return make(cls, (code.co_name, place, above.f_lineno, above.f_lasti))
+                above = above.f_back
+            return super().__new__(cls)  # which says what is wrong
+
+    return CallerId
+
+
+# Texts of goal ids without numpy's general formatter.
+#
+# rclpy's action server makes the text of a goal's id (sixteen octets) five times per goal, for
+# debug records that hardly anybody sees. numpy takes some 50 µs for one; the same text is made
+# here in 3.
+
+_OCTETS = 16
+_OCTET = np.dtype(np.uint8)
+_LINE_MIN = 75
+"""numpy's line width unless the user has set another: such a text fits into it."""
+_OLD_STYLE = 113
+"""Up to this number, numpy's option ``legacy`` means the style of 1.13."""
+
+
+@contextmanager
+def quick_id_texts() -> Iterator[None]:
+    """Make the texts of sixteen octets quickly within the ``with`` block."""
+    arrayprint: Any = sys.modules.get("numpy._core.arrayprint")
+    real = getattr(arrayprint, "_array2string", None)
+    if real is None:  # another numpy, which has it elsewhere: then it takes its time
+        yield
+        return
+
+    def _array2string(a: Any, options: Any, separator: str = " ", prefix: str = "") -> Any:
+        if (
+            type(a) is np.ndarray
+            and a.dtype is _OCTET
+            and a.shape == (_OCTETS,)
+            and separator == " "
+            and not prefix
+            and options["formatter"] is None
+            and options["linewidth"] >= _LINE_MIN
+            and options["threshold"] >= _OCTETS
+            and options["legacy"] > _OLD_STYLE
+        ):
+            return octets_text(a)
+        return real(a, options, separator, prefix)
+
+    arrayprint._array2string = _array2string
+    try:
+        yield
+    finally:
+        arrayprint._array2string = real
+
+
+def octets_text(octets: Any) -> str:
+    """Return what ``str`` makes of an array of octets that fits into a line."""
+    words = [str(octet) for octet in octets.tolist()]
+    width = max(map(len, words))
+    return f"[{' '.join([word.rjust(width) for word in words])}]"
+
+
+# What messages load when their type is first used, without the generator that comes with it.
+#
+# ``rosidl_generator_py`` holds the one function that messages ask for, and a generator of Python
+# code with a template engine and a parser of IDL, a tenth of what a short command takes. In a run
+# the engine would be compiled as if it were a node's library, and the parser has warnings of old
+# modules, which ``pytest -W error`` makes a node's failure. Who asks the package for the generator
+# gets it.
+
+_PACKAGE = "rosidl_generator_py"
+_LOADER = "import_type_support"
+
+
+def load_type_support() -> None:
+    """Load what messages load, now and not in a run; it may be missing where nothing needs it."""
+    with warnings.catch_warnings(), suppress(ImportError):
+        warnings.simplefilter("ignore")
+        importlib.import_module("rosidl_parser")
+        if _PACKAGE not in sys.modules:
+            spec = find_spec(_PACKAGE)
+            if spec is not None and spec.submodule_search_locations:
+                _load_in_part(spec)
+
+
+def _load_in_part(spec: ModuleSpec) -> None:
+    """Have the package with its one function; the rest is loaded when it is asked for."""
+    package = sys.modules[_PACKAGE] = module_from_spec(spec)
+    try:
+        function = getattr(importlib.import_module(f"{_PACKAGE}.{_LOADER}_impl"), _LOADER)
+    except (ImportError, AttributeError):  # not as the releases that we know
+        _load_fully(package, spec)
+        return
+    setattr(package, _LOADER, function)
+
+    def missing(name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(f"module {_PACKAGE!r} has no attribute {name!r}")
+        _load_fully(package, spec)
+        return getattr(package, name)
+
+    package.__dict__["__getattr__"] = missing
+
+
+def _load_fully(package: ModuleType, spec: ModuleSpec) -> None:
+    package.__dict__.pop("__getattr__", None)
+    assert spec.loader is not None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        spec.loader.exec_module(package)
+
+
+# Publishing without rclpy's care for C memory, of which there is none here.
+#
+# ``Publisher.publish`` puts a ``with`` around each message so that the C publisher is not freed
+# under it: a property and two more calls, which took a twelfth of an event. What it does is the
+# same here.
+
+_NAMES = {"handle", "msg_type", "_Publisher__publisher", "publish", "publish_raw"}
+"""What rclpy's own method looks up, among other things; of a release that does not, it stays."""
+
+
+@contextmanager
+def quick_publish() -> Iterator[None]:
+    """Let rclpy's publishers publish quickly within the ``with`` block."""
+    from rclpy.publisher import Publisher
+
+    kind: Any = Publisher
+    real = kind.publish
+    if not set(getattr(getattr(real, "__code__", None), "co_names", ())) >= _NAMES:
+        yield  # somebody has exchanged it, or it is of a release that is not known here
+        return
+    kind.publish = ours = _quick(real)
+    try:
+        yield
+    finally:
+        if kind.publish is ours:
+            kind.publish = real
+
+
+def _quick(real: Callable[[Any, Any], None]) -> Any:
+    """Return a method that does what ``real`` does, and leaves it what is an error."""
+
+    @wraps(real)
+    def publish(self: Any, msg: Any) -> None:
+        handle = self._Publisher__publisher
+        try:
+            is_ours = not handle.destroyed
+        except AttributeError:
+            is_ours = False  # one over DDS, in another thread of this process
+        if is_ours:
+            if isinstance(msg, self.msg_type):
+                handle.publish(msg)
+                return
+            if isinstance(msg, bytes):
+                handle.publish_raw(msg)
+                return
+        real(self, msg)
+
+    return publish
+
+
+# Whether this rclpy is one whose C-extension boundary rsltrace can stand behind.
+#
+# Each release of ROS 2 adds a few names to the boundary. One that rclpy's Python code uses and
+# that has no stand-in here would fail in the middle of a run, so it is looked for before the first
+# one.
+
+KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
+_UNUSED = {"add_to_waitset"}  # executors get no wait set here
+
+
+def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> None:
+    """Make sure that nothing rclpy uses is missing.
+
+    ``real`` is the extension, ``stand_ins`` what takes its place, ``handles`` the classes of the
+    objects it makes by their names in the extension, ``package`` the folder of rclpy's sources.
+
+    :raises SetupError: naming what is missing.
+    """
+    missing = missing_parts(real, stand_ins, handles, package)
+    if missing:
+        raise SetupError(
+            f"the rclpy in {package} is of a release of ROS 2 that this version of rsltrace cannot "
+            f"simulate: it uses {', '.join(missing)} of its C extension, for which rsltrace has no "
+            f"stand-in. It works with {KNOWN}: update rsltrace, source one of these, or install "
+            "the wheels into an environment of their own: pip install 'rsltrace[ros]'"
+        )
+
+
+def missing_parts(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> list[str]:
+    """Return what rclpy's sources use of the extension and has no stand-in, sorted."""
+    # Sources also mention names that only a type checker sees; the extension has none of those.
+    lacking = [
+        (rf"\b_rclpy\.{name}\b", name)
+        for name in dir(real)
+        if name[0].isalpha() and not hasattr(stand_ins, name)
+    ]
+    for name, handle in handles.items():
+        for method in vars(getattr(real, name, object)):
+            if method[0].isalpha() and method not in _UNUSED and not hasattr(handle, method):
+                lacking.append((rf"\.{method}\(", f"{name}.{method}"))
+    if not lacking:
+        return []
+    sources = "\n".join(path.read_text("utf-8", "replace") for path in package.rglob("*.py"))
+    return sorted(name for use, name in lacking if re.search(use, sources))
+
 
 _HANDLES: dict[str, type] = {
     "ActionClient": ActionClientHandle,

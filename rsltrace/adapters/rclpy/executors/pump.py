@@ -13,13 +13,11 @@ from dataclasses import replace
 from typing import Any
 
 from rsltrace.adapters.rclpy.executors.standby import Ran, Standby, standby_of
-from rsltrace.adapters.rclpy.handles.waitables import activate_node
+from rsltrace.adapters.rclpy.handles.wait_set import activate_node
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
 from rsltrace.adapters.rclpy.stacks.callback_groups import begin, is_busy, is_custom
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
-from rsltrace.adapters.rclpy.stacks.wait_reasons import awaited
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.middleware.graph import Graph

@@ -8,17 +8,17 @@ from typing import Any
 from rclpy.executors import Executor
 
 from rsltrace.adapters.rclpy.executors.user_executors import is_bookkeeping
-from rsltrace.adapters.rclpy.handles.waitables import (
+from rsltrace.adapters.rclpy.handles.wait_set import (
     activate_node,
     deactivate_node,
     sync_woken,
 )
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.coroutines import Resume
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.sim_event import FutureWake, SimEvent
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
 
 
 class SimExecutor(Executor):  # type: ignore[misc]

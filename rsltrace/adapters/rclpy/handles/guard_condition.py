@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind

@@ -9,6 +9,7 @@ from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.participant import QosEvent
 from rsltrace.simulation.middleware.qos.status import (
     DEADLINE_MISSED,
     INCOMPATIBLE,
@@ -17,7 +18,6 @@ from rsltrace.simulation.middleware.qos.status import (
     MATCHED,
     MESSAGE_LOST,
 )
-from rsltrace.simulation.middleware.qos_events import QosEvent
 from rsltrace.trace.model.event import EventKind
 
 _QOS_EVENT = int(EventKind.QOS_EVENT)

@@ -10,9 +10,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runners import Wait
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.recorded.polls import RecordedPoll
 
 _NS_PER_S = 1_000_000_000

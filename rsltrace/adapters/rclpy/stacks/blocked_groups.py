@@ -10,14 +10,13 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
-from rsltrace.adapters.rclpy.stacks.runners import Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.simulation.loop.ordered import OrderedLoop, Workers
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity
-from rsltrace.simulation.middleware.events.outcome import Outcome
-from rsltrace.trace.model.endless_wait import EndlessWait
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.simulation.middleware.events.event import Outcome
+from rsltrace.trace.model.finding import EndlessWait
+from rsltrace.trace.model.printable import format_duration, format_seconds
 
 _LONG_NS = 1_000_000_000
 """A shorter wait may well be over soon after the end, and is not told."""

@@ -16,8 +16,7 @@ from typing import Any, NoReturn
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks import callback_groups as groups
-from rsltrace.adapters.rclpy.stacks.runners import Patience, RunEnded, Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Patience, RunEnded, Stacks, Wait
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.event import EventFlag, EventKind

@@ -12,9 +12,8 @@ from typing import Any
 
 from rsltrace.guard.callers import is_user_file, user_frame
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.source_position import file_of, function_of
-from rsltrace.trace.model.code_line import CodeLine
-from rsltrace.trace.model.event import NO_SEQUENCE
+from rsltrace.simulation.middleware.interface import file_of, function_of
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
 
 _PLACES_MAX = 1000
 """Code may be made while a program runs, ever anew: no more places of one entity are told."""

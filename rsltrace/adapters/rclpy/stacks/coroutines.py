@@ -12,8 +12,7 @@ from functools import lru_cache
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.code_lines import Functions
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.wait_reasons import awaited
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import Runnable
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind

@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.program import Handler, Program
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+    from rsltrace.adapters.rclpy.stacks.runners import Stacks
 
 _worlds: list[Stacks] = []
 

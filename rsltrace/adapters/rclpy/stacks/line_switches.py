@@ -25,8 +25,7 @@ from greenlet import getcurrent
 from rsltrace.adapters.rclpy.stacks.blocking_calls import getpid, wait
 from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive, is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import mailbox_of
-from rsltrace.adapters.rclpy.stacks.runners import Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.errors import EXIT_RUN, RunError
 from rsltrace.guard.callers import KINDS, USER, is_in
@@ -34,9 +33,8 @@ from rsltrace.simulation.loop.ordered import OrderedLoop, Place
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
-from rsltrace.simulation.middleware.source_position import file_of
-from rsltrace.trace.model.code_line import CodeLine
-from rsltrace.trace.model.draw import Draw, encode_draw
+from rsltrace.simulation.middleware.interface import file_of
+from rsltrace.trace.model.event import CodeLine, Draw, encode_draw
 
 _OURS = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(__file__)))) + os.sep
 _CALLS_BACK = os.path.join(_OURS, "simulation", "middleware", "events", "dispatcher.py")

@@ -19,11 +19,10 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.runners import Wait
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import UnsupportedError
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
 
 _real_rlock = _thread.RLock
 

@@ -12,17 +12,16 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.error_text import exit_status
-from rsltrace.adapters.rclpy.stacks.construction import Construction
+from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.stacks.exit_handlers import run_exit_handlers
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.starts import Construction
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
-from rsltrace.trace.model.stamp import format_seconds
+from rsltrace.trace.model.printable import format_seconds
 
 _EVERY_MAIN_ENDED = "every main has ended"
 _INTERRUPTED = 130

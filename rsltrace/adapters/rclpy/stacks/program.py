@@ -20,7 +20,7 @@ from greenlet import greenlet
 
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.simulation.middleware.events.failure import Raised
-from rsltrace.simulation.middleware.source_position import source_of
+from rsltrace.simulation.middleware.interface import source_of
 from rsltrace.trace.model.entity import Entity, EntityKind
 
 _FAILURES_MAX = 16

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.runners import Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.trace.model.printable import patience_ns
 
 
 class SimEvent:

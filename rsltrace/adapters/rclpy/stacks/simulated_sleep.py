@@ -14,13 +14,13 @@ from functools import partial
 from types import SimpleNamespace
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import getpid, wait
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
-from rsltrace.guard.library_imports import present_import
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.simulation.middleware.events.event import Event
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000

@@ -7,12 +7,38 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Entry, StartRule
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.simulation.loop.loop import Release
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
+from rsltrace.simulation.middleware.events.event import Event, OutsideEvent
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.services import Service
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.model.finding import Policy
+
+# Events in which the code of a job's entry runs: its constructor, its main, its threads.
+
+
+class Construction(OutsideEvent):
+    """An event that is no entity's callback; ``entry`` is what is being constructed, or None."""
+
+    def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
+        super().__init__(describe)
+        self.entry = entry
+
+
+def policy_of(event: Event) -> Policy | None:
+    """Return the guard's policy for whoever runs, or None for the job's."""
+    if event.node is not None:
+        return getattr(event.node, "policy", None)
+    entry = entry_of(event)
+    return entry.policy if entry is not None else None
+
+
+def entry_of(event: Event) -> Entry | None:
+    """Return the entry of the job whose constructor runs, as long as it has made no node."""
+    return getattr(event.handle, "entry", None)
+
 
 STARTS = 4
 """The operation of a TASK output: what comes of it is that an entry starts."""

@@ -29,21 +29,20 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.construction import Construction
 from rsltrace.adapters.rclpy.stacks.locks import LockOfPools, SimLock, SimRLock
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Wait
+from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.starts import Construction
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
-from rsltrace.guard.library_imports import present_import
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
-from rsltrace.simulation.middleware.source_position import source_of
+from rsltrace.simulation.middleware.interface import source_of
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001

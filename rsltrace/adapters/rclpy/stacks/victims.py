@@ -13,8 +13,7 @@ from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, Spinner
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Wait
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
+from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 
 
 class Victims:

@@ -9,17 +9,228 @@ import select
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from typing import Any
+from functools import partial
+from types import FrameType
+from typing import Any, NoReturn
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.program import Program
+from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.stacks import Stacks
-from rsltrace.adapters.rclpy.terminals.curses_keys import simulated_curses
-from rsltrace.adapters.rclpy.terminals.no_terminal import NoTerminal, refuse
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
+from rsltrace.errors import UnsupportedError
+from rsltrace.guard.frames import exchange
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.trace.model.stamp import patience_ns
+from rsltrace.trace.model.printable import patience_ns
+
+# ``sys.stdin`` of those whom the job gives no terminal: reading from it is an error.
+
+_DEBUGGERS = ("bdb", "cmd", "code", "pdb", "IPython", "prompt_toolkit", "debugpy", "pydevd")
+
+
+class NoTerminal:
+    """Is the real stream to whoever drives the run, and to debuggers."""
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
+
+    @property
+    def buffer(self) -> NoTerminal:
+        """The stream of bytes below."""
+        return NoTerminal(self._real.buffer)
+
+    def read(self, *arguments: Any) -> Any:
+        """Read all, or so much."""
+        refuse("sys.stdin.read()")
+        return self._real.read(*arguments)
+
+    def readline(self, *arguments: Any) -> Any:
+        """Read a line."""
+        refuse("sys.stdin.readline()")
+        return self._real.readline(*arguments)
+
+    def readlines(self, *arguments: Any) -> Any:
+        """Read all lines."""
+        refuse("sys.stdin.readlines()")
+        return self._real.readlines(*arguments)
+
+    def __iter__(self) -> Iterator[Any]:
+        refuse("for line in sys.stdin")
+        return iter(self._real)
+
+    def __next__(self) -> Any:
+        refuse("next(sys.stdin)")
+        return next(self._real)
+
+
+def refuse(call: str) -> None:
+    """Raise ``UnsupportedError`` if a node's code reads (and no debugger in it)."""
+    stacks = simulated_stacks()
+    if stacks is None or stacks.event.handle is None or _is_debugged(sys._getframe(2)):
+        return
+    _fail(stacks, call)
+
+
+def _fail(stacks: Stacks, call: str) -> NoReturn:
+    program = stacks.programs.present
+    if program.entry is None:
+        raise UnsupportedError(
+            f"{call}: a 'node' of a job has no terminal to read from: make it a function that "
+            "spins it (main:), and give that entry what is typed: stdin: [...]"
+        )
+    raise UnsupportedError(
+        f"{call}: {program.label} reads from its terminal, and the job does not say what is typed "
+        "there: give its entry a file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
+    )
+
+
+def _is_debugged(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if str(frame.f_globals.get("__name__", "")).partition(".")[0] in _DEBUGGERS:
+            return True
+        frame = frame.f_back
+    return False
+
+
+# curses reads keys in C: who waits for one waits in simulated time before that.
+
+_READS = ("getch", "getkey", "get_wch", "getstr")
+_NS_PER_MS = 1_000_000
+_FOR_EVER = -1
+_NO_KEY = -1
+
+Asking = Callable[[], "Terminal | None"]
+"""Returns the terminal of the main whose code runs."""
+
+
+Showing = Callable[[Terminal, bool], None]
+"""Makes a terminal the main's standard output, or no longer."""
+
+
+@contextmanager
+def simulated_curses(asking: Asking, show: Showing) -> Iterator[None]:
+    """Let windows of curses wait in simulated time within the ``with`` block."""
+    try:
+        import _curses
+    except ImportError:  # Python can be built without it
+        yield
+        return
+    limits_ms: dict[int, int] = {}
+    all_ms = [_FOR_EVER]
+    limit = _curses.window.timeout
+    with ExitStack() as stack:
+        for name in _READS:
+            making = partial(_reading, asking, limits_ms, all_ms, limit)
+            exchange(stack, _curses.window, name, making)
+        exchange(stack, _curses.window, "refresh", partial(_drained, asking))
+        exchange(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
+        exchange(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
+        redirect(stack, _curses.doupdate, partial(_drained, asking))
+        redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
+        for function in (_curses.setupterm, _curses.initscr):
+            redirect(stack, function, partial(_beginning, asking, show))
+        redirect(stack, _curses.endwin, partial(_ending, asking, show))
+        yield
+
+
+def _beginning(asking: Asking, show: Showing, real: Callable[..., Any]) -> Callable[..., Any]:
+    def begin(*arguments: Any, **options: Any) -> Any:
+        terminal = asking()
+        if terminal is None:
+            refuse(f"curses.{real.__name__}()")
+        else:
+            show(terminal, True)
+        return real(*arguments, **options)
+
+    return begin
+
+
+def _ending(asking: Asking, show: Showing, real: Callable[[], Any]) -> Callable[[], Any]:
+    def end() -> Any:
+        try:
+            return real()
+        finally:
+            terminal = asking()
+            if terminal is not None:
+                terminal.drain()
+                show(terminal, False)
+
+    return end
+
+
+def _drained(asking: Asking, real: Any) -> Any:
+    """Let something be shown, which is for nobody to see."""
+
+    def shown(*arguments: Any) -> Any:
+        terminal = asking()
+        if terminal is not None:
+            terminal.drain()
+        return real(*arguments)
+
+    return shown
+
+
+def _reading(
+    asking: Asking, limits_ms: dict[int, int], all_ms: list[int], limit: Any, real: Any
+) -> Any:
+    name = real.__name__
+
+    def read(self: Any, *arguments: Any) -> Any:
+        terminal = asking()
+        if terminal is None:
+            refuse(f"curses: {name}()")
+            return real(self, *arguments)
+        terminal.drain()
+        limit_ms = limits_ms.get(id(self), all_ms[0])
+        if name != "getstr" and not terminal.offer():
+            limit(self, 0)
+            found = _taken_already(partial(real, self, *arguments))
+            limit(self, limit_ms)
+            if found is not None:
+                return found
+        if limit_ms == 0:
+            terminal.look()
+        else:
+            terminal.await_input(None if limit_ms < 0 else limit_ms * _NS_PER_MS)
+        return real(self, *arguments)
+
+    return read
+
+
+def _taken_already(get: Callable[[], Any]) -> Any:
+    """Return a key that curses has read before (of an escape sequence that means nothing to it),
+    or None."""
+    import _curses
+
+    try:
+        found = get()
+    except _curses.error:
+        return None
+    return None if found == _NO_KEY else found
+
+
+def _limiting(limits_ms: dict[int, int], to_ms: Callable[[Any], int], real: Any) -> Any:
+    def limit(self: Any, value: Any) -> Any:
+        limits_ms[id(self)] = to_ms(value)
+        return real(self, value)
+
+    return limit
+
+
+def _of_nodelay(flag: Any) -> int:
+    return 0 if flag else _FOR_EVER
+
+
+def _halving(all_ms: list[int], real: Callable[[int], Any]) -> Callable[[int], Any]:
+    def halfdelay(tenths: int, /) -> Any:
+        all_ms[0] = tenths * 100
+        return real(tenths)
+
+    return halfdelay
+
 
 _STEP_NS = 1_000_000
 _dup = copy_of(os.dup)  # type: ignore[arg-type]

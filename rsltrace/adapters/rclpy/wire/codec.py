@@ -12,10 +12,17 @@ from collections.abc import Callable
 from functools import cache, cached_property
 from typing import Any
 
-from rsltrace.adapters.rclpy.wire.cdr_layout import HEADER_PART, HEADER_PLACE, fixed_parts, lay_out
 from rsltrace.adapters.rclpy.wire.decoder_source import make_deserializer
 from rsltrace.adapters.rclpy.wire.encoder_source import make_serializer
-from rsltrace.adapters.rclpy.wire.message_spec import HEADER_VALUE, Message, message_spec
+from rsltrace.adapters.rclpy.wire.message_spec import (
+    HEADER_PART,
+    HEADER_PLACE,
+    HEADER_VALUE,
+    Message,
+    fixed_parts,
+    lay_out,
+    message_spec,
+)
 from rsltrace.adapters.rclpy.wire.source_text import packer
 
 

@@ -34,29 +34,27 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rsltrace.adapters.rclpy.wire.cdr_layout import (
+from rsltrace.adapters.rclpy.wire.checked_encoder import decode, unpack_wide
+from rsltrace.adapters.rclpy.wire.message_spec import (
+    CHECK_SLOT,
     HEADER_PART,
     HEADER_PLACE,
+    HEADER_VALUE,
     START,
+    Array,
+    FieldType,
+    Item,
+    Message,
     Part,
     Place,
+    Primitive,
+    Sequence,
+    Text,
     after_items,
     fixed_parts,
     fixed_size,
     lay_out,
     steady,
-)
-from rsltrace.adapters.rclpy.wire.checked_decoder import decode, unpack_wide
-from rsltrace.adapters.rclpy.wire.message_spec import (
-    CHECK_SLOT,
-    HEADER_VALUE,
-    Array,
-    FieldType,
-    Item,
-    Message,
-    Primitive,
-    Sequence,
-    Text,
 )
 from rsltrace.adapters.rclpy.wire.source_text import Source, packer
 

@@ -32,26 +32,24 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from rsltrace.adapters.rclpy.wire.cdr_layout import (
-    HEADER_PART,
-    START,
-    Part,
-    Place,
-    first_alignment,
-    lay_out,
-    steady,
-)
 from rsltrace.adapters.rclpy.wire.checked_encoder import encode, pack_wide
 from rsltrace.adapters.rclpy.wire.message_spec import (
     HEADER,
+    HEADER_PART,
     HEADER_VALUE,
+    START,
     Array,
     FieldType,
     Item,
     Message,
+    Part,
+    Place,
     Primitive,
     Sequence,
     Text,
+    first_alignment,
+    lay_out,
+    steady,
 )
 from rsltrace.adapters.rclpy.wire.source_text import Source, packer
 

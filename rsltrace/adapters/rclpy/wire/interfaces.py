@@ -3,18 +3,238 @@
 Nothing of ROS is imported before it is asked for.
 """
 
+from __future__ import annotations
+
+import json
+import os
+import re
+import sys
+from collections.abc import Iterator
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
 from rsltrace.adapters.rclpy.wire.interface_classes import (
     class_of,
     get_message_class,
     get_service_class,
     type_name,
 )
-from rsltrace.adapters.rclpy.wire.interface_schema import (
-    message_type,
-    schema_text,
-    service_type,
-    type_hash,
+from rsltrace.adapters.rclpy.wire.message_spec import (
+    Array,
+    FieldType,
+    Message,
+    Primitive,
+    Sequence,
+    Text,
+    message_spec,
 )
+from rsltrace.simulation.middleware.interface import MessageType, ServiceType
+
+# Finds the definition files that rosidl installs beside the classes it generates.
+#
+# ``<prefix>/share/<package>/<kind>/<Name>.msg`` (or ``.srv``, ``.action``) is what the author
+# wrote, comments and all; ``<Name>.json`` is the type description whose hash ROS 2 compares.
+
+SEPARATOR = "---"
+_SECTIONS = {
+    "msg": {"": 0},
+    "srv": {"Request": 0, "Response": 1},
+    "action": {"Goal": 0, "Result": 1, "Feedback": 2},
+}
+"""Which section of its file holds a part. Parts not listed are made by rosidl, not the author."""
+
+
+def installed_definition(name: str) -> str | None:
+    """Return the text that defines a message or a part of a service or action, as installed.
+
+    ``name`` is a full name such as ``std_srvs/srv/Trigger_Request``. None if no file defines it.
+    """
+    package, kind, type_ = name.split("/")
+    whole, _, part = type_.partition("_")
+    index = _SECTIONS[kind].get(part)
+    if index is None:
+        return None
+    path = _installed_file(package, kind, f"{whole}.{kind}")
+    if path is None:
+        return None
+    sections: list[list[str]] = [[]]
+    for line in path.read_text("utf-8", "replace").splitlines():
+        if line.rstrip() == SEPARATOR:
+            sections.append([])
+        else:
+            sections[-1].append(line.rstrip())
+    return "\n".join(sections[index]).strip("\n") if index < len(sections) else None
+
+
+def installed_type_hash(name: str) -> str | None:
+    """Return the ``RIHS01_...`` hash of an interface by its full name, or None."""
+    package, kind, type_ = name.split("/")
+    path = _installed_file(package, kind, f"{type_.partition('_')[0]}.json")
+    if path is None:
+        return None
+    try:
+        hashes = json.loads(path.read_text("utf-8"))["type_hashes"]
+        return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name), None)
+    except (ValueError, KeyError, TypeError):
+        return None  # of a ROS version that describes types otherwise
+
+
+def installed_description(name: str) -> Any:
+    """Return the type description of an interface by its full name, as JSON has it, or None."""
+    package, kind, type_ = name.split("/")
+    path = _installed_file(package, kind, f"{type_}.json")
+    return None if path is None else json.loads(path.read_text("utf-8"))
+
+
+def installed_file_text(name: str) -> str | None:
+    """Return the whole text of the file that an interface is defined in, or None."""
+    package, kind, type_ = name.split("/")
+    path = _installed_file(package, kind, f"{type_.partition('_')[0]}.{kind}")
+    return None if path is None else path.read_text("utf-8", "replace")
+
+
+def _installed_file(package: str, kind: str, file: str) -> Path | None:
+    for prefix in _prefixes(package):
+        path = prefix / "share" / package / kind / file
+        if path.is_file():
+            return path
+    return None
+
+
+def _prefixes(package: str) -> Iterator[Path]:
+    # First the prefix that the class comes from: an overlay's definition may differ.
+    spec = find_spec(package)
+    for location in (spec.submodule_search_locations or []) if spec is not None else []:
+        # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper
+        yield from list(Path(location).parents)[2:5]
+    for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        if entry:
+            yield Path(entry)
+    yield Path(sys.prefix)
+
+
+# The message definition a trace carries for each topic, so that it can be read without ROS.
+#
+# It is what rosbag2 and the ``ros2msg`` encoding of MCAP call a concatenated definition: the text
+# of the message, then of every message in it, each after a line of 80 ``=`` and ``MSG:
+# package/Type``.
+
+_RULE = "=" * 80
+_FIELD = re.compile(r"\s*(?P<type>[^\s#]+)\s+(?P<name>[a-zA-Z]\w*)\s*(?P<constant>=)?", re.ASCII)
+_TEXT_NAMES = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
+
+
+@cache
+def schema_text(cls: type) -> str:
+    """Return the concatenated ``ros2msg`` definition of a message class or part of a service.
+
+    The definitions are those installed with the classes, or, where there is none (action wrappers,
+    messages defined in IDL), made from the class: fields only, no comments or constants.
+
+    Raises TypeError if rosidl did not generate the class.
+    """
+    root = message_spec(cls)
+    pieces = [_definition(root)]
+    for spec in _dependencies(root):
+        pieces.append(f"{_RULE}\nMSG: {_short_name(spec)}\n{_definition(spec)}")
+    return "".join(f"{piece}\n" if piece else "" for piece in pieces)
+
+
+@cache
+def type_hash(cls: type) -> str | None:
+    """Return the type hash of an interface class (``RIHS01_`` and 64 hex digits).
+
+    None if its type description is not installed. Raises TypeError if rosidl did not generate it.
+    """
+    return installed_type_hash(type_name(cls))
+
+
+@cache
+def message_type(cls: type) -> MessageType:
+    """Return a message class as the middleware knows it: by name."""
+    return MessageType(type_name(cls), lambda: (schema_text(cls), type_hash(cls) or ""))
+
+
+@cache
+def service_type(cls: Any) -> ServiceType:
+    """Return a service class as the middleware knows it: by name."""
+    request, response = message_type(cls.Request), message_type(cls.Response)
+    return ServiceType(request.name.removesuffix("_Request"), request, response)
+
+
+def _definition(spec: Message) -> str:
+    text = installed_definition(spec.type_name)
+    # A file of another version than the class would make every reader misread the messages.
+    if text is not None and _field_names(text) == [field.name for field in spec.fields]:
+        return text if "/msg/" in spec.type_name else _with_full_types(text, spec)
+    return "\n".join(f"{_written(field.type)} {field.name}" for field in spec.fields)
+
+
+def _with_full_types(text: str, spec: Message) -> str:
+    """Write out the package of types that stand there without one.
+
+    In a ``.srv`` or ``.action`` file these are messages of the same package, but readers that know
+    of messages only take them for parts of the same service or action.
+    """
+    packages = {
+        field.name: _short_name(item).rpartition("/")[0] + "/"
+        for field in spec.fields
+        if isinstance(item := getattr(field.type, "item", field.type), Message)
+    }
+
+    def full(line: str) -> str:
+        match = _FIELD.match(line)
+        if match is None or match["constant"] or "/" in match["type"]:
+            return line
+        start = match.start("type")
+        return line[:start] + packages.get(match["name"], "") + line[start:]
+
+    return "\n".join(map(full, text.splitlines()))
+
+
+def _field_names(text: str) -> list[str]:
+    matches = (_FIELD.match(line) for line in text.splitlines())
+    return [match["name"] for match in matches if match and not match["constant"]]
+
+
+def _dependencies(root: Message) -> list[Message]:
+    """Return every message inside ``root`` once, in the order in which they are met."""
+    found: dict[str, Message] = {}
+
+    def visit(type_: FieldType) -> None:
+        if isinstance(type_, Array | Sequence):
+            visit(type_.item)
+        elif isinstance(type_, Message) and type_.type_name not in found:
+            found[type_.type_name] = type_
+            for field in type_.fields:
+                visit(field.type)
+
+    for field in root.fields:
+        visit(field.type)
+    return list(found.values())
+
+
+def _short_name(spec: Message) -> str:
+    package, _, type_ = spec.type_name.split("/")
+    return f"{package}/{type_}"
+
+
+def _written(type_: FieldType) -> str:
+    """Return a type as a ``.msg`` file has it."""
+    if isinstance(type_, Primitive):
+        return _TEXT_NAMES.get(type_.name, type_.name)
+    if isinstance(type_, Text):
+        bound = "" if type_.bound is None else f"<={type_.bound}"
+        return f"{'wstring' if type_.wide else 'string'}{bound}"
+    if isinstance(type_, Message):
+        return _short_name(type_)
+    if isinstance(type_, Array):
+        return f"{_written(type_.item)}[{type_.length}]"
+    bound = "" if type_.bound is None else f"<={type_.bound}"
+    return f"{_written(type_.item)}[{bound}]"
+
 
 __all__ = [
     "class_of",

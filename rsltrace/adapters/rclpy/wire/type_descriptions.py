@@ -25,7 +25,7 @@ from functools import cache
 from typing import Any
 
 from rsltrace.adapters.rclpy.wire.interface_classes import type_name
-from rsltrace.adapters.rclpy.wire.interface_files import installed_description, installed_file_text
+from rsltrace.adapters.rclpy.wire.interfaces import installed_description, installed_file_text
 
 _get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _get_pointer.restype, _get_pointer.argtypes = c_void_p, (ctypes.py_object, c_char_p)

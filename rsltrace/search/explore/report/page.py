@@ -9,19 +9,20 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.report.charts import histogram, number, progress, scatter
-from rsltrace.search.explore.report.effects import FAILS, Effect, effects
 from rsltrace.search.explore.report.exploration import (
+    FAILS,
     Cause,
+    Effect,
     Exploration,
     Value,
     causes,
+    effects,
     repeat_command,
     settings,
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
-from rsltrace.trace.model.printable import printable, printable_lines
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.model.printable import format_duration, printable, printable_lines
 
 _RUNS_MAX = 200
 _CHARTS_MAX = 24

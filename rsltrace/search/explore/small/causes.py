@@ -2,17 +2,214 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rsltrace.errors import ExploreError
-from rsltrace.search.explore.small.folder import write_small
-from rsltrace.search.explore.small.reduction import Reduction
+from rsltrace.job import Job, job_from_text, load_job
+from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.small.reduction import Parts, Reduced, Reduction
 from rsltrace.search.explore.table import SMALL
-from rsltrace.search.explore.trial import JobSource, TrialResult
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult, overrides_of
 from rsltrace.search.explore.workers import Worker
+from rsltrace.trace.model.printable import format_seconds, printable
+
+# What is written beside a failing run: a README for people, and a test for pytest.
+
+_TEST = '''"""The run in this folder fails as it did when it was found: {why}
+
+Once the bug is mended the run is another one, and this test has done its work.
+"""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+FOLDER = Path(__file__).parent
+
+
+def test_the_run_fails_bit_for_bit(tmp_path):
+    words = ["record", str(FOLDER / "job.yaml"), "--json", "-o", str(tmp_path / "run.mcap")]
+    done = subprocess.run(
+        [sys.executable, "-m", "rsltrace", *words], capture_output=True, text=True
+    )
+    assert done.stdout, done.stderr
+    assert json.loads(done.stdout.splitlines()[-1])["digest"] == "{digest}"
+    assert done.returncode != 0
+'''
+
+
+def test_module(failing: TrialResult) -> str:
+    """Return a test that runs the job of its folder."""
+    return _TEST.format(why=_one_line(failing).replace('"', "'"), digest=failing.digest)
+
+
+def readme(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> str:
+    """Return what the folder is, how to see it fail, and what the failure needs."""
+    return "\n".join(_lines(reduced, failing, passing)) + "\n"
+
+
+def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> Iterator[str]:
+    yield "# A run that fails"
+    yield ""
+    assert failing.failure is not None
+    yield from (f"    {printable(line)}" for line in failing.failure.text.splitlines())
+    yield ""
+    yield "```sh"
+    yield "rsltrace record job.yaml -o again.mcap"
+    yield f"# digest {failing.digest}  events {failing.events}"
+    if failing.failure.event is not None:
+        yield f"rsltrace view failing.mcap --at {failing.failure.event}"
+        yield f"rsltrace debug failing.mcap  # then: goto {failing.failure.event}"
+    if passing is not None:
+        yield "rsltrace diff failing.mcap passing.mcap"
+    yield "```"
+    yield ""
+    yield "What this run needs to fail, beside the job it was found with:"
+    yield ""
+    needed = list(_needed(reduced))
+    yield from needed or ["- nothing: the job fails as it is"]
+    yield ""
+    if not reduced.is_minimal:
+        yield f"(There may be less to it: {reduced.runs} runs were made to find out, no more.)"
+    else:
+        yield f"None of it can be left out alone ({reduced.runs} runs were made to find out)."
+    yield ""
+    if passing is not None:
+        yield f"`passing.mcap` is the nearest run that passes: {printable(reduced.passing_words)}."
+        yield "`diff.txt` says where the two diverge."
+    else:
+        yield "No run with one part less passes, so there is no `passing.mcap`."
+    yield ""
+    yield "`test_reproduces.py` is a test for pytest. The folder can be moved together with the"
+    yield "sources that `job.yaml` names."
+
+
+def _needed(reduced: Reduced) -> Iterator[str]:
+    parts = reduced.parts
+    if parts.seed is not None:
+        yield f"- seed {parts.seed}"
+    for name, value in parts.settings:
+        yield f"- {printable(f'{name} = {value}')}"
+    for one, names in zip(parts.departures or (), reduced.chosen, strict=True):
+        what = f": {printable(names)}" if names else ""
+        yield f"- another order at choice {one['choice']} (number {one['run']} in line){what}"
+    for fault in parts.faults or ():
+        words = ", ".join(f"{key}: {value}" for key, value in fault.items())
+        yield f"- the fault {{{printable(words)}}}"
+    if parts.until_ns is not None:
+        yield f"- it may end at {format_seconds(parts.until_ns)} s"
+    if reduced.left_out:
+        yield f"- it needs no {printable(', '.join(reduced.left_out))}"
+
+
+def _one_line(result: TrialResult) -> str:
+    assert result.failure is not None
+    return printable(result.failure.text.splitlines()[0]).rstrip(".") + "."
+
+
+# The folder of a failing run: everything that somebody else needs to see it fail.
+
+JOB, FAILING, PASSING, DIFF = "job.yaml", "failing.mcap", "passing.mcap", "diff.txt"
+README, TEST = "README.md", "test_reproduces.py"
+_OF_FOLDER = re.compile(r"[^\s()]*/((?:failing|passing)\.mcap)")
+
+
+def write_small(
+    source: JobSource, reduced: Reduced, folder: Path, *, timeout_s: float | None = None
+) -> str:
+    """Write a reduced trial to ``folder``, which is made; return in a sentence where it parts from
+    the nearest run that passes, "" if there is none.
+
+    The job in it is the whole job with what sets the trial apart, and names the same sources, bags
+    and files as the original, relative to the folder. Its run has been made from that very file.
+
+    :raises ExploreError: the run from there is another one, or the folder cannot be written.
+    """
+    folder = folder.resolve()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        return _write(source, reduced, folder, timeout_s)
+    except OSError as error:
+        raise ExploreError(f"{error.filename or folder}: {error.strerror}") from None
+
+
+def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float | None) -> str:
+    job = moved_job(source, reduced.parts, folder)
+    _put(folder / JOB, job.to_yaml())
+    failing = _recorded(JobSource(str(folder / JOB)), job, folder / FAILING, timeout_s)
+    if failing.digest != reduced.result.digest:
+        raise ExploreError(
+            f"{folder / JOB} does not do what the trial did (digest {failing.digest}, not "
+            f"{reduced.result.digest}): what differs is not in the job"
+        )
+    passing, decides = None, ""
+    for name in (PASSING, DIFF):
+        (folder / name).unlink(missing_ok=True)  # of an earlier one
+    if reduced.passing is not None:
+        text = moved_job(source, reduced.passing, folder).to_yaml()
+        passing_source = JobSource(str(folder / JOB), (), text, str(folder))
+        passing = _recorded(passing_source, job, folder / PASSING, timeout_s)
+        report, decides = _diff(folder)
+        _put(folder / DIFF, report)
+    _put(folder / TEST, test_module(failing))
+    _put(folder / README, readme(reduced, failing, passing))
+    return decides
+
+
+def moved_job(source: JobSource, parts: Parts, folder: Path) -> Job:
+    """Return the job of a trial as one whose file is in ``folder``: paths in it start there.
+
+    :raises JobError: it is wrong.
+    """
+    trial = Trial(0, parts.overlay())
+    own = [*source.overrides, *overrides_of(trial)]
+    name = str(folder / JOB)
+    if source.text is not None:  # there is no file: what it is stands in the overrides
+        return job_from_text(source.text, name, folder, overrides=own)
+    original = os.path.abspath(source.path)
+    base = json.dumps({"base": os.path.relpath(original, folder)})
+    before = load_job(original, overrides=source.overrides)
+    moved = list(_moved_arguments(before, folder))
+    return job_from_text(base, name, folder, overrides=[*own, *moved])
+
+
+def _moved_arguments(job: Job, folder: Path) -> Iterator[tuple[str, str]]:
+    """Yield overrides for the paths among a job's ROS arguments, which are words like others."""
+    for index, word in enumerate(job.ros_arguments[1:], start=1):
+        if job.ros_arguments[index - 1] == "--params-file":
+            path = os.path.relpath(job.resolve(word), folder)
+            yield "--params-file", f"ros_arguments.{index}={json.dumps(path)}"
+
+
+def _recorded(source: JobSource, job: Job, path: Path, timeout_s: float | None) -> TrialResult:
+    """Run the job of a file; its trace is at ``path`` afterwards."""
+    path.unlink(missing_ok=True)
+    with Worker(source, pins=job.guard.pins) as worker:
+        return worker.run(Trial(0, {}), path, Wants(keep=True), timeout_s)
+
+
+def _diff(folder: Path) -> tuple[str, str]:
+    """Return what differs between the two traces, named as in the folder: all, and a sentence."""
+    from rsltrace.diff import diff_files
+    from rsltrace.diff.options import DiffOptions
+    from rsltrace.diff.report import render
+
+    found: Any = diff_files(folder / FAILING, folder / PASSING)
+    text: str = render(found, "text", DiffOptions())
+    return _OF_FOLDER.sub(r"\1", text), found.sentence
+
+
+def _put(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")
+
 
 _CAUSES_MAX = 10
 

@@ -3,19 +3,67 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rsltrace.errors import ExploreError, RsltraceError
 from rsltrace.run.plans.recorded_order import ATTACHMENT_CHOICES
 from rsltrace.search.explore.outcome import Wants
-from rsltrace.search.explore.small.ddmin import ddmin
 from rsltrace.search.explore.trial import ERROR, Failure, JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
-from rsltrace.simulation.loop.choices import decoded
+from rsltrace.simulation.loop.policy import decoded
 from rsltrace.trace.reader import Trace
+
+# Delta debugging (Zeller and Hildebrandt, 2002): which of many things does a failure need?
+
+T = TypeVar("T")
+
+
+def ddmin(items: Sequence[T], fails: Callable[[list[T]], bool]) -> list[T]:
+    """Return some of ``items``, in their order, with which ``fails`` says that it still does, and
+    of which none can be left out alone (or none at all, if it fails without any).
+
+    All of them have to fail; they are not asked again. ``fails`` need not be monotonic: what fails
+    with few things may pass with more. It is asked about each selection once, at most about
+    n^2 + 3n, and about 2 log2(n) if one thing is to blame.
+    """
+    known: dict[tuple[int, ...], bool] = {tuple(range(len(items))): True}
+
+    def still_fails(chosen: Sequence[int]) -> bool:
+        key = tuple(chosen)
+        if key not in known:
+            known[key] = fails([items[index] for index in key])
+        return known[key]
+
+    left = list(range(len(items)))
+    if still_fails([]):
+        return []
+    parts = 2
+    while len(left) >= 2:
+        pieces = _pieces(left, parts)
+        rests = [[one for one in left if one not in piece] for piece in pieces]
+        for smaller, next_parts in (
+            *((piece, 2) for piece in pieces),
+            *((rest, max(parts - 1, 2)) for rest in rests if parts > 2),
+        ):
+            if still_fails(smaller):
+                left, parts = smaller, next_parts
+                break
+        else:
+            if parts >= len(left):
+                break
+            parts = min(2 * parts, len(left))
+    return [items[index] for index in left]
+
+
+def _pieces(left: Sequence[int], count: int) -> list[list[int]]:
+    """Return ``left`` in ``count`` pieces of nearly the same length, none of them empty."""
+    ends = [len(left) * number // count for number in range(count + 1)]
+    return [list(left[begin:end]) for begin, end in pairwise(ends)]
+
 
 _TIMES_TRIED = 12
 _PASSING_TRIED = 16

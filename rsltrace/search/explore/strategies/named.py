@@ -2,18 +2,251 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+import random
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job, locate
 from rsltrace.run.plans.scheduling import switches_at_lines
 from rsltrace.search.explore.strategies.faults import FaultWalk
-from rsltrace.search.explore.strategies.feedback import Feedback
-from rsltrace.search.explore.strategies.strategy import Proposal, Strategy
+from rsltrace.search.explore.strategies.strategy import Proposal, Strategy, choices_left
 from rsltrace.search.explore.strategies.systematic import Systematic
-from rsltrace.search.explore.strategies.vary import VaryWalk
-from rsltrace.search.explore.strategies.walks import PctWalk, RandomWalk
 from rsltrace.search.explore.trial import TrialResult
+from rsltrace.search.explore.vary import Variations
+from rsltrace.simulation.loop.policy import pct_bound
+from rsltrace.trace.chain import hash64
+
+# Orders near those that have shown something new: one more departure from one of them.
+
+_TRIES = 20
+_ORDERS_MAX = 2_000
+_NEW_SEEDS = 0.2
+
+
+class Feedback:
+    """Keeps the orders of runs in which something happened that had not happened before (an event
+    with its content and its node's state, two events of a node in that order), and departs from
+    one of them at one more choice; the newest are taken most often."""
+
+    behaviours = True
+    steps = False
+
+    def __init__(self, seed: int = 0, *, is_forked: bool = False) -> None:
+        """``is_forked``: runs begin as the plain one, with its seed."""
+        self._seed = seed
+        self._is_forked = is_forked
+        self._first = 0
+        self._seen: set[int] = set()
+        self._orders: list[tuple[dict[str, Any], tuple[tuple[int, int], ...]]] = []
+        """What else sets a run apart (its seed, say), and of each choice which of how many."""
+        self._tried: set[int] = set()
+        self._runs = self._new_runs = 0
+
+    def begin(self, plain: TrialResult) -> None:
+        choices_left(plain)
+        self._first = plain.choices_before
+        self._keep(plain)
+
+    def propose(self, number: int) -> Proposal | None:
+        chance = random.Random(f"{self._seed} {number}")
+        overlay: dict[str, Any] = {}
+        for _ in range(_TRIES):
+            overlay = self._near(chance)
+            if self._is_new(overlay):
+                break
+        words = f"near what was new, {len(overlay['policy']['departures'])} departures"
+        if "seed" in overlay:
+            words += f", seed {overlay['seed']}"
+        return Proposal(overlay, words)
+
+    def _is_new(self, overlay: Mapping[str, Any]) -> bool:
+        """Say whether this has not been proposed, and remember that it has."""
+        mark = hash64(json.dumps(overlay, sort_keys=True).encode())
+        if mark in self._tried:
+            return False
+        self._tried.add(mark)
+        return True
+
+    def _near(self, chance: random.Random) -> dict[str, Any]:
+        """Return an overlay: the departures of a run that was kept up to some choice, and one more;
+        now and then, and where there is no choice, another seed for what is drawn."""
+        orders = [one for one in self._orders if len(one[1]) > self._first]
+        if self._is_forked and not orders:
+            return {"policy": {"departures": []}}
+        if not self._is_forked and (not orders or chance.random() < _NEW_SEEDS):
+            return {"seed": chance.randrange(1 << 32), "policy": {"departures": []}}
+        overlay, order = orders[max(chance.randrange(len(orders)), chance.randrange(len(orders)))]
+        place = chance.randrange(self._first, len(order))
+        taken, count = order[place]
+        other = chance.randrange(count - 1)
+        run = other + (other >= taken)
+        found = [(choice, one) for choice, (one, _) in enumerate(order[:place]) if one]
+        departures = [*found, (place, run)] if run else found
+        written = [{"choice": choice, "run": one} for choice, one in departures]
+        return {**overlay, "policy": {"departures": written}}
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        return self._keep(result)
+
+    def recall(self, result: TrialResult) -> None:
+        self._is_new(result.trial.overlay)
+        self._keep(result)
+
+    def _keep(self, result: TrialResult) -> TrialResult | None:
+        self._runs += 1
+        new = [one for one in result.behaviours if one not in self._seen]
+        if not new:
+            return None
+        self._seen.update(new)
+        overlay = {key: value for key, value in result.trial.overlay.items() if key != "policy"}
+        self._orders.append((overlay, result.order))
+        if len(self._orders) > _ORDERS_MAX:
+            del self._orders[0]
+        self._new_runs += 1
+        return replace(result, behaviours=tuple(new))
+
+    def coverage(self) -> list[str]:
+        return [
+            f"feedback: {self._new_runs} of {self._runs} runs showed something new, "
+            f"{len(self._seen)} behaviours in all"
+        ]
+
+
+# Random orders: a walk that chooses among all that could run, and PCT with its guarantee.
+
+
+class _ByNumber:
+    """A strategy whose trials follow from their numbers."""
+
+    behaviours = False
+    steps = False
+
+    def __init__(self, seed: int, after: str | None) -> None:
+        """``after``: the simulated time up to which the order is the plain one, and the job's own
+        seed counts."""
+        self._seed = seed
+        self._after = after
+
+    def _proposal(self, policy: Mapping[str, Any], number: int, what: str) -> Proposal:
+        seed = self._seed + number
+        if self._after is None:
+            order = policy.get("order", dict(policy))
+            return Proposal({"policy": order, "seed": seed}, f"{what}, seed {seed}")
+        order = {**policy, "after": self._after, "seed": seed}
+        return Proposal({"policy": order}, f"{what} after {self._after}, seed {seed}")
+
+    def begin(self, plain: TrialResult) -> None:
+        """See that there is something to choose."""
+        choices_left(plain)
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        """Learn nothing."""
+        return None
+
+
+class RandomWalk(_ByNumber):
+    """``policy: permutation``, with the number of the trial as seed: delays and the like are drawn
+    anew, too."""
+
+    def __init__(self, seed: int = 0, after: str | None = None) -> None:
+        super().__init__(seed, after)
+        self._tried = 0
+
+    def propose(self, number: int) -> Proposal | None:
+        self._tried += 1
+        return self._proposal({"order": "permutation"}, number, "random order")
+
+    def coverage(self) -> list[str]:
+        return [f"random walk: {self._tried} seeds"] if self._tried else []
+
+    def recall(self, result: TrialResult) -> None:
+        policy = result.trial.overlay.get("policy")
+        order = policy.get("order") if isinstance(policy, Mapping) else policy
+        self._tried += order == "permutation"
+
+
+class PctWalk(_ByNumber):
+    """``policy: {pct: …}`` of depths from 1 to ``depth`` in turn, with other seeds."""
+
+    def __init__(self, depth: int = 3, seed: int = 0, after: str | None = None) -> None:
+        super().__init__(seed, after)
+        self._depth = depth
+        self._choices, self._entities = 1, 1
+        self._tried = [0] * depth
+
+    def begin(self, plain: TrialResult) -> None:
+        self._choices = max(choices_left(plain), 1)
+        self._entities = max(plain.entities, 1)
+
+    def propose(self, number: int) -> Proposal | None:
+        depth = 1 + number % self._depth
+        self._tried[depth - 1] += 1
+        policy = {"pct": {"depth": depth, "choices": self._choices}}
+        return self._proposal(policy, number, f"PCT of depth {depth}")
+
+    def recall(self, result: TrialResult) -> None:
+        policy = result.trial.overlay.get("policy")
+        if isinstance(policy, Mapping) and "pct" in policy:
+            self._tried[policy["pct"]["depth"] - 1] += 1
+
+    def coverage(self) -> list[str]:
+        lines = []
+        for depth, runs in enumerate(self._tried, 1):
+            if runs:
+                bound = pct_bound(self._entities, self._choices, depth)
+                least = 1 - (1 - bound) ** runs
+                lines.append(
+                    f"PCT: a bug of depth {depth} is found with a probability of at least "
+                    f"{bound:.2g} by one run, {least:.2g} by these {runs} "
+                    f"({self._entities} entities, {self._choices} choices)"
+                )
+        return lines
+
+
+# Other settings: the combinations that ``vary:`` of the job describes.
+
+
+class VaryWalk:
+    """One combination of settings after the other; order and seed are the job's."""
+
+    behaviours = False
+    steps = False
+
+    def __init__(self, job: Job, seed: int = 0) -> None:
+        if job.vary is None:
+            raise ExploreError("the job has no vary:, which says what to vary and between what")
+        self._names = tuple(job.vary.settings)
+        self._method = job.vary.method.replace("_", " ")
+        self._variations = Variations(job.vary, seed)
+        self._tried = 0
+
+    def begin(self, plain: TrialResult) -> None:
+        """Need nothing of the plain run."""
+
+    def propose(self, number: int) -> Proposal | None:
+        values = self._variations.at(number - 1)
+        if values is None:
+            return None
+        self._tried += 1
+        why = ", ".join(f"{name} = {value}" for name, value in values.items())
+        return Proposal({"set": values}, why)
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        """Learn nothing."""
+        return None
+
+    def recall(self, result: TrialResult) -> None:
+        self._tried += 1
+
+    def coverage(self) -> list[str]:
+        of = f" of {self._variations.count}" if self._variations.count is not None else ""
+        return [
+            f"settings ({self._method}): {self._tried}{of} combinations of {', '.join(self._names)}"
+        ]
+
 
 NAMES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.draw import is_second_copy
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import OutputKind
+from rsltrace.trace.model.event import OutputKind, is_second_copy
 from rsltrace_viewer.model.query.conditions import Mask, find
 from rsltrace_viewer.model.run import Run, Segment
 

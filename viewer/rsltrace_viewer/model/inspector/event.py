@@ -6,8 +6,13 @@ Messages are decoded when their section is open; nothing else of the trace is re
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
 
 from rsltrace.errors import TraceError
+from rsltrace.trace.format import TOPIC_STATES
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
@@ -18,22 +23,119 @@ from rsltrace.trace.model.event import (
     Output,
     OutputKind,
 )
-from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.states import Leaf, state_after
 from rsltrace.trace.words.code import output_places, places_text
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.inspector.effects import Effects
-from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.inspector.message_tree import (
+    Line,
+    Openness,
+    Role,
     bytes_lines,
     message_lines,
     preview,
 )
-from rsltrace_viewer.model.inspector.parameters import parameters_at
-from rsltrace_viewer.model.inspector.states import state_lines
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import entity_of, event_text, node_of, outputs_text
+
+# Parameters of a node at some time, put together from what it announced on /parameter_events.
+
+TOPIC = "/parameter_events"
+_VALUE_FIELDS = {
+    1: "bool_value",
+    2: "integer_value",
+    3: "double_value",
+    4: "string_value",
+    5: "byte_array_value",
+    6: "bool_array_value",
+    7: "integer_array_value",
+    8: "double_array_value",
+    9: "string_array_value",
+}
+_MESSAGES_MAX = 20_000
+"""So many announcements are read; a node that sets parameters in a loop has more."""
+
+
+def parameters_at(run: Run, node: str, stamp_ns: int) -> dict[str, object]:
+    """Return the parameters of ``node`` at ``stamp_ns``, by name. Raises TraceError."""
+    values: dict[str, object] = {}
+    for stamp, owner, changes in _announced(run):
+        if stamp > stamp_ns:
+            break
+        if owner == node:
+            for name, value in changes:
+                if value is None:
+                    values.pop(name, None)
+                else:
+                    values[name] = value
+    return dict(sorted(values.items()))
+
+
+@lru_cache(maxsize=4)
+def _announced(run: Run) -> tuple[tuple[int, str, tuple[tuple[str, object], ...]], ...]:
+    """Return (stamp, node, changes) of all announcements; a value of None was undeclared."""
+    found = []
+    for stamp_ns, sequence, data in run.trace.messages(TOPIC):
+        if sequence >= _MESSAGES_MAX:
+            break
+        message: Any = run.trace.decode(TOPIC, data)
+        changes: list[tuple[str, object]] = [
+            (parameter.name, _value(parameter.value))
+            for parameter in (*message.new_parameters, *message.changed_parameters)
+        ]
+        changes += [(parameter.name, None) for parameter in message.deleted_parameters]
+        found.append((stamp_ns, message.node, tuple(changes)))
+    return tuple(found)
+
+
+def _value(value: Any) -> object:
+    return getattr(value, _VALUE_FIELDS.get(value.type, ""), "not set")
+
+
+# A node's recorded state as lines.
+#
+# States are made of the changes up to an event, so one is put together only where somebody looks.
+
+_VALUE_MAX = 200
+_ELEMENTS_SHOWN = 8
+
+
+def state_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+    """Yield the attributes of the event's node after it; nothing if they were not recorded."""
+    if not event.state_hash or not _has_states(run):
+        return
+    entity = run.entities[event.entity]
+    node = entity.id if entity.kind is EntityKind.NODE else entity.node
+    is_open = openness.is_open("state", False)
+    title = f"of {run.node_name(event.entity)} after this event"
+    yield Line(0, "state", title, Role.SECTION, "state", is_open)
+    if not is_open:
+        return
+    try:
+        state = state_after(run.trace, node, event.index)
+    except TraceError as error:
+        yield Line(1, "", printable(str(error)), Role.ERROR, "state.error")
+        return
+    for path, leaf in state.items():
+        yield Line(1, printable(path), _shown(leaf), Role.FIELD, f"state.{path}")
+    if not state:
+        yield Line(1, "", "no attributes", Role.NOTE, "state.none")
+
+
+def _has_states(run: Run) -> bool:
+    return any(channel.topic == TOPIC_STATES for channel in run.trace.channels.values())
+
+
+def _shown(leaf: Leaf) -> str:
+    if not isinstance(leaf, np.ndarray):
+        return shortened(printable(leaf), _VALUE_MAX)
+    first = ", ".join(repr(value.item()) for value in leaf.flat[:_ELEMENTS_SHOWN])
+    more = ", …" if leaf.size > _ELEMENTS_SHOWN else ""
+    shape = " x ".join(map(str, leaf.shape)) or "scalar"
+    return f"{leaf.dtype} {shape}: [{first}{more}]"
+
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _OUTPUTS_OPEN = 3

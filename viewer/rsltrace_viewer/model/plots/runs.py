@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rsltrace.diff.result import Diff
-from rsltrace.trace.model.built_in import NODE_TOPICS
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace_viewer.model.plots.series import (
     CHAIN_AGE,
     CHAIN_LATENCY,

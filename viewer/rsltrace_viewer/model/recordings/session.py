@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -12,16 +12,54 @@ from rsltrace.diff.result import BagDiff
 from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.decode import to_plain
-from rsltrace.trace.model.printable import printable
-from rsltrace.trace.model.stamp import format_duration, format_seconds
-from rsltrace.trace.words.times import START, TimeInRun
-from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
-from rsltrace_viewer.model.inspector.message_tree import message_lines
-from rsltrace_viewer.model.recordings.filter import read_filter
-from rsltrace_viewer.model.recordings.matches import Key, Matches
-from rsltrace_viewer.model.recordings.pairs import Pairs
-from rsltrace_viewer.model.recordings.recording import Recording, Topic
+from rsltrace.trace.model.printable import format_duration, format_seconds, printable
+from rsltrace.trace.words.phrases import START, TimeInRun
+from rsltrace_viewer.model.inspector.message_tree import Line, Openness, Role, message_lines
+from rsltrace_viewer.model.recordings.filter import Condition, Mask, read_filter, steps_of
+from rsltrace_viewer.model.recordings.recording import Pairs, Recording, Topic
 from rsltrace_viewer.model.timeline.message_values import differing_values, message_values
+
+# The messages of one or two recordings that a filter or a search means, as far as is known.
+
+Side = tuple[Recording, Topic | None]
+Key = tuple[str, str]
+"""A topic by its name and type."""
+
+
+class Matches:
+    """Looks at a topic when it is asked to, and remembers what it found."""
+
+    def __init__(self, condition: Condition) -> None:
+        self._condition = condition
+        self._masks: dict[Key, list[Mask]] = {}
+
+    def look(self, key: Key, sides: Sequence[Side]) -> Iterator[int]:
+        """Look at a topic in each recording; yields how many messages were looked at by now.
+
+        Raises BagError, TraceError.
+        """
+        if key in self._masks:
+            return
+        masks = []
+        looked = 0
+        for recording, topic in sides:
+            found: list[Mask] = [np.zeros(0, dtype=np.bool_)]
+            if topic is not None:
+                for mask in steps_of(self._condition, recording, topic):
+                    found.append(mask)
+                    looked += len(mask)
+                    yield looked
+            masks.append(np.concatenate(found))
+        self._masks[key] = masks
+
+    def masks(self, key: Key) -> list[Mask] | None:
+        """Return which messages of a topic are meant, for each recording; None if not yet known."""
+        return self._masks.get(key)
+
+    def counts(self, key: Key) -> list[int]:
+        """Return how many these are; none where nothing is known."""
+        return [int(mask.sum()) for mask in self._masks.get(key, [])]
+
 
 _PREVIEW_BYTES = 1 << 16
 

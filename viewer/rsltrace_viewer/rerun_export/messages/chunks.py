@@ -26,25 +26,25 @@ from rsltrace.trace.format import (
     TOPIC_ROSOUT,
 )
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.colours import colour
 from rsltrace_viewer.rerun_export.columns import (
     EVENT,
     SIM_TIME,
     Clock,
     Column,
+    FrameTree,
+    colour,
     lists,
     make_chunk,
 )
-from rsltrace_viewer.rerun_export.frames import FrameTree
-from rsltrace_viewer.rerun_export.messages.clouds import extent, shaded
-from rsltrace_viewer.rerun_export.messages.fields import Curves, curves_of
 from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerRows
-from rsltrace_viewer.rerun_export.messages.readable import left_out
 from rsltrace_viewer.rerun_export.messages.rows import (
+    Curves,
     LoadedColumns,
     Rows,
     Stream,
     Waiting,
+    curves_of,
+    left_out,
     loaded_chunk,
     loaded_columns,
 )
@@ -52,13 +52,15 @@ from rsltrace_viewer.rerun_export.messages.shapes import (
     SHAPES,
     Drawing,
     Paint,
+    extent,
     frames_of,
+    messages_of,
+    numbers,
     pose_drawing,
+    shaded,
 )
 from rsltrace_viewer.rerun_export.messages.trails import Trails
-from rsltrace_viewer.rerun_export.messages.values import messages_of, numbers
-from rsltrace_viewer.rerun_export.moments import Moments
-from rsltrace_viewer.rerun_export.paths import Paths, join
+from rsltrace_viewer.rerun_export.moments import Moments, Paths, join
 
 _OWN = (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS, TOPIC_ROSOUT)
 _DECODERS = ("ros2msg", "ros2_reflection", "raw", "schema")

@@ -6,15 +6,169 @@ Rows of one kind wait here until there are enough for a chunk: faster to write, 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 from rerun.chunk import Chunk
+from rosbags.interfaces import Nodetype
 
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock
+from rsltrace.errors import TraceError
+from rsltrace.trace.decode import Decoders
+from rsltrace.trace.model.printable import NO_FIELD
+from rsltrace.trace.reader import Trace
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists
+from rsltrace_viewer.rerun_export.messages.shapes import items, numbers
+
+# Numeric fields of messages as curves: what makes any topic plottable, whatever its type.
+#
+# The numbers that stand together in a message (x, y and z of a position) are one set of curves, at
+# ``TOPIC/pose.pose.position``. Times and large arrays such as covariances are no curves.
+
+_ITEMS_MAX = 16
+_CURVES_MAX = 32
+"""More curves than this are no plot that anybody reads; the data is there all the same."""
+_TIME_FIELDS = ({"sec", "nanosec"}, {"seconds", "nanoseconds"})
+"""What ROS puts into a message that has no fields."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """Curves with one point per message: ``scalars`` has a list of values per row."""
+
+    path: str
+    names: tuple[str, ...]
+    scalars: pa.Array
+
+
+def curves_of(structs: pa.StructArray) -> Iterator[Curves]:
+    """Yield the curves of some messages, those of the whole message first."""
+    yield from _curves(structs, "")
+
+
+def _curves(structs: pa.StructArray, path: str) -> Iterator[Curves]:
+    names: list[str] = []
+    inner: list[tuple[str, pa.Array]] = []
+    for place in range(structs.type.num_fields):
+        field = structs.type.field(place)
+        if field.name == NO_FIELD:
+            continue
+        if _is_number(field.type):
+            names.append(field.name)
+        else:
+            inner.append((field.name, structs.field(place)))
+    if names and set(names) not in _TIME_FIELDS:
+        shown = names[:_CURVES_MAX]
+        values = np.stack([numbers(structs.field(name)) for name in shown], axis=1)
+        counts = np.full(len(structs), len(shown), dtype=np.int64)
+        yield Curves(path, tuple(shown), lists(counts, pa.array(values.reshape(-1))))
+    for name, array in inner:
+        below = f"{path}.{name}" if path else name
+        if pa.types.is_struct(array.type):
+            yield from _curves(array, below)
+        elif pa.types.is_list(array.type) or pa.types.is_fixed_size_list(array.type):
+            yield from _array(array, below)
+
+
+def _array(array: pa.Array, path: str) -> Iterator[Curves]:
+    if not _is_number(array.type.value_type):
+        return
+    counts, values = items(array)
+    most = int(np.max(counts)) if len(counts) else 0
+    if 0 < most <= _ITEMS_MAX:
+        names = tuple(f"[{place}]" for place in range(most))
+        yield Curves(path, names, lists(counts, pa.array(numbers(values))))
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return bool(
+        pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    )
+
+
+# Which topics Rerun's loader may read: it has no limits of its own for what a type says.
+#
+# A sequence of empty messages is four bytes that ask for gigabytes, a fixed array asks for as many
+# values as one likes. rosbags' definition of a type, which our own decoder has checked, tells.
+
+_VALUES_MAX = 1 << 20
+"""In the parts of a message whose size is fixed."""
+
+
+def left_out(trace: Trace) -> dict[str, str]:
+    """Return the topics whose messages Rerun must not read, and why not."""
+    decoders = Decoders()
+    found = {}
+    for channel in trace.channels.values():
+        try:
+            decoder = decoders.of(channel)
+            values = _values(decoder.name, decoder.types, {})
+        except TraceError as error:
+            found[channel.topic] = str(error)
+            continue
+        except _EmptyItems as error:
+            found[channel.topic] = f"{channel.type} has a sequence of {error}, which has no fields"
+            continue
+        if decoder.wide_texts:
+            found[channel.topic] = f"{channel.type} has wide texts (wstring)"
+        elif values > _VALUES_MAX:
+            found[channel.topic] = f"a {channel.type} has {values} values, more than {_VALUES_MAX}"
+    return found
+
+
+class _EmptyItems(Exception):
+    """A sequence whose items have no bytes."""
+
+
+def _values(name: str, types: dict[str, Any], known: dict[str, int]) -> int:
+    """Return how many values a message has at least, the messages in it among them.
+
+    ``types`` do not contain themselves. Raises _EmptyItems.
+    """
+    if name not in known:
+        known[name] = sum(_values_of(field, types, known) for _, field in types[name][1])
+    return known[name]
+
+
+def _values_of(field: Any, types: dict[str, Any], known: dict[str, int]) -> int:
+    kind, detail = field
+    if kind == Nodetype.BASE:
+        return 1
+    if kind == Nodetype.NAME:
+        return 1 + _values(detail, types, known)
+    item, size = detail
+    if kind == Nodetype.SEQUENCE:
+        if _is_empty(item, types):
+            raise _EmptyItems(item[1])
+        _values_of(item, types, known)  # within limits, and no sequences of nothing in it
+        return 1
+    return int(size) * _values_of(item, types, known)
+
+
+def _is_empty(field: Any, types: dict[str, Any]) -> bool:
+    """Whether a field has no bytes: messages of messages of nothing."""
+    kind, detail = field
+    if kind == Nodetype.ARRAY:
+        return _is_empty(detail[0], types)
+    return kind == Nodetype.NAME and _has_no_bytes(detail, types, {})
+
+
+def _has_no_bytes(name: str, types: dict[str, Any], known: dict[str, bool]) -> bool:
+    if name not in known:
+        known[name] = all(
+            (kind == Nodetype.NAME and _has_no_bytes(detail, types, known))
+            or (
+                kind == Nodetype.ARRAY
+                and detail[0][0] == Nodetype.NAME
+                and _has_no_bytes(detail[0][1], types, known)
+            )
+            for _, (kind, detail) in types[name][1]
+        )
+    return known[name]
+
 
 _ROWS_PER_CHUNK = 8192
 _BYTES_PER_CHUNK = 1 << 20

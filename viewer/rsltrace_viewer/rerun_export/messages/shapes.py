@@ -22,13 +22,68 @@ from rsltrace_viewer.rerun_export.columns import (
     strip_lists,
     vectors,
 )
-from rsltrace_viewer.rerun_export.messages.values import (
-    columns,
-    get,
-    items,
-    numbers,
-    rotated_x,
-)
+
+# Messages as Arrow gives them, taken apart: the fields of many messages as one numpy array.
+#
+# Rerun's reader hands out every message of a type it does not draw as one Arrow struct. A
+# message's fields are found by dotted paths; sequences keep how many items each message has.
+
+
+def messages_of(column: pa.Array) -> pa.StructArray | None:
+    """Return the structs of a column that holds one per row, or None if it is anything else."""
+    if not pa.types.is_list(column.type) or not pa.types.is_struct(column.type.value_type):
+        return None
+    structs = column.flatten()
+    return structs if len(structs) == len(column) and structs.null_count == 0 else None
+
+
+def get(structs: pa.StructArray, path: str) -> pa.Array:
+    """Return the field at ``path`` (``pose.pose.position``) of each struct. Raises KeyError."""
+    array: pa.Array = structs
+    for name in path.split("."):
+        place = array.type.get_field_index(name) if pa.types.is_struct(array.type) else -1
+        if place < 0:
+            raise KeyError(path)
+        array = array.field(place)
+    return array
+
+
+def numbers(array: pa.Array) -> npt.NDArray[np.float64]:
+    """Return an array of numbers as float64, shape (n,); null becomes NaN."""
+    if pa.types.is_boolean(array.type):
+        array = array.cast(pa.uint8())
+    return np.asarray(array.to_numpy(zero_copy_only=False), dtype=np.float64)
+
+
+def columns(structs: pa.StructArray, path: str, names: str) -> npt.NDArray[np.float64]:
+    """Return the one-letter fields ``names`` (``xyz``) at ``path``, shape (n, len(names))."""
+    at = get(structs, path) if path else structs
+    return np.stack([numbers(get(at, name)) for name in names], axis=1)
+
+
+def items(array: pa.Array) -> tuple[npt.NDArray[np.int64], pa.Array]:
+    """Return (items per row, all items one after the other) of a column of sequences."""
+    if pa.types.is_fixed_size_list(array.type):
+        counts = np.full(len(array), array.type.list_size, dtype=np.int64)
+    else:
+        counts = np.diff(array.offsets.to_numpy()).astype(np.int64)
+    return counts, array.flatten()
+
+
+def rotated_x(quaternions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return where the x axis points after rotations (x, y, z, w), shape (n, 3)."""
+    x, y, z, w = quaternions.T
+    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1)
+
+
+def rotated(quaternion: Any, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return points, shape (n, 3), turned by one rotation (x, y, z, w)."""
+    if not any(quaternion[:3]):
+        return points
+    axis = np.asarray(quaternion[:3], dtype=np.float64)
+    twice = 2.0 * np.cross(axis, points)
+    return np.asarray(points + float(quaternion[3]) * twice + np.cross(axis, twice))
+
 
 ARROW_LENGTH = 0.6
 """In metres: about a robot."""
@@ -196,3 +251,45 @@ def frames_of(messages: pa.StructArray, field: str = "header.frame_id") -> list[
         return list(get(messages, field).to_pylist())
     except KeyError:
         return []
+
+
+# Colours of point clouds: each topic's own, from dark below to bright above.
+#
+# Rerun's loader gives all points of a cloud one colour, in which walls and ground are one heap.
+
+_DARKEST = 0.3
+_LOW, _HIGH = 2, 98
+"""In per cent: what is above or below is a stray point."""
+
+Box = tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
+
+
+def shaded(positions: pa.ListArray, paint: Paint) -> pa.ListArray:
+    """Return a colour for each point of each cloud (a row of ``positions``)."""
+    counts = np.asarray(positions.value_lengths().fill_null(0).to_numpy(), dtype=np.int64)
+    heights = _clouds_points(positions)[:, 2]
+    known = np.isfinite(heights)
+    low, high = np.percentile(heights[known], (_LOW, _HIGH)) if known.any() else (0.0, 0.0)
+    part = np.clip((heights - low) / max(high - low, 1e-9), 0.0, 1.0)
+    bright = np.where(known, _DARKEST + (1 - _DARKEST) * part, 1.0)
+    colours = np.full(len(heights), 255, dtype=np.uint32)
+    for shift in (24, 16, 8):
+        channel = (bright * (paint.rgba >> shift & 255)).astype(np.uint32)
+        colours |= channel << np.uint32(shift)
+    return lists(counts, pa.array(colours))
+
+
+def extent(positions: pa.ListArray) -> Box | None:
+    """Return the corners of the box that nearly all points of some clouds are in."""
+    points = _clouds_points(positions)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    low, high = np.percentile(points, (_LOW, _HIGH), axis=0)
+    return low, high
+
+
+def _clouds_points(positions: pa.ListArray) -> npt.NDArray[np.float64]:
+    """Return the points of all rows, shape (n, 3)."""
+    values = positions.flatten().flatten().to_numpy(zero_copy_only=False)
+    return np.asarray(values, dtype=np.float64).reshape(-1, 3)

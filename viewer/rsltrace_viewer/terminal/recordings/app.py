@@ -10,21 +10,57 @@ from textual.binding import Binding
 from textual.widget import Widget
 
 from rsltrace.trace.model.printable import printable
-from rsltrace.trace.words.times import TimeInRun, parse_time_in_run
-from rsltrace_viewer.model.inspector.lines import Line
-from rsltrace_viewer.model.recordings.filter import FIELDS
+from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
+from rsltrace_viewer.model.inspector.message_tree import Line
+from rsltrace_viewer.model.query.parser import complete
+from rsltrace_viewer.model.recordings.filter import FIELDS, choices, read_filter
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Recording
 from rsltrace_viewer.model.recordings.session import RecordingSession
-from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.follow import walk
 from rsltrace_viewer.terminal.recordings.keys import RECORDING_KEYS, recording_keys
-from rsltrace_viewer.terminal.recordings.questions import question_of
 from rsltrace_viewer.terminal.recordings.shell import RecordingShell
 from rsltrace_viewer.terminal.screens.help import KeysScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.list_view import ListView
-from rsltrace_viewer.terminal.widgets.prompt import Prompt
+from rsltrace_viewer.terminal.widgets.prompt import Prompt, Question
+
+# What is asked about recordings, and which answers are good: a search, a filter, a time.
+
+
+def question_of(kind: str, session: RecordingSession) -> Question:
+    """Return the question of a kind: ``search``, ``filter`` or ``time``."""
+    recordings = session.recordings
+    known = choices(recordings)
+
+    def check(text: str) -> object:
+        return read_filter(text, recordings)
+
+    def completed(text: str) -> list[str]:
+        return complete(text, known)
+
+    fields = "topic: type: time: text: …"
+    questions = {
+        "search": Question(
+            "search",
+            "search",
+            f"a word, or {fields} as in a filter; Enter finds the next",
+            "",
+            check,
+            completed,
+        ),
+        "filter": Question(
+            "filter",
+            "filter",
+            f"{fields}  Tab completes, empty shows all",
+            session.filter_text,
+            check,
+            completed,
+        ),
+        "time": Question("time", "go to", "seconds after the start, or 2ms", "", parse_time_in_run),
+    }
+    return questions[kind]
 
 
 class RecordingApp(RecordingShell):

@@ -12,10 +12,10 @@ from textual.widgets import Static
 
 from rsltrace.diff.row_sign import Sign
 from rsltrace.trace.model.printable import printable
-from rsltrace_viewer.model.cells import cells, fit
-from rsltrace_viewer.model.inspector.lines import Line
+from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.recordings.session import RecordingSession
-from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.model.view import cells, fit
+from rsltrace_viewer.terminal.follow import walk
 from rsltrace_viewer.terminal.recordings.keys import recording_keys
 from rsltrace_viewer.terminal.widgets.bars import HeaderBar, verdict_lines
 from rsltrace_viewer.terminal.widgets.inspector import Inspector

@@ -13,9 +13,9 @@ from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.lanes import KIND_LETTERS
 from rsltrace_viewer.model.query.fields import FIELDS
+from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.keys import Key, keys_of
 
 _KEY_WIDTH = 13

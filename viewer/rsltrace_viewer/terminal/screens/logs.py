@@ -11,11 +11,10 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.printable import printable
-from rsltrace.trace.model.stamp import format_seconds
-from rsltrace_viewer.model.cells import fit
-from rsltrace_viewer.model.history import Event
+from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.logs import LogLine, event_of
+from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.session import RUN_B, Session
 from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
 

@@ -13,10 +13,8 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.printable import printable
-from rsltrace.trace.model.stamp import format_duration
+from rsltrace.trace.model.printable import format_duration, printable
 from rsltrace.trace.native import is_native
-from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.chains import Chain
 from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.overview import (
@@ -31,6 +29,7 @@ from rsltrace_viewer.model.overview import (
     unheard_of,
 )
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.keys import KEYS
 from rsltrace_viewer.terminal.widgets.bars import HeaderBar

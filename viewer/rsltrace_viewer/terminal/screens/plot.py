@@ -18,11 +18,9 @@ from textual.widgets.option_list import Option
 
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.printable import printable
-from rsltrace_viewer.model.cells import fit
-from rsltrace_viewer.model.plots.braille import Plot, plot
-from rsltrace_viewer.model.plots.data import PlotData, difference
-from rsltrace_viewer.model.plots.series import Series, Source
-from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.model.plots.series import Plot, PlotData, Series, Source, difference, plot
+from rsltrace_viewer.model.view import fit
+from rsltrace_viewer.terminal.follow import walk
 
 _AXIS = 11
 

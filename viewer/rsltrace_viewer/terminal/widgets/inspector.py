@@ -12,9 +12,9 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace_viewer.model.cells import cells, fit, wrap
-from rsltrace_viewer.model.inspector.lines import Line, Role
-from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
+from rsltrace_viewer.model.inspector.message_tree import Line, Role
+from rsltrace_viewer.model.view import cells, fit, wrap
+from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
 
 _IN_FULL = (Role.NOTE, Role.ERROR, Role.WARNING, Role.DIFFERENCE)
 _VALUE_LINES = 4

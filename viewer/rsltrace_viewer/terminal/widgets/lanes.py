@@ -14,10 +14,9 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from rsltrace.trace.model.printable import printable
-from rsltrace_viewer.model.axis import axis_text
-from rsltrace_viewer.model.cells import cells, fit
-from rsltrace_viewer.model.lanes import Lane, Lanes
-from rsltrace_viewer.model.timeline.short_names import ShortNames
+from rsltrace_viewer.model.lanes import Lane, Lanes, axis_text
+from rsltrace_viewer.model.timeline.events import ShortNames
+from rsltrace_viewer.model.view import cells, fit
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LABEL_MAX = 28

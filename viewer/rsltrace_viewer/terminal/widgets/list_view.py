@@ -12,7 +12,7 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
 
 STYLES = ("plain", "muted", "title", "good", "error", "warning", "link", "bar")
 Pieces = Sequence[tuple[str, str]]

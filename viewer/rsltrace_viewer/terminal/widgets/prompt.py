@@ -14,7 +14,7 @@ from textual.suggester import Suggester
 from textual.widgets import Input, Static
 
 from rsltrace.trace.model.printable import printable
-from rsltrace_viewer.model.cells import cells
+from rsltrace_viewer.model.view import cells
 
 _SHOWN_COMPLETIONS = 8
 

@@ -15,10 +15,9 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from rsltrace.diff.row_sign import Sign
-from rsltrace_viewer.model.cells import fit
-from rsltrace_viewer.model.timeline.columns import Columns
-from rsltrace_viewer.model.timeline.events import EventText
-from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
+from rsltrace_viewer.model.timeline.events import Columns, EventText
+from rsltrace_viewer.model.view import fit
+from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
