@@ -36,6 +36,13 @@ WAYS = {
     "difference": "r = list(s - {'zz'})",
     "dict": "r = list(dict.fromkeys(s))",
     "extend": "r = []\nr.extend(s)",
+    "added": "r = []\nr += s",
+    "slice": "r = []\nr[:] = s",
+    "sorted": "r = sorted(s, key=lambda text: 0)",
+    "smallest": "r = __import__('heapq').nsmallest(5, s, key=lambda text: 0)",
+    "counter": "r = list(__import__('collections').Counter(s))",
+    "chain": "r = list(__import__('itertools').chain(s))",
+    "pickle": "r = list(dict.fromkeys(__import__('pickle').loads(__import__('pickle').dumps(s))))",
 }
 
 
@@ -117,7 +124,9 @@ def test_lines_of_tracebacks_stay(tmp_path: Path) -> None:
 
 def test_modules_are_found_rewritten_only_during_a_run(said: Callable[..., Any]) -> None:
     before = list(sys.meta_path)
+    members = {kind: dict(vars(kind)) for kind in (set, frozenset, dict, list)}
     said(node_code("pass"))
     assert sys.meta_path == before
+    assert members == {kind: dict(vars(kind)) for kind in members}
     probe = "import sys; assert not any('rsltrace' in str(f) for f in sys.meta_path)"
     subprocess.run([sys.executable, "-c", probe], check=True, env=dict(os.environ), timeout=300)
