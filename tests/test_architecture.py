@@ -229,7 +229,7 @@ _NO_METHODS_OF_OURS = {
 
 
 def test_no_method_of_another_object_is_replaced() -> None:
-    """Whoever watches or steers a run is an observer (``simulation/middleware/events/observer.py``)."""
+    """Whoever watches or steers a run is an observer (``middleware/events/observer.py``)."""
     modules = parsed()
     found = replaced_methods(modules)
     assert found <= set(_NO_METHODS_OF_OURS), sorted(found - set(_NO_METHODS_OF_OURS))
@@ -263,11 +263,11 @@ RUNS_CODE = {
     "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
     "rsltrace/adapters/rclpy/executors/user_executors.py": "import_module",  # functions of rclpy
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
-    "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # tomli; setup.py, as colcon
+    "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # setup.py
     # What a run, and only a run, does with code that its job names.
     "rsltrace/adapters/rclpy/wire/interface_classes.py": "import_module",  # classes of messages
     "rsltrace/adapters/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
-    "rsltrace/search/explore/worker.py": "import_module",  # libraries that the last run has imported
+    "rsltrace/search/explore/worker.py": "import_module",  # what the last run has imported
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
     "rsltrace/run/plans/main_programs.py": "exec",  # main: a program

@@ -91,7 +91,11 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
     job, _ = job_of(words, launch, skip, overrides)
     expanded = without_launch_files(job)
     with search_path(job):
-        return audit_job(expanded.job, lambda target, where: source_of(target, where=where))
+        from rsltrace.adapters.workspace.installs import module_folders
+
+        return audit_job(
+            expanded.job, lambda target, where: source_of(target, where=where), module_folders
+        )
 
 
 def _line(one: Found) -> str:

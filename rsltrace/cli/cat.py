@@ -17,6 +17,7 @@ import numpy.typing as npt
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind
@@ -27,7 +28,6 @@ from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.code import code_places, output_places, places_text
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
-from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
 
 # One event as a line of aligned columns, for ``rsltrace cat``.
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rsltrace_viewer.terminal.recordings.app import RecordingApp
     from rsltrace_viewer.terminal.screenshot import Shown
 
-    from rsltrace.trace.words.phrases import TimeInRun
+    from rsltrace.job.values.times import TimeInRun
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
@@ -140,7 +140,7 @@ def _recordings(
     from rsltrace_viewer.model.recordings.filter import read_filter
     from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 
-    from rsltrace.trace.words.phrases import START
+    from rsltrace.job.values.times import START
 
     session = open_recordings(paths)
     start = None
@@ -243,7 +243,7 @@ def _place(session: Any, at: str) -> int:
 
 
 def _time(at: str, what: str) -> TimeInRun:
-    from rsltrace.trace.words.phrases import parse_time_in_run
+    from rsltrace.job.values.times import parse_time_in_run
 
     try:
         return parse_time_in_run(at)

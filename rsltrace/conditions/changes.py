@@ -7,9 +7,9 @@ from typing import Any
 from rsltrace.conditions.condition import Armed, error_text, shown
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, Moment
+from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.printable import format_seconds
-from rsltrace.trace.words.phrases import TimeInRun
 
 _NOT_THERE = "(not there)"
 

@@ -44,9 +44,9 @@ from rsltrace.conditions.occurrences import (
 from rsltrace.conditions.topic_fields import plain, topic_of
 from rsltrace.conditions.view import Moment
 from rsltrace.errors import ConditionError, did_you_mean
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.model.finding import Source
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
-from rsltrace.trace.words.phrases import parse_time_in_run
 
 _HEAD = re.compile(r"([A-Za-z_]+)(?:\s*[:=]\s*|\s+|\Z)")
 _MESSAGE = re.compile(r"([/A-Za-z_*?~][^\s:]*)\s*:(?!:)\s*")

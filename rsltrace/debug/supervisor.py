@@ -127,7 +127,7 @@ class Supervisor:
         text = str(place).strip()
         if text.isascii() and text.isdigit():
             return {"until": int(text)}
-        from rsltrace.trace.words.phrases import parse_time_in_run
+        from rsltrace.job.values.times import parse_time_in_run
 
         try:
             return {"until_ns": parse_time_in_run(text).stamp_ns(self.tree.start_ns)}

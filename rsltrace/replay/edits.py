@@ -21,10 +21,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import EditError, did_you_mean
+from rsltrace.job.values.times import TimeInRun, parse_stamp, parse_time_in_run
 from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.phrases import TimeInRun, parse_stamp, parse_time_in_run
 
 Step = tuple[str, Any]
 """A step into an object: ``(".", name)`` or ``("[", key)``."""

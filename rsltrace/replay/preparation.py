@@ -326,7 +326,7 @@ def count_to(trace: Trace, position: Position) -> int:
 
     :raises ReplayError: if it is no position, or before the first event.
     """
-    from rsltrace.trace.words.phrases import parse_time_in_run
+    from rsltrace.job.values.times import parse_time_in_run
 
     text = str(position).strip()
     if text.isascii() and text.isdigit():

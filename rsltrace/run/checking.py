@@ -89,7 +89,11 @@ def _divisions_by_nothing(job: Job) -> Iterator[str]:
     if any(clock.advances and clock.node == "*" for clock in job.clocks):
         return
     try:
-        found = audit_job(job, lambda target, where: source_of(target, where=where)).found
+        from rsltrace.adapters.workspace.installs import module_folders
+
+        found = audit_job(
+            job, lambda target, where: source_of(target, where=where), module_folders
+        ).found
     except JobError:  # made in Python: there is no source to look at
         return
     for one in found:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 from rsltrace.errors import DeadlockError, RunError, did_you_mean
 from rsltrace.job import FaultSpec, Job, load_job
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.times import parse_time
+from rsltrace.job.values.times import parse_time, parse_time_in_run
 from rsltrace.run.driver import Driver
 from rsltrace.run.forked import ForkedRun, ForkResult
 from rsltrace.run.session import RunResult, Session
@@ -19,7 +19,6 @@ from rsltrace.run.tap import Tap
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.printable import format_seconds
-from rsltrace.trace.words.phrases import parse_time_in_run
 
 T = TypeVar("T")
 Time = str | int | float

@@ -55,10 +55,11 @@ def unused_remappings(job: Job, census: Census) -> Iterator[str]:
             given.setdefault((old, new), (spec.origin or locate(job, loc), []))[1].extend(own)
     for (old, _), (place, askers) in given.items():
         if not _is_used(old, askers, census):
-            yield f"{place}: {_unused_remappings_note(old, askers, census)}"
+            yield f"{place}: {_remapping_note(old, askers, census)}"
     for index, old in _rules(job.ros_arguments):
         if not _is_used(old, everybody, census):
-            yield f"{locate(job, ('ros_arguments', index))}: {_unused_remappings_note(old, everybody, census)}"
+            place = locate(job, ("ros_arguments", index))
+            yield f"{place}: {_remapping_note(old, everybody, census)}"
 
 
 def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
@@ -86,7 +87,7 @@ def _forms(name: str, asker: Asker) -> list[str]:
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
 
-def _unused_remappings_note(old: str, askers: list[Asker], census: Census) -> str:
+def _remapping_note(old: str, askers: list[Asker], census: Census) -> str:
     names = [
         form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]

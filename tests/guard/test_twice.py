@@ -223,7 +223,7 @@ import sys
 from rsltrace import Trace, load_job, record
 
 record(load_job(sys.argv[1]), sys.argv[2])
-ours = sys.modules["rsltrace.simulation.middleware.events.dispatcher"]  # was loaded in the run, and stays
+ours = sys.modules["rsltrace.simulation.middleware.events.dispatcher"]  # was loaded in the run
 loader = type(ours.__loader__).__module__
 assert loader != "rsltrace.guard.virtual.user_modules", "it is not user code"
 with Trace.open(sys.argv[2]) as trace:

@@ -12,10 +12,10 @@ from rsltrace.debug.conditions.text import parse_condition
 
 import rsltrace
 from rsltrace.job import load_job
+from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.run import run
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
 
 pytestmark = pytest.mark.ros
 

@@ -21,8 +21,8 @@ from rsltrace_viewer.model.timeline.events import EventTexts, ShortNames, layout
 from rsltrace_viewer.model.view import OneRun, Window, cells, fit, wrap
 from rsltrace_viewer.terminal.screens.help import help_text
 
+from rsltrace.job.values.times import parse_stamp
 from rsltrace.trace.model.event import NO_EVENT
-from rsltrace.trace.words.phrases import parse_stamp
 
 
 def test_the_model_loads_no_terminal_library() -> None:

@@ -30,8 +30,8 @@ from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
 from rsltrace.diff.row_sign import Sign
+from rsltrace.job.values.times import START, parse_time_in_run
 from rsltrace.trace.decode import to_plain
-from rsltrace.trace.words.phrases import START, parse_time_in_run
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces" / "delayed_input"
 

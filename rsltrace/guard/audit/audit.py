@@ -8,12 +8,11 @@ import os
 import re
 import sys
 import tokenize
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rsltrace.adapters.workspace.installs import module_folders
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.calls import Place, find_calls
 from rsltrace.guard.audit.names import Names
@@ -296,6 +295,7 @@ def _done(
 
 Executables = Callable[[str, str], "str | Path"]
 """Given ``package/executable`` and where it is written: ``module:function``, or a script's path."""
+ModuleFolders = Callable[[Iterable[Path]], list[Path]]
 
 
 def audit_path(path: Path) -> Audit:
@@ -311,8 +311,12 @@ def audit_path(path: Path) -> Audit:
     return _audit(found, GuardTreatment(Policy()))
 
 
-def audit_job(job: Job, executable: Executables) -> Audit:
+def audit_job(
+    job: Job, executable: Executables, module_folders: ModuleFolders | None = None
+) -> Audit:
     """Look at the modules of a job's nodes, and at what those import below its search path.
+
+    Where nodes are executables of packages, ``module_folders`` tells the folders of their modules.
 
     :raises JobError: if a node's module is not found.
     """
@@ -340,7 +344,7 @@ def audit_job(job: Job, executable: Executables) -> Audit:
         else:
             names.setdefault(module_of(target), where)
     folders = [job.resolve(folder).resolve() for folder in job.search_path]
-    if any(spec.executable is not None for spec in job.nodes):
+    if module_folders and any(spec.executable is not None for spec in job.nodes):
         folders += [folder for folder in module_folders(folders) if folder not in folders]
     collection, missing = collect_modules(list(names), scripts, folders, programs)
     for name in missing:

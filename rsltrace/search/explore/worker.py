@@ -1,8 +1,8 @@
 """The program of a worker: it loads what a run needs once, and makes each run in a copy of itself.
 
-``python -m rsltrace.search.explore.worker SOCKET [--no-pin]``, started by ``workers``. The worker itself
-never runs user code, so every copy begins as the one before did; what a run leaves behind, leaks or
-breaks is gone with its process, and so is what it has started.
+``python -m rsltrace.search.explore.worker SOCKET [--no-pin]``, started by ``workers``. The worker
+itself never runs user code, so every copy begins as the one before did; what a run leaves behind,
+leaks or breaks is gone with its process, and so is what it has started.
 """
 
 from __future__ import annotations

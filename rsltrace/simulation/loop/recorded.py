@@ -60,8 +60,8 @@ class Recorded:
     first come, first served. Entities are the same if their names are: ``name_of`` returns the name
     of one of this run, by its id. ``chosen`` chooses as the recording's own policy did: then the
     run is the recording's as long as it does the same, which whoever ends the events has to
-    look at (``simulation/middleware/events/recorded_run.py``). Where nobody knows what it chose (None) the
-    events are all there is, and what has none of its own, see ``choices.py``, runs as it comes.
+    look at (``recorded_run`` in ``simulation/middleware/events``). Where nobody knows what it
+    chose (None) the events are all there is, and what has none of its own, see ``choices.py``, runs as it comes.
 
     :raises RunError: from ``choose``, if what the recording has next cannot run now.
     """

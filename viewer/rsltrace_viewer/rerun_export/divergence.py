@@ -150,9 +150,9 @@ def marks_of(diff: Diff) -> Marks:
     fields: dict[tuple[str, str], None] = {}
     for divergence in diff.divergences:
         for message in divergence.messages:
-            for field in message.fields:
-                path = field.path.split("[")[0]
-                inside = path.rpartition(".")[0] if path == field.path else path
+            for one in message.fields:
+                path = one.path.split("[")[0]
+                inside = path.rpartition(".")[0] if path == one.path else path
                 fields[message.topic, join(inside).strip("/") if inside else ""] = None
     lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
     topics = dict.fromkeys(reach.topic for each in diff.divergences for reach in each.reaches)

@@ -14,8 +14,8 @@ from textual.screen import Screen
 from textual.widget import Widget
 
 from rsltrace.errors import TraceError
+from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.trace.model.printable import printable, shortened
-from rsltrace.trace.words.phrases import TimeInRun, parse_time_in_run
 from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run

@@ -17,7 +17,7 @@ from textual.content import Content
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rsltrace.trace.words.phrases import parse_time_in_run
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace_viewer.model.folder import Found
 from rsltrace_viewer.model.query.parser import completions
 from rsltrace_viewer.model.view import cells, fit

@@ -13,13 +13,13 @@ import numpy.typing as npt
 
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import WITH_TOPIC
 from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace.segments import output_of
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.kinds import SHORT_KINDS
-from rsltrace.trace.words.phrases import parse_time_in_run
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition, Mask
 from rsltrace_viewer.model.query.tokens import (

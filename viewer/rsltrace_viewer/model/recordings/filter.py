@@ -19,10 +19,10 @@ from rsltrace.conditions.topic_fields import OF_MESSAGE, plain
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.decode import to_plain
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.logs import parse_log
-from rsltrace.trace.words.phrases import parse_time_in_run
 from rsltrace_viewer.model.query.fields import level_of, place_of, whole_number
 from rsltrace_viewer.model.query.parser import Choices, Language, read
 from rsltrace_viewer.model.query.tokens import (
