@@ -27,7 +27,7 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
     max_examples=20,
 )
-settings.register_profile("many", settings.get_profile("few"), max_examples=400)
+settings.register_profile("many", settings.get_profile("few"), max_examples=200)
 settings.register_profile("new", settings.get_profile("few"), derandomize=False, print_blob=True)
 
 # A shell that starts us in the background has us ignore Ctrl-C, and so would all that we start.

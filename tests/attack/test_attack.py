@@ -205,7 +205,7 @@ def _run(case: Case, code: str, allowed: frozenset[int] = oracle.READING) -> Ran
     return execution.run(command, case.folder.parent / "streams")
 
 
-@pytest.mark.few(65)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("wrong", _SABOTAGE, ids=lambda wrong: wrong.value)
 def test_the_oracle_sees_sabotage(
     wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

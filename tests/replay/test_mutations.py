@@ -137,7 +137,7 @@ def test_of_a_pipeline(tmp_path: Path) -> None:
         assert campaign.changed > 1, node
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 9])
+@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.long), 27])
 def test_of_mains_threads_and_services(every: int, tmp_path: Path) -> None:
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
     (tmp_path / "job.yaml").write_text(ALL + "seed: 5\n")

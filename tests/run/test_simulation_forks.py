@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import subprocess
 import sys
@@ -21,6 +22,14 @@ from rsltrace.errors import JobError, OutputError, RunError  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import Simulation, record  # noqa: E402
 from rsltrace.trace.reader import Trace  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_by_other_tests() -> None:
+    """A process that shares memory cannot fork; what is left of runs with processes may be garbage
+    that nobody has collected."""
+    gc.unfreeze()
+    gc.collect()
 
 
 class Counter(Node):
