@@ -297,7 +297,7 @@ def _generate(name: str, order: dict[str, Any], *, uses: int) -> None:
         pipes: Any = {"stdin": given, "stdout": subprocess.PIPE, "stderr": said}
         with subprocess.Popen(command, text=True, **pipes) as process:
             try:
-                _tell_progress(process.stdout, name, len(order["interfaces"]))
+                _tell_progress(process.stdout or (), name, len(order["interfaces"]))
             except BaseException:
                 process.kill()
                 raise
