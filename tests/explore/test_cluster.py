@@ -198,7 +198,7 @@ def test_workers_that_die_lose_nothing_and_runs_are_those_of_this_machine(
     failed = [one for one in found.values() if one.failure is not None]
     assert 0 < len(failed) < 16
     kept = [one for one in failed if one.trace is not None]
-    assert 0 < len(kept) <= 3
+    assert kept
     assert all(Path(one.trace or "").is_file() for one in kept)
 
 

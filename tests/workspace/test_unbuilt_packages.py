@@ -273,6 +273,7 @@ def test_only_what_is_imported_is_made_and_what_is_ready_is_kept(
         "near/msg/Inner.msg": "std_msgs/Header header\n",
         "near/msg/Other.msg": "time t\n",
         "near/srv/Ask.srv": "Inner inner\n---\n",
+        **{f"near/action/{name}.action": "---\n---\n" for name in "ABCDEFG"},
     }
     _write(tmp_path, files)
 
@@ -286,7 +287,7 @@ def test_only_what_is_imported_is_made_and_what_is_ready_is_kept(
         assert made() == []
         box = module.HTTPBox2D()
         assert made() == ["_http_box2_d.py", "_inner.py", "_leaf.py"]
-        assert "of near_msgs/msg/HTTPBox2D and of what it uses (interface files: 3)" in (
+        assert "of near_msgs/msg/HTTPBox2D, and of what that uses (interface files: 2), once" in (
             capfd.readouterr().err
         )
         assert box.leaves[1].x == 0
@@ -303,6 +304,12 @@ def test_only_what_is_imported_is_made_and_what_is_ready_is_kept(
     with unbuilt_packages([tmp_path]):
         import_module("near_msgs.msg").HTTPBox2D()
         assert capfd.readouterr().err == ""
+        exec("from near_msgs.action import A, B")  # rosidl is started once for a statement
+        assert capfd.readouterr().err.count("of near_msgs/action/A, B, once") == 1
+        exec("from near_msgs.action import *")
+        assert capfd.readouterr().err == (
+            "rsltrace: note: making Python classes of near_msgs/action/C, D, E, F, G, once\n"
+        )
 
 
 @given(st.from_regex(r"[A-Z][A-Za-z0-9]{0,12}", fullmatch=True))
@@ -404,3 +411,29 @@ def test_what_is_installed_counts_and_what_is_nowhere_is_not_found(tmp_path: Pat
         assert metadata.version("pytest") == pytest.__version__
         with pytest.raises(metadata.PackageNotFoundError):
             metadata.version("nowhere_to_be_found")
+
+
+def test_a_long_import_says_how_far_it_is_and_loses_nothing_when_it_is_cut_off(
+    tmp_path: Path,
+    caches: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    files = {f"msg/M{number}.msg": "int32 x\n" for number in range(4)}
+    _write(tmp_path, {"package.xml": "<package><name>long_msgs</name></package>", **files})
+    monkeypatch.setattr(interfaces, "_TOLD_EVERY_S", 0.0)
+    told: list[str] = []
+
+    def cut_off(text: str) -> None:
+        told.append(text)
+        if text.startswith("2 of 4"):
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(interfaces, "_tell", cut_off)
+    maker = interface_makers(source_packages([tmp_path]))["long_msgs"]
+    with pytest.raises(KeyboardInterrupt):
+        maker.make("msg", "M0", "M1", "M2", "M3")
+    assert told[0] == "making Python classes of long_msgs/msg/M0, M1, M2, M3, once"
+    assert told[1] == "1 of 4 interface files are ready for long_msgs/msg/M0, M1, M2, M3"
+    assert all(maker.module_of("msg", name).is_file() for name in ("M0", "M1"))
+    assert not maker.module_of("msg", "M3").is_file()

@@ -18,6 +18,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+READY = "\x01ready\n"
+"""A line of standard output for each interface that is ready; rosidl's own are others."""
 _NEW = ".new-"
 """What is begun long ago and was never ready is removed by its name: ``cache``."""
 
@@ -31,6 +33,7 @@ def main() -> str | None:
         try:
             _make(one, order, made)
             _put(made, into)
+            os.write(1, READY.encode())
         except Exception as error:
             said = " ".join(str(error).split()) or type(error).__name__
             place = str(Path(one["folder"], one["file"]))

@@ -233,6 +233,8 @@ def made_when_imported(module: str) -> tuple[Callable[[str], Any], list[str]]:
     def get(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        with engage(None):  # what that takes is none of the node's doing
+            maker.make(kind, *dict.fromkeys(names[one] for one in _wanted(name) if one in names))
         file = maker.module_of(kind, names[name])
         made = import_module(f"{module}.{file.stem}")
         offered = {one: getattr(made, one) for one, stem in names.items() if stem == names[name]}
@@ -240,6 +242,16 @@ def made_when_imported(module: str) -> tuple[Callable[[str], Any], list[str]]:
         return offered[name]
 
     return get, sorted(names)
+
+
+def _wanted(name: str) -> Sequence[str]:
+    """Return what else the import statement names for which ``name`` is looked up: rosidl is
+    started once for all."""
+    frame = sys._getframe(2)
+    if frame.f_code.co_name == "_handle_fromlist":
+        listed = frame.f_locals.get("fromlist")
+        return [str(one) for one in listed] if isinstance(listed, (list, tuple)) else [name]
+    return [name]
 
 
 def unbuilt_executables(package: str) -> dict[str, str | Path]:

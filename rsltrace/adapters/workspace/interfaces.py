@@ -12,7 +12,9 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import redirect_stderr, suppress
 from functools import cached_property
 from importlib import metadata
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
+from rsltrace.adapters.workspace.generate import READY
 from rsltrace.errors import JobError, SetupError
 from rsltrace.source_packages import SourcePackage
 from rsltrace.terminal import tell
@@ -43,6 +46,8 @@ _FIELD = re.compile(
 )
 _USED_BY_ALL = ("service_msgs", "action_msgs", "unique_identifier_msgs", "builtin_interfaces")
 """The packages whose types every service and action uses."""
+_NAMED_MAX = 5
+_TOLD_EVERY_S = 5.0
 _SERVICE = ("", "_Event", "_Request", "_Response")
 _ACTION = ("", *(f"_{part}{end}" for part in ("GetResult", "SendGoal") for end in _SERVICE[1:]))
 EXPORTS = {"msg": ("",), "srv": _SERVICE, "action": _ACTION}
@@ -135,18 +140,21 @@ class InterfaceMaker:
         """Return the file with the class of an interface, whether it is made or not."""
         return self.modules / kind / f"_{module_name(stem)}.py"
 
-    def make(self, kind: str, stem: str) -> None:
-        """Make the classes of an interface, and of those that it uses, unless they are there.
+    def make(self, kind: str, *stems: str) -> None:
+        """Make the classes of interfaces, and of those that they use, unless they are there.
 
         :raises JobError: if its file cannot be understood, or uses what is not there.
         :raises SetupError: if rosidl is not there.
         """
-        if self.module_of(kind, stem).is_file():
-            return
-        file = next(f for f in self._package.interfaces if (f.parent.name, f.stem) == (kind, stem))
         needed: dict[tuple[str, Path], InterfaceMaker] = {}
-        self._collect(file, needed, ())
-        _generate(f"{self._package.name}/{kind}/{stem}", _order(needed))
+        for file in self._package.interfaces:
+            if file.parent.name == kind and file.stem in stems:
+                self._collect(file, needed, ())
+        if needed:
+            names = [stem for stem in stems if any(file.stem == stem for _, file in needed)]
+            more = f" and {len(names) - _NAMED_MAX} more" if len(names) > _NAMED_MAX else ""
+            name = f"{self._package.name}/{kind}/{', '.join(names[:_NAMED_MAX])}{more}"
+            _generate(name, _order(needed), uses=len(needed) - len(names))
 
     def _collect(
         self,
@@ -267,8 +275,11 @@ def _versions() -> str:
     return " ".join(found)
 
 
-def _generate(name: str, order: dict[str, Any]) -> None:
-    """Have rosidl make what the order says, in a process of its own; what is ready is kept."""
+def _generate(name: str, order: dict[str, Any], *, uses: int) -> None:
+    """Have rosidl make what the order says, in a process of its own; what is ready is kept.
+
+    ``name`` is what somebody wants, ``uses`` how many interfaces more that takes.
+    """
     missing = [module for module in _NEEDED if find_spec(module) is None]
     templates = _templates()
     if missing or templates is None:
@@ -277,23 +288,38 @@ def _generate(name: str, order: dict[str, Any]) -> None:
             f"ROS's rosidl ({', '.join(missing) or 'rosidl_generator_py'} cannot be found): "
             "pip install ros-jazzy-common-interfaces, or source a ROS 2 that has rosidl"
         )
-    _say_what_takes_long(name, len(order["interfaces"]))
-    done = subprocess.run(
-        [sys.executable, "-c", _RUN, json.dumps(sys.path)],
-        input=json.dumps({**order, "templates": str(templates)}),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode:
-        raise _failure(name, done.stderr)
+    more = f", and of what that uses (interface files: {uses})" if uses else ""
+    _tell(f"making Python classes of {name}{more}, once")
+    with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as given:
+        json.dump({**order, "templates": str(templates)}, given)
+        given.seek(0)
+        command = [sys.executable, "-c", _RUN, json.dumps(sys.path)]
+        pipes: Any = {"stdin": given, "stdout": subprocess.PIPE, "stderr": said}
+        with subprocess.Popen(command, text=True, **pipes) as process:
+            try:
+                _tell_progress(process.stdout or (), name, len(order["interfaces"]))
+            except BaseException:
+                process.kill()
+                raise
+        if process.returncode:
+            said.seek(0)
+            raise _failure(name, said.read())
 
 
-def _say_what_takes_long(name: str, files: int) -> None:
-    """Say what is being made, past what a node may have put in the place of ``sys.stderr``."""
-    uses = f" and of what it uses (interface files: {files})" if files > 1 else ""
+def _tell_progress(lines: Iterable[str], name: str, count: int) -> None:
+    """Say now and then how much is ready."""
+    ready, told_s = 0, time.monotonic()
+    for line in lines:
+        ready += line == READY
+        if line == READY and time.monotonic() - told_s >= _TOLD_EVERY_S:
+            told_s = time.monotonic()
+            _tell(f"{ready} of {count} interface files are ready for {name}")
+
+
+def _tell(text: str) -> None:
+    """Say something past what a node may have put in the place of ``sys.stderr``."""
     with suppress(OSError, ValueError), redirect_stderr(sys.__stderr__):
-        tell(f"rsltrace: note: making Python classes of {name}{uses}, once")
+        tell(f"rsltrace: note: {text}")
 
 
 def _failure(name: str, said: str) -> JobError | SetupError:
