@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.adapters.workspace import cache
+from rsltrace.adapters.workspace import cache, interfaces
 from rsltrace.adapters.workspace.build_files import entry_points, name_and_version
 from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.adapters.workspace.installs import share_prefix

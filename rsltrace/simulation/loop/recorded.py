@@ -61,7 +61,8 @@ class Recorded:
     of one of this run, by its id. ``chosen`` chooses as the recording's own policy did: then the
     run is the recording's as long as it does the same, which whoever ends the events has to
     look at (``recorded_run`` in ``simulation/middleware/events``). Where nobody knows what it
-    chose (None) the events are all there is, and what has none of its own, see ``choices.py``, runs as it comes.
+    chose (None) the events are all there is, and what has none of its own, see ``Choices`` in
+    ``policy.py``, runs as it comes.
 
     :raises RunError: from ``choose``, if what the recording has next cannot run now.
     """
