@@ -23,12 +23,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.view import Sent
-
 from rsltrace import Job, load_job
 from rsltrace.checks.evaluate import condition, opposite, plain, title, topic_of
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.view import Sent
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.printable import NS_PER_S
 

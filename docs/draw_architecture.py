@@ -46,7 +46,9 @@ BOXES = (
     Box(468, 458, 168, 54, "guard", "clocks, chance, files", RUNNING),
     Box(180, 522, 456, 66, "simulation/middleware", "graph, QoS, links", RUNNING, 56),
     Box(180, 598, 456, 66, "simulation/loop", "simulated time", RUNNING, 56),
-    Box(180, 674, 456, 56, "simulation/chance", "delays and losses, from named streams", RUNNING, 56),
+    Box(
+        180, 674, 456, 56, "simulation/chance", "delays and losses from named streams", RUNNING, 56
+    ),
     Box(646, 108, 444, 270, "diff", "where two runs diverge, and why", READING),
     Box(658, 160, 268, 64, "report", "text, JSON, Markdown, one line", ROOM),
     Box(658, 232, 268, 64, "causes · traces · bags", "roots, consequences, evidence", ROOM),
@@ -55,7 +57,15 @@ BOXES = (
     Box(646, 452, 354, 136, "trace", "events, outputs, payloads, hashes", READING),
     Box(1010, 452, 80, 136, "recordings", "rosbag2", READING),
     Box(646, 598, 444, 132, "trace/mcap", "records, chunks, indexes; cut-off, remote", READING, 49),
-    Box(180, 740, 910, 54, "trace/model · errors", "frozen values that all share; every error", SHARED),
+    Box(
+        180,
+        740,
+        910,
+        54,
+        "trace/model · errors",
+        "frozen values that all share; every error",
+        SHARED,
+    ),
 )
 
 OUTSIDE = (

@@ -222,7 +222,8 @@ _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/stacks/exit_handlers.py", "register"): "of the module atexit",
     ("rsltrace/adapters/rclpy/stacks/exit_handlers.py", "unregister"): "of the module atexit",
     ("rsltrace/adapters/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
-    ("rsltrace/guard/virtual/set_order.py", "exec_module"): "of Python's loaders",
+    ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
+    ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
     ("rsltrace/adapters/launch/python_file.py", "include"): "a slot of LaunchContext",
 }
 """What has the name of a method, and why it is none of the product's objects'."""
@@ -269,7 +270,10 @@ RUNS_CODE = {
     "rsltrace/adapters/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
     "rsltrace/search/explore/worker.py": "import_module",  # what the last run has imported
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
-    "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
+    "rsltrace/guard/virtual/user_modules.py": "compile exec_module",  # the same, with our calls
+    "rsltrace/guard/virtual/set_order.py": "pickle",  # makes its pickles of sets ordered
+    "rsltrace/run/plans/executables.py": "import_module",  # main: of a package, by its own program
+    "rsltrace/adapters/workspace/imports.py": "import_module",  # interfaces that were just made
     "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
     "rsltrace/run/plans/scheduling.py": "import_module",  # node: module:Class
     "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment

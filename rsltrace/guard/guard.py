@@ -12,7 +12,7 @@ from collections.abc import Callable
 from fnmatch import fnmatchcase
 from types import FrameType
 from typing import Any
-from weakref import WeakSet
+from weakref import WeakKeyDictionary
 
 from rsltrace.errors import GuardError
 from rsltrace.guard import engagement
@@ -47,7 +47,7 @@ from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
-_guards: WeakSet[Guard] = WeakSet()
+_guards: WeakKeyDictionary[Guard, None] = WeakKeyDictionary()  # no set: a run puts those in order
 
 FINDINGS_PER_EVENT = 100
 """An event that looks at the address of a million objects is one problem, not a million."""
@@ -148,7 +148,7 @@ class Guard:
         self.makes_chance = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
         self.thread = engagement.thread_id()
         self.process = _process_id()
-        _guards.add(self)
+        _guards[self] = None
         self._event = -1
         self._in_event = 0
         self._reads = 0

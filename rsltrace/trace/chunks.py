@@ -20,7 +20,7 @@ from rsltrace.trace.format import (
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
-from rsltrace.trace.mcap.chunk import ChunkBody, rows_chunk
+from rsltrace.trace.mcap.chunk_body import ChunkBody, rows_chunk
 from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 

@@ -56,7 +56,7 @@ from rsltrace.trace.format import (
     TOPIC_TIMINGS,
 )
 from rsltrace.trace.index import metadata_checksum
-from rsltrace.trace.mcap.chunk import Waiting, messages_chunk
+from rsltrace.trace.mcap.chunk_body import Waiting, messages_chunk
 from rsltrace.trace.mcap.deferred import DeferredWriter
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter

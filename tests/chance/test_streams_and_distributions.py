@@ -26,7 +26,8 @@ from rsltrace.simulation.chance.distribution import (
     Uniform,
     quantile,
 )
-from rsltrace.simulation.chance.stream import Stream, exp, log
+from rsltrace.simulation.chance.exact import exp, log
+from rsltrace.simulation.chance.stream import Stream
 
 N = 100_000
 MS = 1_000_000

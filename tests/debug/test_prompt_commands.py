@@ -198,7 +198,7 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Shell]:
     ("line", "says"),
     [
         ("step x", "'x' is no whole number"),
-        ("goto", "where to? 812 is an event, 2.5s a simulated time"),
+        ("goto", "where to? 812 is an event, 2.5s a time of the run"),
         ("info nods", "no info 'nods'; did you mean 'nodes'?"),
         ("print", "print what?"),
         ("p/x speed", "there are no formats"),

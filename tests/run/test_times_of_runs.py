@@ -7,10 +7,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.text import parse_condition
 
 import rsltrace
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.text import parse_condition
 from rsltrace.job import load_job
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.run import run

@@ -10,7 +10,6 @@ import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
 
 # How much of anything is read from a file or a server before it is refused.
@@ -60,22 +59,6 @@ REQUEST_SECONDS_MAX = 60.0
 
 REMOTE_SECONDS_MAX = 600.0
 """For all requests of one open file together."""
-
-
-# The header of an MCAP message as numpy sees it: ``records.MESSAGE_HEAD`` is the same.
-
-MESSAGE_HEADER_DTYPE = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel_id", "<u2"),
-        ("message_sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
-"""``message_sequence`` is what MCAP calls ``sequence``: messages have fields of
-that name, too, and may stand in one layout with it."""
 
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -23,7 +23,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from rsltrace.trace.mcap.chunk import ChunkBody
+from rsltrace.trace.mcap.chunk_body import ChunkBody
 
 _FOOTER_BEFORE_CRC = struct.Struct("<BQQQ")
 _FOOTER_BYTES = 20

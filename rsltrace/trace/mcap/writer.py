@@ -16,7 +16,7 @@ from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, 
 
 from rsltrace.errors import OutputError
 from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
-from rsltrace.trace.mcap.chunk import ChunkBody
+from rsltrace.trace.mcap.chunk_body import ChunkBody
 from rsltrace.trace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
 from rsltrace.trace.mcap.sink import Sink
 from rsltrace.trace.mcap.summary_writer import SummaryBuilder, record_bytes

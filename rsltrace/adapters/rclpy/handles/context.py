@@ -68,7 +68,9 @@ class ContextHandle(Handle):
         for node in graph.nodes:
             if getattr(node, "context", None) is self:
                 for publisher in graph.publishers_of(node):
-                    publisher.refuse(self._refuse)  # type: ignore[attr-defined]
+                    refuse = getattr(publisher, "refuse", None)  # a bag's has none
+                    if refuse is not None:
+                        refuse(self._refuse)
 
     def _refuse(self, message: object) -> NoReturn:
         self._cut_off()

@@ -44,6 +44,11 @@ class LogSink(Protocol):
         """Forget a node."""
 
 
+_GROUPS: weakref.WeakKeyDictionary[NodeHandle, list[weakref.ref[Any]]] = weakref.WeakKeyDictionary()
+"""The callback groups of nodes that have more than the default one, in the order of their use. Not
+an attribute: Python shares the names of at most thirty among objects of a class."""
+
+
 class NodeHandle(Destroyable, Participant):
     """Stands in for ``_rclpy.Node``.
 
@@ -105,7 +110,6 @@ class NodeHandle(Destroyable, Participant):
         self.mailbox: Mailbox | None = None
         self.rosout: DomainEntity | None = None
         self._made = _node_being_made()
-        self._groups: list[weakref.ref[Any]] = []
         self.user_waitables: dict[Any, Any] = {}
         self.waitable_count = 0
         domain.graph.add_node(self)
@@ -286,10 +290,11 @@ class NodeHandle(Destroyable, Participant):
         ``reentrant 2``; "" for the default one."""
         if group is None or group is getattr(self.made, "default_callback_group", group):
             return ""
-        number = next((n for n, one in enumerate(self._groups, 1) if one() is group), 0)
+        groups = _GROUPS.setdefault(self, [])
+        number = next((n for n, one in enumerate(groups, 1) if one() is group), 0)
         if not number:
-            self._groups.append(weakref.ref(group))
-            number = len(self._groups)
+            groups.append(weakref.ref(group))
+            number = len(groups)
         kind = type(group).__name__
         return f"{_GROUP_KINDS.get(kind, kind)} {number}"
 
