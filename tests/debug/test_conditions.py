@@ -53,6 +53,7 @@ class View:
 
     index: int = 0
     stamp_ns: int = 0
+    start_ns: int = 0
     kind: int = EventKind.SUBSCRIPTION
     entity: int = 7
     entity_name: str = "/odom"
