@@ -26,9 +26,7 @@ def _count(text: str, otherwise: int = 1) -> int:
 
 def _place(text: str) -> int | str:
     if not text:
-        raise DebugError(
-            "where to? 812 is an event, 2.5s a time of the run"
-        )
+        raise DebugError("where to? 812 is an event, 2.5s a time of the run")
     return int(text) if text.isascii() and text.isdecimal() else text.removeprefix("t=")
 
 
