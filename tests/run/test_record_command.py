@@ -358,19 +358,16 @@ def test_the_trace_has_the_job_as_it_ran(rsltrace: Any, job_file: Any, tmp_path:
     """What an override changed is in the trace's job, which loads as the job that ran."""
     job_file("nodes: [{node: nodes_under_test:Talker, name: a}]\nstop: {duration: 9s}\n")
     command = ("record", "job.yaml", "-o", "run.mcap", "--seed", "4", "--until", "3")
-    done = rsltrace(
-        *command, "--set", "nodes.a.arguments.period=0.5", "--set", "stop.duration=null"
-    )
+    done = rsltrace(*command, "--set", "nodes.a.arguments.period=0.5")
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
         text, resolved = trace.job_text, json.loads(trace.job["resolved"])
-    assert (resolved["seed"], resolved["stop"]["time_ns"]) == (4, 3 * 10**9)
+    assert (resolved["seed"], resolved["stop"]["duration_ns"]) == (4, 3 * 10**9)
     assert text.startswith(
         "# The effective job of job.yaml\n"
         "#   with --set nodes.a.arguments.period=0.5\n"
-        "#   with --set stop.duration=null\n"
         "#   with --seed seed=4\n"
-        '#   with --until stop.time="3s"\n'
+        '#   with --until stop.duration="3s"\n'
     )
     (tmp_path / "again.yaml").write_text(text)
     again = rsltrace("record", "again.yaml", "-o", "again.mcap")
