@@ -596,7 +596,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
 
         gc.unfreeze()
         held = [each for each in gc.get_objects() if isinstance(each, Program)]
-        kept.extend(len(each.failures) for each in held if each.entry is not None)
+        kept.extend(len(each.failures) for each in held if each.entry and each.failures)
         rclpy.shutdown()
 
     simulate(NodeSpec(main=main))
