@@ -29,7 +29,7 @@ from rsltrace.checks.properties import Eventually, Never, Property, Rate
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.view import Sent
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S
 
 DISCOVERY_S_MAX = 30.0
 SETTLE_S = 0.2

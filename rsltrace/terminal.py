@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 
-from rsltrace.trace.model.printable import printable_lines
+from rsltrace.trace.model.texts import printable_lines
 
 
 def say(text: str = "", *, end: str = "\n") -> None:

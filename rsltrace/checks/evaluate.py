@@ -22,7 +22,7 @@ from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.values.target import Target, target_text
-from rsltrace.trace.model.printable import NS_PER_S, format_duration
+from rsltrace.trace.model.texts import NS_PER_S, format_duration
 from rsltrace.trace.reader import Trace
 
 # The texts of checks as conditions: those of the debugger that speak of what others can see.

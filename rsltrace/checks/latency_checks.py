@@ -11,7 +11,7 @@ from rsltrace.checks.latency.instances import quantile
 from rsltrace.checks.latency.measure import ChainLatency, Latencies, measuring
 from rsltrace.checks.properties import KEPT_MAX, Violation
 from rsltrace.job.parts.check import LatencySpec
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.reader import Trace
 
 _WORDS = {

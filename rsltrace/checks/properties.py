@@ -13,7 +13,7 @@ from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.trace_events import TraceEvent
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import NS_PER_S, format_duration, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 
 _SHOWN_MAX = 3
 KEPT_MAX = 1000

@@ -17,7 +17,7 @@ from rsltrace.cli.output.text_file import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job

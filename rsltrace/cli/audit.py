@@ -14,7 +14,7 @@ import click
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import EXIT_USAGE
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.guard.audit.rules import Audit, Found

@@ -22,7 +22,7 @@ from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind
 from rsltrace.trace.model.finding import Finding
-from rsltrace.trace.model.printable import format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.code import code_places, output_places, places_text

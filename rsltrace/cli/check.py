@@ -14,7 +14,7 @@ from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.words.phrases import table
 
 if TYPE_CHECKING:

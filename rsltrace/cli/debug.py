@@ -12,7 +12,7 @@ import click
 from rsltrace.cli.job_source import set_option
 from rsltrace.cli.replay import agree, code_lines
 from rsltrace.terminal import tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 
 @click.command()

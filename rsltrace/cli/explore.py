@@ -21,7 +21,7 @@ from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import terminated
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -38,7 +38,7 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
     """Read ``1000`` (trials) or ``10min`` (of real time)."""
     from rsltrace.job.values.times import parse_time
     from rsltrace.search.explore.search import Budget
-    from rsltrace.trace.model.printable import NS_PER_S
+    from rsltrace.trace.model.texts import NS_PER_S
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from rsltrace.terminal import tell
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 EXIT_CUT = 1
 

@@ -19,7 +19,7 @@ from rsltrace.cli.output.fit_text import as_json, checked_text, text
 from rsltrace.cli.output.text_file import check_picture, save_picture, write_text
 from rsltrace.errors import OutputError, RunError, TraceError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:

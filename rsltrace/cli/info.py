@@ -25,7 +25,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import waits_of
 from rsltrace.trace.model.operation import is_built_in
-from rsltrace.trace.model.printable import NS_PER_S, format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds, printable
 from rsltrace.trace.native import Spread, busy_threads, callback_figures, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text

@@ -13,7 +13,7 @@ from rsltrace.cli.output.text_file import undone, write_text
 from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
 from rsltrace.terminal import tell
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.job.reading.node_source import Found

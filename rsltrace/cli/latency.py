@@ -21,7 +21,7 @@ from rsltrace.cli.output.latency_text import (
 )
 from rsltrace.errors import TraceError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:

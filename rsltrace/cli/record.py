@@ -20,7 +20,7 @@ from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import READ_BY, Source
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.logs import silent_topics, without_server
 
 if TYPE_CHECKING:

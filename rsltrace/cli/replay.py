@@ -24,7 +24,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.guard.pin import unpin
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.replay.edits import Edit

@@ -9,7 +9,7 @@ from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, Moment
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 _NOT_THERE = "(not there)"
 

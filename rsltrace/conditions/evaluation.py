@@ -46,7 +46,7 @@ from rsltrace.conditions.functions import (
 )
 from rsltrace.conditions.operators import BINARY, COMPARE, UNARY, USUAL, element
 from rsltrace.errors import ConditionError, did_you_mean
-from rsltrace.trace.model.printable import PLACEHOLDERS
+from rsltrace.trace.model.texts import PLACEHOLDERS
 
 LANGUAGE = (
     "fields, numbers, texts, comparisons, and, or, not, in, arithmetic, indexes, A if B else C, "

@@ -203,7 +203,7 @@ class Diff:
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it."""
         from rsltrace.trace.model.html import Sheet
-        from rsltrace.trace.model.printable import format_seconds
+        from rsltrace.trace.model.texts import format_seconds
         from rsltrace.trace.words.phrases import as_sentence
 
         sheet = Sheet(as_sentence(self.sentence))

@@ -20,7 +20,7 @@ from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""

@@ -22,7 +22,7 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TIMING
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.native import CUT_AFTER_NS
 from rsltrace.trace.recorder import Recorder
 

@@ -15,7 +15,7 @@ from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.run.driver import time_of_step
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.policy import Departures
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 
 def run_up_to(session: Session, time_ns: int) -> bool:

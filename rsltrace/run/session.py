@@ -74,7 +74,7 @@ from rsltrace.trace.format import METADATA_ENVIRONMENT
 from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.model.drop import kept_drops
 from rsltrace.trace.model.finding import EndlessWait, GuardCount, kept_waits
-from rsltrace.trace.model.printable import format_seconds, shortened
+from rsltrace.trace.model.texts import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 

@@ -18,7 +18,7 @@ from rsltrace.run.session import RunResult, Session
 from rsltrace.run.tap import Tap
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 T = TypeVar("T")
 Time = str | int | float

@@ -18,7 +18,7 @@ from rsltrace.run.plans.entries import entry_keys
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.events.event import Asker, Census
 from rsltrace.trace.model.operation import NODE_SERVICES
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 
 # Remappings of a job that remap nothing: no node has asked for the name that they replace.
 #

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 from rsltrace.guard.callers import in_import, is_user_file
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.terminal import tell
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain

@@ -20,7 +20,7 @@ from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE, T
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.reader import Trace
 
 # Counting a trace: how many events and outputs, of what kinds, of which entities, how often.
@@ -75,18 +75,19 @@ def count(trace: Trace) -> Counts:
     counts = Counts()
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         stamps = events["stamp"]
-        _add(counts.events, events["entity"], stamps)
+        add_series(counts.events, events["entity"], stamps)
         own = outputs[outputs["kind"] != _ENTITY]
         owners = (own["event"] - events["index"][0]).astype(np.intp)
-        _add(counts.outputs, own["entity"], stamps[owners])
+        add_series(counts.outputs, own["entity"], stamps[owners])
         _add_kinds(counts.event_kinds, events["kind"])
         _add_kinds(counts.output_kinds, outputs["kind"])
     return counts
 
 
-def _add(
+def add_series(
     series: dict[int, Series], entities: npt.NDArray[np.uint32], stamps: npt.NDArray[np.uint64]
 ) -> None:
+    """Add rows to the series of their entities: how many, the first time and the last."""
     ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
     first = np.full(len(ids), 2**64 - 1, dtype=np.uint64)
     last = np.zeros(len(ids), dtype=np.uint64)

@@ -29,7 +29,7 @@ from rsltrace.trace.cdr import STAND_IN_TYPE, with_wide_texts, without_wide_text
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.mcap import records as limits
 from rsltrace.trace.mcap.records import SCHEMA_ENCODING
-from rsltrace.trace.model.printable import PLACEHOLDERS
+from rsltrace.trace.model.texts import PLACEHOLDERS
 
 if TYPE_CHECKING:
     from rsltrace.trace.leaves import Leaf

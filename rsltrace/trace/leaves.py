@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.interfaces import Nodetype
 
 from rsltrace.trace.cdr import STAND_IN_TYPE
-from rsltrace.trace.model.printable import NO_FIELD
+from rsltrace.trace.model.texts import NO_FIELD
 
 _DEPTH_MAX = 6
 

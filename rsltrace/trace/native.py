@@ -15,7 +15,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING_DTYPE, TOPIC_TIMINGS
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
-from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.reader import Trace
 
 CUT_AFTER_NS = 2 * NS_PER_S

@@ -67,7 +67,7 @@ from rsltrace.trace.mcap.walk import read_body, walk_records
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, Event, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, Mode
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 

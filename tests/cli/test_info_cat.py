@@ -31,7 +31,7 @@ from rsltrace.cli.main import cli
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.phrases import table
 from tests.golden_files import check_golden
 

@@ -14,7 +14,7 @@ from mcap.opcode import Opcode
 from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
 from rsltrace.cli.main import cli
-from rsltrace.trace.model.printable import printable_lines
+from rsltrace.trace.model.texts import printable_lines
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x08\x9b31m\u202eevil\u2066"

@@ -12,7 +12,7 @@ from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow
 from rsltrace.diff.sentences.values import durations
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import durations_apart, format_duration, printable, told_apart
+from rsltrace.trace.model.texts import durations_apart, format_duration, printable, told_apart
 from rsltrace.trace.words.entities import EntityKey
 
 MESSAGE = int(OutputKind.MESSAGE)

@@ -14,7 +14,7 @@ import rclpy
 from rclpy.node import Node
 
 from rsltrace import NodeSpec
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 pytestmark = pytest.mark.ros
 

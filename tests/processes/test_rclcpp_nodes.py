@@ -29,6 +29,10 @@ pytestmark = [
     pytest.mark.long,
     pytest.mark.skipif(not _HAS_RCLCPP, reason="needs rclcpp: source a ROS 2 that has it"),
 ]
+_HAS_COMPONENTS = any(
+    (one / "lib/rclcpp_components/component_container").exists() for one in PREFIXES
+)
+needs_components = pytest.mark.skipif(not _HAS_COMPONENTS, reason="needs rclcpp_components")
 _INTERFACES = ("std_msgs", "std_srvs", "rcl_interfaces", "builtin_interfaces", "statistics_msgs")
 
 
@@ -131,6 +135,7 @@ def test_a_loop_at_a_rate_gets_all_that_there_is_in_the_order_of_the_loop(
         assert seen[at : at + 8] == list(range(8))
 
 
+@needs_components
 def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     prefix = tmp_path / "install"
     index = prefix / "share/ament_index/resource_index"
@@ -174,6 +179,7 @@ def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.Monkey
     assert EventKind.SERVICE in kinds
 
 
+@needs_components
 def test_a_component_that_is_not_there_is_named(tmp_path: Path) -> None:
     job = """
 nodes:

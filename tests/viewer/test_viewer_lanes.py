@@ -16,7 +16,7 @@ from rsltrace_viewer.model.lanes import Lanes, axis_text, drawn
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.view import OneRun, Window, ends_of, spread, step_below, step_from
 
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 _S = 1_000_000_000
 

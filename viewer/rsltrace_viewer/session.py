@@ -15,7 +15,7 @@ from rsltrace.errors import TraceError
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S, format_duration
+from rsltrace.trace.model.texts import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks

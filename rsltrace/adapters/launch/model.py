@@ -15,7 +15,7 @@ from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job
 from rsltrace.job.reading.yaml_source import Place
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 # What a launch file can see while it is read: arguments, environment, namespace, defaults.
 

@@ -22,7 +22,7 @@ from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import NO_EVENT, Draw, EventKind, encode_draw
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 _DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
 

@@ -8,7 +8,7 @@ from textwrap import fill
 from typing import Any
 
 from rsltrace.native.timing.analysis import Analysis, ChainResult, Seen
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
 
 # The picture of ``rsltrace analyze``: for each chain its bound, what was seen, its deadline.

@@ -13,7 +13,7 @@ from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job
 from rsltrace.run.process import search_path
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import code_place
 from rsltrace.trace.words.events import EventWords

@@ -14,7 +14,7 @@ from rsltrace.trace.model.event import (
     draw_text,
     is_switch,
 )
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import code_place, output_places
 from rsltrace.trace.words.kinds import flag_names

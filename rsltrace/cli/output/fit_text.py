@@ -12,7 +12,7 @@ from rsltrace.checks.latency.instances import Durations
 from rsltrace.native.fit.comparison import NEAR, Checked, CheckedChain, Compared, far
 from rsltrace.native.fit.models import Model, as_job_has_it
 from rsltrace.native.fit.parts import Fit, time_text
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
 
 _PERCENT = (50, 95, 99)

@@ -15,7 +15,7 @@ from xml.sax.saxutils import escape
 
 from rsltrace.errors import SetupError
 from rsltrace.simulation.middleware.overview import End, Link, Overview
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 _CHARACTER = 7.3
 _ROW = 54.0

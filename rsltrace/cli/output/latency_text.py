@@ -10,7 +10,7 @@ from typing import Any
 
 from rsltrace.checks.latency.instances import Figures, Parts, Passage, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.phrases import table
 

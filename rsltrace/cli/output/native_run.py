@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.errors import NodeError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:

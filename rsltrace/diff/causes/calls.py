@@ -21,7 +21,7 @@ from rsltrace.diff.facts.causes import UnrecordedAnswer
 from rsltrace.diff.facts.evidence import CallDifference, EventView
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.finding import Finding, Mode, Source
-from rsltrace.trace.model.printable import printable, shortened, told_apart
+from rsltrace.trace.model.texts import printable, shortened, told_apart
 
 CALLS_MAX = 20
 EARLIER_MAX = 3

@@ -19,7 +19,7 @@ from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_fi
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.reader import Trace
 
 _LINES_MAX = 20_000

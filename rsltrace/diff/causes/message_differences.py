@@ -51,7 +51,7 @@ from rsltrace.trace.model.event import (
     draw_text,
 )
 from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.code import output_places, place_here
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text

@@ -18,7 +18,7 @@ from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 _NEVER = frozenset(("record", "checks", "metrics", "vary", "livelock_limit", "stop", "vars"))

@@ -29,7 +29,7 @@ from rsltrace.diff.result import BagDiff, Diff, Divergence
 from rsltrace.diff.sentences.runs import moved_text
 from rsltrace.diff.sentences.values import fate_text, link_text, no_fields_text, notes_text
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.kinds import flag_names
 

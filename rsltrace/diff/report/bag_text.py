@@ -35,7 +35,7 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result import BagDiff
 from rsltrace.diff.sentences.runs import moved_text, tail_text
 from rsltrace.diff.sentences.values import no_fields_text
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 _COLUMNS = (
     ("equal", "equal"),

@@ -11,7 +11,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import report_lines
 from rsltrace.diff.result import BagDiff, Diff
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.phrases import as_sentence
 
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

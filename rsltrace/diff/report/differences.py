@@ -13,7 +13,7 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
 from rsltrace.diff.sentences.values import fate_text, notes_text
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.code import places_text
 
 _INDENT = "    "

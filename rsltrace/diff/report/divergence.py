@@ -21,7 +21,7 @@ from rsltrace.diff.report.line import (
 )
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.sentences.values import link_text, no_fields_text
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.phrases import event_title, seconds_text
 

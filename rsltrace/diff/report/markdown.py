@@ -12,7 +12,7 @@ from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
 from rsltrace.diff.report.text import report_lines
 from rsltrace.diff.result import BagDiff, Diff
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.phrases import as_sentence
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~@])")

@@ -11,7 +11,7 @@ from rsltrace.diff.report.divergence import event_text
 from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.diff.sentences.runs import remark_text
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 from rsltrace.trace.words.phrases import as_sentence
 
 COLUMNS = ("run", "verdict", "event", "time", "where")

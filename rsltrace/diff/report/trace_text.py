@@ -27,7 +27,7 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result import Diff, Side
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
-from rsltrace.trace.model.printable import format_seconds, printable, told_apart
+from rsltrace.trace.model.texts import format_seconds, printable, told_apart
 from rsltrace.trace.words.phrases import as_sentence, seconds_text
 
 if TYPE_CHECKING:

@@ -71,7 +71,7 @@ from rsltrace.trace.model.event import (
     kind_of,
 )
 from rsltrace.trace.model.finding import Source
-from rsltrace.trace.model.printable import durations_apart, format_duration, printable, shortened
+from rsltrace.trace.model.texts import durations_apart, format_duration, printable, shortened
 from rsltrace.trace.words.phrases import at_time, event_phrase, seconds_text
 
 PARAMETER_EVENTS = "/parameter_events"

@@ -41,7 +41,7 @@ from rsltrace.diff.facts.remarks import (
     Told,
 )
 from rsltrace.diff.sentences import says, sentence
-from rsltrace.trace.model.printable import format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.phrases import seconds_text
 
 _OPTIONS_MAX = 3

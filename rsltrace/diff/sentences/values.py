@@ -28,7 +28,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.sentences import says, sentence
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import (
+from rsltrace.trace.model.texts import (
     durations_apart,
     format_duration,
     printable,

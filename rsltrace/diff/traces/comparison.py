@@ -48,7 +48,7 @@ from rsltrace.diff.traces.ended_runs import (
 from rsltrace.diff.traces.tolerance import interruptions, messages_within, side
 from rsltrace.errors import TraceError, did_you_mean
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10

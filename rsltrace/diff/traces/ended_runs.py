@@ -24,7 +24,7 @@ from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.tolerance import interruptions, side, stop_reason
 from rsltrace.trace.format import REPLAY_DIVERGED
 from rsltrace.trace.model.event import Event, EventFlag, EventKind
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.reader import Trace
 
 # Runs that agree until the recording of one of them is cut, or that have nothing to compare.

@@ -26,7 +26,7 @@ from rsltrace.diff.values.numbers import (
     number_text,
     same_number,
 )
-from rsltrace.trace.model.printable import (
+from rsltrace.trace.model.texts import (
     NS_PER_S,
     PLACEHOLDERS,
     format_seconds,

@@ -12,15 +12,10 @@ from sys import _getframe
 from typing import Any
 
 from rsltrace.guard import frames
+from rsltrace.guard.file_report_filter import NOT_NEWS, asking_module, is_installed, is_resolving
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, at_least, engaged
-from rsltrace.guard.process_ids import (
-    NOT_NEWS,
-    asking_module,
-    is_installed,
-    is_resolving,
-    meant_path,
-)
+from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.recorded.descriptors import (
     RawDescriptor,
     opened,

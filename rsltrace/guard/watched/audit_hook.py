@@ -14,9 +14,9 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard.callers import user_frame
+from rsltrace.guard.file_report_filter import READERS_OF_CODE, asking_module, is_installed
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engage, engaged
-from rsltrace.guard.process_ids import READERS_OF_CODE, asking_module, is_installed
 from rsltrace.trace.model.finding import Mode, Source
 
 _HASHED_BYTES_MAX = 64 << 20

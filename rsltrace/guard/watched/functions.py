@@ -20,10 +20,10 @@ from types import BuiltinFunctionType, FrameType
 from typing import Any
 
 from rsltrace.guard.callers import is_of_python, module_of
+from rsltrace.guard.file_report_filter import NOT_NEWS, asking_module, is_installed
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
-from rsltrace.guard.process_ids import NOT_NEWS, asking_module, is_installed
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.watched.audit_hook import report_audit_events
 from rsltrace.trace.model.finding import READ_BY, Mode, Source

@@ -13,7 +13,7 @@ from fractions import Fraction
 from typing import NamedTuple
 
 from rsltrace.job.values.problem import Problem, describe
-from rsltrace.trace.model.printable import NS_PER_S, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
 # Sizes in a job: a number of bytes, or a number with a unit (``4MiB``).
 

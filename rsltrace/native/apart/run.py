@@ -27,7 +27,7 @@ from rsltrace.native.support import check_loopback, domain
 from rsltrace.run.plans.scheduling import has_stop
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.trace.model.printable import NS_PER_S, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
 # What several processes have done, in the order in which it began.
 #

@@ -11,7 +11,7 @@ from rsltrace.checks.latency.instances import Durations
 from rsltrace.job import Job
 from rsltrace.native.fit.measured import Execution, Link, Measured
 from rsltrace.native.fit.models import FEW, Model, as_job_has_it, model_of, series_of
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
 TABLES, FAMILIES, SERIES = HOW = ("tables", "families", "series")

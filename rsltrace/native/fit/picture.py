@@ -12,7 +12,7 @@ import numpy.typing as npt
 from rsltrace.checks.latency.instances import Durations
 from rsltrace.native.fit.models import Model
 from rsltrace.native.fit.parts import Fit
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 Numbers = npt.NDArray[np.float64]
 _COLUMNS = 3

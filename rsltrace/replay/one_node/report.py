@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
 from rsltrace.replay.one_node.result import NodeReplayResult, OutputChange
-from rsltrace.trace.model.printable import format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.phrases import table
 
 _ROWS = 15

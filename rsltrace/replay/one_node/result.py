@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:

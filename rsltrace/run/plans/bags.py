@@ -18,7 +18,7 @@ from rsltrace.run.plans.scheduling import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.printable import NS_PER_S, format_duration, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle

@@ -20,7 +20,7 @@ from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import READERS, show_original
 from rsltrace.guard.virtual.randomness import begin_shared
-from rsltrace.guard.virtual.tbb_threads import (
+from rsltrace.guard.virtual.third_party_libraries import (
     COMPILES,
     REWRITES,
     TorchStreams,

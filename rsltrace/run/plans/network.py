@@ -31,7 +31,7 @@ from rsltrace.simulation.chance.distribution import (
     Uniform,
 )
 from rsltrace.simulation.chance.stream import ClockModel
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 
 # From a job's ``clocks:`` to the clocks of its nodes.
 

@@ -36,8 +36,8 @@ from rsltrace.run.plans.executables import compiled_file, process_command
 from rsltrace.run.plans.network import clocks_of
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
-from rsltrace.trace.model.printable import printable
 from rsltrace.trace.model.regular_file import not_regular
+from rsltrace.trace.model.texts import printable
 
 
 class Processes:

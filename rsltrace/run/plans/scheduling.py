@@ -37,7 +37,7 @@ from rsltrace.simulation.loop.stop import (
 )
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
 from rsltrace.simulation.middleware.events.failure import text_of
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.entry import Entry

@@ -10,7 +10,7 @@ from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.run.plans.entries import entry_keys
 from rsltrace.simulation.middleware.graph import Graph
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 
 
 def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None) -> Iterator[str]:

@@ -38,7 +38,7 @@ from rsltrace.search.explore.trial import (
     Trial,
     TrialResult,
 )
-from rsltrace.trace.model.printable import shortened
+from rsltrace.trace.model.texts import shortened
 from rsltrace.trace.reader import Trace
 
 _FRAME = re.compile(r'File "([^"\n]*)", line (\d+)')

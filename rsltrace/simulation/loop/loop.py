@@ -23,7 +23,7 @@ from typing import Any, Protocol
 from rsltrace.errors import LivelockError
 from rsltrace.simulation.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerQueue, TimerState
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 
 class Dispatchable(Protocol):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.chance.stream import Stream
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 # What a policy has chosen, one byte for each choice it had: enough to choose the same again.
 #

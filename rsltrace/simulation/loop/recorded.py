@@ -10,7 +10,7 @@ from rsltrace.simulation.loop.policy import After, Candidate, Moment
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 THE_RUN = "the run"
 """The name of entity 0."""

@@ -14,7 +14,7 @@ from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible
 from rsltrace.simulation.middleware.qos.timing import finite
 from rsltrace.simulation.middleware.subscription import Subscription
 from rsltrace.trace.model.operation import NODE_SERVICES, NODE_TOPICS
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 
 _ACTION = "/_action/"
 _CLOCK = "/clock"

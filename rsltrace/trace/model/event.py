@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 
 # A place in user code, as far as a run has met it: where outputs come from, what callbacks run.
 

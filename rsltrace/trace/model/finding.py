@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 # Functions of rclpy that no simulation calls, because the loop does their work itself.
 #

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from itertools import islice
 from xml.etree.ElementTree import Element, SubElement, tostring
 
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 
 _ROWS_MAX = 20
 _CELL_MAX = 120

@@ -12,8 +12,8 @@ from urllib.parse import quote
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.records import FILE_BYTES_MIN, FILE_GROWTH_MAX
 from rsltrace.trace.mcap.records import MAGIC as MCAP_MAGIC
-from rsltrace.trace.model.printable import format_seconds
 from rsltrace.trace.model.regular_file import not_regular
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.recordings.mcap_file import McapFile
 from rsltrace.trace.recordings.metadata import NAME, read_metadata
 from rsltrace.trace.recordings.sqlite_file import MAGIC as SQLITE_MAGIC

@@ -38,7 +38,7 @@ from rsltrace.trace.mcap.summary import (
     read_summary,
 )
 from rsltrace.trace.mcap.walk import read_body, walk_records
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.recordings.merge import Message
 from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
 

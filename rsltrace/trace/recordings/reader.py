@@ -15,7 +15,7 @@ from types import TracebackType
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX
-from rsltrace.trace.model.printable import format_duration
+from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.recordings.files import ZSTD_MAGIC, BagFiles, open_files
 from rsltrace.trace.recordings.merge import Message, Piece, merge
 from rsltrace.trace.recordings.topic import BagTopic, Extent, Storage, StoredTopic

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any, Protocol
 
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.printable import NS_PER_S
+from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.recordings.merge import Message
 
 DURATION_INFINITE_NS = 2**63 - 1

@@ -15,7 +15,7 @@ from rsltrace.trace.cdr import STAND_IN_TYPE
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
-from rsltrace.trace.model.printable import NO_FIELD
+from rsltrace.trace.model.texts import NO_FIELD
 from rsltrace.trace.tables.rows import Labels, Source, node_names, whole_numbers
 from rsltrace.trace.tables.table import Table
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 # Names and levels as people type them, in filters and in breakpoints.
 

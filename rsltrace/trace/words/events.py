@@ -9,7 +9,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind, draw_text, is_switch
 from rsltrace.trace.model.operation import is_built_in
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityNames
 from rsltrace.trace.words.kinds import kind_label

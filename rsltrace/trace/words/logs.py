@@ -14,7 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import Output
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 # What somebody waits for in vain: a topic that nobody publishes, a service or an action that

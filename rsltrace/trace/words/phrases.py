@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 
 if TYPE_CHECKING:
     from rsltrace.trace.words.entities import EntityKey

@@ -15,7 +15,7 @@ from textual.worker import get_current_worker
 from rsltrace.debug.checkpoints import Breakpoint
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import DebugError, RsltraceError
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, Stop, Superseded
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.terminal.app import ViewerApp

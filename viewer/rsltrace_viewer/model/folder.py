@@ -9,7 +9,7 @@ from pathlib import Path
 
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.model.printable import format_duration, printable
+from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings import open_bag

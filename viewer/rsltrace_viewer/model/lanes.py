@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace_viewer.model.view import Floats, Window
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from rsltrace.errors import TraceError
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.logs import LEVEL_WARN, LogRecord, parse_log
 from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.run import Run

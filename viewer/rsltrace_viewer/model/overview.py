@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.contents import Series
+from rsltrace.trace.contents import Series, add_series
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import Draw, EventFlag, EventKind, OutputKind, encode_draw
 from rsltrace.trace.model.operation import is_built_in
@@ -92,11 +92,11 @@ def read_overview(run: Run) -> Iterator[Overview]:
             yield found
             continue
         events, stamps = segment.events, segment.events["stamp"]
-        _add(found.events, events["entity"], stamps)
+        add_series(found.events, events["entity"], stamps)
         draws = outputs[outputs["kind"] == _DRAW]
         sent = outputs[~np.isin(outputs["kind"], _NOT_SENT)]
         places = (sent["event"] - np.uint64(segment.first)).astype(np.intp)
-        _add(found.sent, sent["entity"], stamps[places])
+        add_series(found.sent, sent["entity"], stamps[places])
         _add_since_causes(found, segment, before)
         before = segment
         kinds, values = draws["hash"] >> _VALUE_BITS, (draws["hash"] & _VALUE).astype(np.int64)
@@ -108,19 +108,6 @@ def read_overview(run: Run) -> Iterator[Overview]:
         yield found
     found.share = 1.0
     yield found
-
-
-def _add(
-    series: dict[int, Series], entities: npt.NDArray[np.uint32], stamps: npt.NDArray[np.uint64]
-) -> None:
-    ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
-    first = np.full(len(ids), 2**64 - 1, dtype=np.uint64)
-    last = np.zeros(len(ids), dtype=np.uint64)
-    np.minimum.at(first, places, stamps)
-    np.maximum.at(last, places, stamps)
-    rows = zip(ids.tolist(), counts.tolist(), first.tolist(), last.tolist(), strict=True)
-    for entity, number, first_ns, last_ns in rows:
-        series.setdefault(entity, Series()).add(number, first_ns, last_ns)
 
 
 _OF_CAUSES = ("stamp", "entity")

@@ -19,7 +19,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, Event, EventKind, Output, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S, printable
+from rsltrace.trace.model.texts import NS_PER_S, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.entities import RUN_NAME

@@ -26,7 +26,7 @@ from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.markdown import code_block
 from rsltrace.diff.result import Diff, Divergence
 from rsltrace.diff.sentences.values import link_text
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 from rsltrace.trace.words.phrases import event_title
 from rsltrace_viewer.rerun_export.columns import (
     EVENT,

@@ -17,7 +17,7 @@ import rerun as rr
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_DETAILS, TOPIC_ROSOUT
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 # Where things are in Rerun's tree of entities, and what they are called there.

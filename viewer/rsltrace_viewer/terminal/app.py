@@ -15,7 +15,7 @@ from textual.widget import Widget
 
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run

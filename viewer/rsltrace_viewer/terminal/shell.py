@@ -20,7 +20,7 @@ from textual.geometry import Size
 from textual.worker import get_current_worker
 
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.source import Source, source_of
 from rsltrace_viewer.session import Session

@@ -18,7 +18,7 @@ from rsltrace.adapters.rclpy.stacks.coroutines import Resume
 from rsltrace.adapters.rclpy.stacks.runners import Stacks
 from rsltrace.adapters.rclpy.stacks.sim_event import FutureWake, SimEvent
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 
 class SimExecutor(Executor):  # type: ignore[misc]

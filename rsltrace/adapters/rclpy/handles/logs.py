@@ -24,7 +24,7 @@ from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import NS_PER_S, format_seconds
+from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
 _SEVERITY = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 _TEN_SECONDS_NS = 10 * NS_PER_S

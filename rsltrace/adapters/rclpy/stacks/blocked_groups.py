@@ -16,7 +16,7 @@ from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.event import Outcome
 from rsltrace.trace.model.finding import EndlessWait
-from rsltrace.trace.model.printable import format_duration, format_seconds
+from rsltrace.trace.model.texts import format_duration, format_seconds
 
 _LONG_NS = 1_000_000_000
 """A shorter wait may well be over soon after the end, and is not told."""

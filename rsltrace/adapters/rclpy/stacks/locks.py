@@ -22,7 +22,7 @@ from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
 from rsltrace.errors import UnsupportedError
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 _real_rlock = _thread.RLock
 

@@ -21,7 +21,7 @@ from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 _EVERY_MAIN_ENDED = "every main has ended"
 _INTERRUPTED = 130

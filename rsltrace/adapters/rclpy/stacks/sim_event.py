@@ -6,7 +6,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 
 class SimEvent:

@@ -42,7 +42,7 @@ from rsltrace.simulation.middleware.interface import source_of
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001

@@ -21,7 +21,7 @@ from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.trace.model.printable import patience_ns
+from rsltrace.trace.model.texts import patience_ns
 
 # ``sys.stdin`` of those whom the job gives no terminal: reading from it is an error.
 

@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rsltrace.adapters.rclpy.wire.checked_encoder import decode, unpack_wide
+from rsltrace.adapters.rclpy.wire.checked_codec import decode, unpack_wide
 from rsltrace.adapters.rclpy.wire.message_spec import (
     CHECK_SLOT,
     HEADER_PART,

@@ -32,7 +32,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
-from rsltrace.adapters.rclpy.wire.checked_encoder import encode, pack_wide
+from rsltrace.adapters.rclpy.wire.checked_codec import encode, pack_wide
 from rsltrace.adapters.rclpy.wire.message_spec import (
     HEADER,
     HEADER_PART,

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from itertools import accumulate
 from xml.etree.ElementTree import Element, SubElement
 
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 
 WIDTH, HEIGHT = 420, 180
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34

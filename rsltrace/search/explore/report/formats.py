@@ -19,7 +19,7 @@ from rsltrace.search.explore.report.exploration import (
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
-from rsltrace.trace.model.printable import printable, printable_lines
+from rsltrace.trace.model.texts import printable, printable_lines
 
 # The runs of a search as a Parquet table, one row each, for DuckDB, pandas and the like.
 #

@@ -22,7 +22,7 @@ from rsltrace.search.explore.report.exploration import (
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
-from rsltrace.trace.model.printable import format_duration, printable, printable_lines
+from rsltrace.trace.model.texts import format_duration, printable, printable_lines
 
 _RUNS_MAX = 200
 _CHARTS_MAX = 24

@@ -18,7 +18,7 @@ from rsltrace.search.explore.small.reduction import Parts, Reduced, Reduction
 from rsltrace.search.explore.table import SMALL
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult, overrides_of
 from rsltrace.search.explore.workers import Worker
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 
 # What is written beside a failing run: a README for people, and a test for pytest.
 

@@ -18,7 +18,7 @@ from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import EventFlag, OutputKind
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 _RAISED = int(EventFlag.RAISED)
 _OWN_FILES = (

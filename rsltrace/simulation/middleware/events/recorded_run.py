@@ -14,7 +14,7 @@ from rsltrace.simulation.loop.recorded import ObservedOrder, Recorded, RecordedE
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
-from rsltrace.trace.model.printable import format_seconds
+from rsltrace.trace.model.texts import format_seconds
 
 # A run that follows the order of a native one as far as it can.
 

@@ -22,7 +22,7 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace_viewer.model.comparison import Comparison

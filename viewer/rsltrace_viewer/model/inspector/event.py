@@ -23,7 +23,7 @@ from rsltrace.trace.model.event import (
     Output,
     OutputKind,
 )
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.states import Leaf, state_after
 from rsltrace.trace.words.code import output_places, places_text
 from rsltrace.trace.words.entities import RUN_NAME

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.trace.model.printable import PLACEHOLDERS, printable, shortened
+from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
 
 # Lines of the inspector: a tree written as lines with depths, opened where one wants to look.
 #

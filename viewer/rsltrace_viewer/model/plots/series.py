@@ -14,7 +14,7 @@ from rsltrace.checks.latency.measure import measuring
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, Output, OutputKind
-from rsltrace.trace.model.printable import PLACEHOLDERS
+from rsltrace.trace.model.texts import PLACEHOLDERS
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 

@@ -15,7 +15,7 @@ import xxhash
 from rsltrace.diff.bags.sequences import Keys, gaps_by_order
 from rsltrace.diff.bags.source import open_source
 from rsltrace.diff.row_sign import Sign
-from rsltrace.trace.model.printable import NS_PER_S, printable
+from rsltrace.trace.model.texts import NS_PER_S, printable
 
 _KEPT_BYTES = 256 << 20
 _PER_STEP = 1000

@@ -13,7 +13,7 @@ from rsltrace.diff.row_sign import Sign
 from rsltrace.errors import RsltraceError
 from rsltrace.job.values.times import START, TimeInRun
 from rsltrace.trace.decode import to_plain
-from rsltrace.trace.model.printable import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace_viewer.model.inspector.message_tree import Line, Openness, Role, message_lines
 from rsltrace_viewer.model.recordings.filter import Condition, Mask, read_filter, steps_of
 from rsltrace_viewer.model.recordings.recording import Pairs, Recording, Topic

@@ -19,7 +19,7 @@ from rsltrace.trace.model.event import (
     OutputKind,
     duration_of,
 )
-from rsltrace.trace.model.printable import format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace.trace.words.logs import LEVEL_WARN, log_record

@@ -13,7 +13,7 @@ import numpy as np
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
-from rsltrace.trace.model.printable import PLACEHOLDERS, printable, shortened
+from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import EventText, outputs_text
 

@@ -11,7 +11,7 @@ from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.sentences.values import IN_ONE, no_fields_text
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.printable import printable, shortened
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace_viewer.model.timeline.message_values import field_name, number
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from rerun.chunk import Chunk
 from rsltrace.trace.format import OUTPUT_DTYPE
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.trace.model.printable import NS_PER_S, printable
+from rsltrace.trace.model.texts import NS_PER_S, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.entities import RUN_NAME

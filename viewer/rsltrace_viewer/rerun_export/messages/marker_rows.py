@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, FrameTree
 from rsltrace_viewer.rerun_export.messages.shapes import rotated
 from rsltrace_viewer.rerun_export.moments import join

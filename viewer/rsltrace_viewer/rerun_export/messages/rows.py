@@ -18,7 +18,7 @@ from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoders
-from rsltrace.trace.model.printable import NO_FIELD
+from rsltrace.trace.model.texts import NO_FIELD
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists
 from rsltrace_viewer.rerun_export.messages.shapes import items, numbers

@@ -10,7 +10,7 @@ from textual.binding import Binding
 from textual.widget import Widget
 
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.query.parser import complete
 from rsltrace_viewer.model.recordings.filter import FIELDS, choices, read_filter

@@ -11,7 +11,7 @@ from textual.content import Content
 from textual.widgets import Static
 
 from rsltrace.diff.row_sign import Sign
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.recordings.session import RecordingSession
 from rsltrace_viewer.model.view import cells, fit

@@ -11,7 +11,7 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.printable import format_seconds, printable
+from rsltrace.trace.model.texts import format_seconds, printable
 from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.logs import LogLine, event_of
 from rsltrace_viewer.model.view import fit

@@ -13,7 +13,7 @@ from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.printable import format_duration, printable
+from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.native import is_native
 from rsltrace_viewer.model.chains import Chain
 from rsltrace_viewer.model.checks import Checks

@@ -17,7 +17,7 @@ from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.plots.series import Plot, PlotData, Series, Source, difference, plot
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.follow import walk

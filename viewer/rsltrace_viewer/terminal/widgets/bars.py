@@ -10,7 +10,7 @@ from textual.scroll_view import ScrollView
 from textual.widget import Widget
 from textual.widgets import Static
 
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 

@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
 
-from rsltrace.trace.model.printable import printable
+from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.lanes import Lane, Lanes, axis_text
 from rsltrace_viewer.model.timeline.events import ShortNames
 from rsltrace_viewer.model.view import cells, fit

@@ -1,10 +1,4 @@
-"""One thread for Intel's TBB, in ``libtbb`` and wherever it is linked into an extension module.
-
-TBB has no environment variable. It asks once, when it is first used, for how many processors the
-calling thread may run on, and divides loops by that number even where a single thread then runs
-them: sums of floating-point numbers would differ between machines, too. So each copy of TBB is made
-to ask while this thread may use one processor, and is held to one thread until the run is over.
-"""
+"""Libraries that need care in a run: TBB, PyTorch, pygame and pytest."""
 
 from __future__ import annotations
 
@@ -243,6 +237,15 @@ def pygame_clock(stack: ExitStack) -> None:
     for owner in (pygame.time, pygame):
         if hasattr(owner, "Clock"):  # pygame-ce has it in both
             replace_attribute(stack, owner, "Clock", clock)
+
+
+# One thread for Intel's TBB, in ``libtbb`` and wherever it is linked into an extension module.
+#
+# TBB has no environment variable. It asks once, when it is first used, for how many processors the
+# calling thread may run on, and divides loops by that number even where a single thread then runs
+# them: sums of floating-point numbers would differ between machines, too. So each copy of TBB is
+# made to ask while this thread may use one processor, and is held to one thread until the run is
+# over.
 
 
 class _Names(NamedTuple):
