@@ -250,7 +250,7 @@ class _Comparison:
         if not chosen:
             chosen = propagation.found[:1]
             self._remarks.append(NothingAskedFor(self._asked))
-        elif propagation.found[0] is not chosen[0]:
+        elif self._asked and propagation.found[0] is not chosen[0]:
             self._remarks.append(ShownLater(self._start, self._asked))
         most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
         if len(chosen) > most:

@@ -144,7 +144,7 @@ class NodeReplayResult:
     def sentence(self) -> str:
         """The result in one sentence."""
         inputs = "1 input" if self.inputs == 1 else f"{self.inputs} inputs"
-        fed = f"fed with {inputs} to {format_seconds(self.end_ns - self.start_ns)} s"
+        fed = f"fed with {inputs} over {format_seconds(self.end_ns - self.start_ns)} s"
         first = self.first
         if first is None and not self.compared:
             return f"{self.node} ran, and there is nothing to compare it with ({fed})"
