@@ -1,9 +1,10 @@
-"""Child processes that never outlive their campaign: a Ctrl-C ends them all."""
+"""Child processes: commands of rsltrace itself, how a process ended, and none left behind."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -11,15 +12,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-# Ends with the process that started it, and does not load what lies in the present folder.
+# The kernel ends the process with the one that started it (PR_SET_PDEATHSIG). No module is loaded
+# from the working directory.
 _PROGRAM = """
 import ctypes, os, sys
-ctypes.CDLL(None).prctl(1, 9)
+prctl = getattr(ctypes.CDLL(None), 'prctl', None)
+if prctl is not None:
+    prctl(1, 9)
 if os.getppid() != int(sys.argv.pop(1)):
     sys.exit(137)
-del sys.path[0]
-sys.path.append(sys.argv.pop(1))
+sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
 import runpy
 module = sys.argv.pop(1)
 sys.argv[0] = 'rsltrace'
@@ -30,8 +34,56 @@ OWN_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def rsltrace_command(words: Sequence[str], module: str = "rsltrace") -> list[str]:
-    """Return a command line of this very rsltrace; its process ends with the present one."""
+    """Return a command line of this installation of rsltrace, which runs ``module`` as a program.
+
+    Its process ends with the present one.
+    """
     return [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(OWN_FOLDER), module, *words]
+
+
+def start_connected(
+    module: str, words: Sequence[str] = (), **options: Any
+) -> tuple[subprocess.Popen[bytes], socket.socket]:
+    """Start a module of rsltrace as a program; return its process and this end of a socket to it.
+
+    The number of the other end is the program's first word. Nothing comes from standard input.
+    ``options`` are those of ``subprocess.Popen``.
+
+    :raises OSError: if no process can be made.
+    """
+    here, there = socket.socketpair()
+    with there:
+        try:
+            process = subprocess.Popen(
+                rsltrace_command([str(there.fileno()), *words], module),
+                stdin=subprocess.DEVNULL,
+                pass_fds=(there.fileno(),),
+                **options,
+            )
+        except BaseException:
+            here.close()
+            raise
+    return process, here
+
+
+def how_ended(exit_code: int) -> str:
+    """Return how a process ended, in words; the code is negative for a signal."""
+    if exit_code >= 0:
+        return f"ended with exit status {exit_code}"
+    return f"was killed by {signal_name(-exit_code)}"
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal, such as ``SIGSEGV``."""
+    with suppress(ValueError):
+        return signal.Signals(number).name
+    return f"signal {number}"
+
+
+def kill_group(pid: int) -> None:
+    """Kill a process that leads a group, and what it has started."""
+    with suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, signal.SIGKILL)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,5 +174,4 @@ class Processes:
 def _kill(process: subprocess.Popen[str]) -> None:
     """Kill a process and what it has started."""
     if process.poll() is None:
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
+        kill_group(process.pid)

@@ -11,9 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,6 +20,7 @@ from types import TracebackType
 from typing import Any
 
 from rsltrace import errors
+from rsltrace.child_processes import start_connected
 from rsltrace.debug.branches import Branches
 from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
@@ -84,20 +83,12 @@ class DebugSession:
 
     def _open(self, spec: dict[str, Any]) -> None:
         """Start the processes of the session."""
-        ours, theirs = socket.socketpair()
-        command = [sys.executable, "-m", "rsltrace.debug.supervisor", str(theirs.fileno())]
         try:
-            self._process = subprocess.Popen(
-                [*command, json.dumps(spec)],
-                pass_fds=[theirs.fileno()],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
+            self._process, ours = start_connected(
+                "rsltrace.debug.supervisor", [json.dumps(spec)], stdout=subprocess.DEVNULL
             )
         except OSError as error:
-            ours.close()
             raise DebugError(f"no process can be made for the session: {error}") from error
-        finally:
-            theirs.close()
         self._lines = Lines(ours)
         try:
             ready = self._until(lambda message: message.get("notice") == "ready")

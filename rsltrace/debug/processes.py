@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 from typing import Any
 
+from rsltrace.child_processes import how_ended, rsltrace_command
 from rsltrace.errors import DebugError
 from rsltrace.line_protocol import Lines
 
@@ -49,7 +50,7 @@ class Family:
         """
         ours, theirs = socket.socketpair()
         number = theirs.fileno()
-        command = [sys.executable, "-m", _MAIN, str(number), json.dumps(spec)]
+        command = rsltrace_command([str(number), json.dumps(spec)], _MAIN)
         theirs.set_inheritable(True)
         to_output = [(os.POSIX_SPAWN_DUP2, output, std) for std in (1, 2)]
         from_nowhere = (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0)
@@ -82,7 +83,7 @@ class Family:
             self.reap()
             status = self._ended.get(process.pid)
             if status is not None:
-                return _said(status)
+                return f"its process {how_ended(os.waitstatus_to_exitcode(status))}"
             select.select([], [], [], 0.01)
         return "its process does not answer any more"
 
@@ -107,17 +108,6 @@ class Family:
                     os.kill(pid, signal.SIGKILL)
             with suppress(ChildProcessError):
                 os.waitpid(-1, 0)
-
-
-def _said(status: int) -> str:
-    code = os.waitstatus_to_exitcode(status)
-    if code >= 0:
-        return f"its process ended with exit status {code}"
-    try:
-        name = signal.Signals(-code).name
-    except ValueError:
-        name = f"signal {-code}"
-    return f"its process was ended by {name}"
 
 
 def _children() -> list[int]:

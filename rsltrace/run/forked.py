@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NoReturn, TypeVar
 
+from rsltrace.child_processes import how_ended
 from rsltrace.errors import RunError
 from rsltrace.forking import (
     Pairs,
@@ -59,18 +60,12 @@ def in_copy(function: Callable[[int], Any], pairs: Pairs) -> Any:
         with suppress(ChildProcessError):  # who ignores the ends of its children has no status
             status = os.waitpid(pid, 0)[1]
     if not data:
-        raise RunError(f"the copy of the simulation has died{_of(status)}")
+        how = "has died" if status is None else how_ended(os.waitstatus_to_exitcode(status))
+        raise RunError(f"the copy of the simulation {how}")
     kind, value = pickle.loads(data)
     if kind == "raised":
         raise value
     return value
-
-
-def _of(status: int | None) -> str:
-    if status is None:
-        return ""
-    code = os.waitstatus_to_exitcode(status)
-    return f" of {signal.Signals(-code).name}" if code < 0 else f", with exit status {code}"
 
 
 def _answer(function: Callable[[int], Any], tell: int) -> NoReturn:

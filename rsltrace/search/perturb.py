@@ -11,7 +11,6 @@ import os
 import random
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.workspace.cache import same_place
-from rsltrace.child_processes import Done, Processes
+from rsltrace.child_processes import Done, Processes, how_ended
 from rsltrace.guard.pin import THREADS
 
 HASH_SEED = "hash seed"
@@ -259,7 +258,7 @@ def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
     if done.timed_out:
         digest, failure = "", "it took too long and was killed (see --timeout)"
     elif done.exit_code < 0:
-        digest, failure = "", f"it was killed by {signal.Signals(-done.exit_code).name}"
+        digest, failure = "", f"it {how_ended(done.exit_code)}"
     elif not digest and not failure:
         failure = f"it ended with exit status {done.exit_code} and no trace"
     return Recorded(around, path, digest, events, done.exit_code, failure, done.errors)

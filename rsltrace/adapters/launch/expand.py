@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import os
 import pickle
-import signal
 import subprocess
 import sys
 import tempfile
@@ -18,6 +16,7 @@ from rsltrace.adapters.launch.model import Argument, Expanded, Launched, argumen
 from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.adapters.workspace.imports import unbuilt_packages
+from rsltrace.child_processes import rsltrace_command
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
 from rsltrace.source_packages import source_packages, workspace_of
@@ -28,11 +27,6 @@ from rsltrace.terminal import tell
 # What they import, print, set and start is none of the run's, nor is it if they end Python.
 
 _OUTPUT_MAX = 1 << 16
-_PR_SET_PDEATHSIG = 1
-_RUN = (
-    "import json, sys; order = json.loads(sys.argv.pop()); sys.path[:] = order['path']; "
-    "from rsltrace.adapters.launch.expand import main; main(order)"
-)
 
 
 def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]) -> Launched:
@@ -51,11 +45,10 @@ def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
             "folders": [str(folder) for folder in folders],
             "answer": str(answer),
             "path": sys.path,
-            "reader": os.getpid(),
         }
         with output.open("wb") as stream:
             done = subprocess.run(
-                [sys.executable, "-c", _RUN, json.dumps(order)],
+                rsltrace_command([json.dumps(order)], __name__),
                 stdin=subprocess.DEVNULL,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
@@ -90,7 +83,7 @@ def main(order: Mapping[str, object]) -> None:
     from rsltrace.adapters.launch.python_file import read_launch_file
     from rsltrace.adapters.workspace.imports import unbuilt_packages
 
-    _end_with(int(str(order["reader"])))
+    sys.path[:] = order["path"]  # type: ignore[call-overload]
     folders = [Path(folder) for folder in order["folders"]]  # type: ignore[attr-defined]
     sys.path[:0] = map(str, folders)
     arguments: Mapping[str, str] = order["arguments"]  # type: ignore[assignment]
@@ -115,15 +108,6 @@ def main(order: Mapping[str, object]) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # threads that the launch file has started need not end
-
-
-def _end_with(parent: int) -> None:
-    """Let the system kill this process when the one that wants the answer is gone."""
-    prctl = getattr(ctypes.CDLL(None), "prctl", None)  # Linux
-    if prctl is not None:
-        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
 
 
 def expand(
@@ -220,3 +204,7 @@ def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
         with showing_line(job, loc):
             shown = where if in_file else os.path.relpath(job.resolve(spec.file))
             raise JobError(wrong, where=shown)
+
+
+if __name__ == "__main__":
+    main(json.loads(sys.argv[1]))

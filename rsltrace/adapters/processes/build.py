@@ -16,12 +16,13 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.adapters.processes.door import Program
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
+from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError
 
 SOURCES = Path(__file__).parent / "native"
@@ -192,8 +193,7 @@ def _run(commands: Iterable[list[str]]) -> None:
             _check(name, running.pop(0).returncode, said)
     finally:
         for one in running:
-            with suppress(ProcessLookupError):
-                os.killpg(one.pid, signal.SIGKILL)
+            kill_group(one.pid)
             one.communicate()
 
 

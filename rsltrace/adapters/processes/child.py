@@ -5,7 +5,6 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
-import signal
 import socket
 import struct
 import subprocess
@@ -15,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.adapters.processes.wire import HEAD, RECORD, Told, WireError
+from rsltrace.child_processes import how_ended, kill_group
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
 
@@ -156,11 +156,7 @@ class Ended:
         """What happened, as the end of a sentence."""
         if self.broken_link:
             return f"{self.broken_link} the descriptor by which rsltrace runs it"
-        if self.status >= 0:
-            return f"ended with exit status {self.status}"
-        with suppress(ValueError):
-            return f"was killed by {signal.Signals(-self.status).name}"
-        return f"was killed by signal {-self.status}"
+        return how_ended(self.status)
 
 
 class Child:
@@ -289,8 +285,7 @@ class Child:
 
     def kill(self) -> None:
         """Kill the process with all that it has started."""
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
+        kill_group(self._process.pid)
         self._process.wait()
         self._socket.close()
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import builtins
-import ctypes
 import os
 import signal
 import socket
@@ -125,14 +124,8 @@ class RunningMain:
         return sleep
 
 
-_PR_SET_PDEATHSIG = 1
-
-
-def main(number: int, run: int) -> None:
-    """Do what the run (a process) orders on the socket of a number."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != run:
-        os._exit(1)
+def main(number: int) -> None:
+    """Do what the run orders on the socket of a number."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # until there is something to interrupt
     link = Link(socket.socket(fileno=number))
     try:
@@ -285,3 +278,7 @@ class _Child:
         if self._priorities is not None:
             with suppress(OSError):
                 self._link.send("levels", dict(self._priorities.levels))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

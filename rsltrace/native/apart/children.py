@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import socket
 import subprocess
-import sys
 import threading
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from rsltrace.child_processes import kill_group, start_connected
 from rsltrace.errors import JobError
 from rsltrace.native.apart.wire import Frame, Link, Order
 
-# Does not load what lies in the present folder.
-_PROGRAM = """
-import sys
-sys.path[:] = [*filter(None, sys.path), sys.argv[1]]
-from rsltrace.native.apart.child import main
-main(*map(int, sys.argv[2:]))
-"""
-_OWN_FOLDER = Path(__file__).resolve().parents[3]
+_MAIN = "rsltrace.native.apart.child"
 _LOOK_S = 0.2
 _REAPED_WITHIN_S = 10.0
 """A process that was killed, or has closed its socket, is gone after a moment."""
@@ -73,21 +64,12 @@ class Child(threading.Thread):
         self.exit_text = ""
         self._told = told
         self._ended = ended
-        here, there = socket.socketpair()
-        command = [sys.executable, "-c", _PROGRAM, str(_OWN_FOLDER), str(there.fileno())]
-        with there:
-            try:
-                self._process = subprocess.Popen(
-                    [*command, str(os.getpid())],
-                    env=dict(start.environment),
-                    cwd=start.folder,
-                    stdin=subprocess.DEVNULL,
-                    pass_fds=(there.fileno(),),
-                    start_new_session=True,
-                )
-            except OSError as error:
-                here.close()
-                raise JobError(f"{start.name} cannot be started: {error.strerror}") from error
+        try:
+            self._process, here = start_connected(
+                _MAIN, env=dict(start.environment), cwd=start.folder, start_new_session=True
+            )
+        except OSError as error:
+            raise JobError(f"{start.name} cannot be started: {error.strerror}") from error
         self._link = Link(here)
         try:
             with suppress(BrokenPipeError, ConnectionResetError):  # has ended: that is noticed
@@ -151,14 +133,4 @@ class Child(threading.Thread):
 
     def kill(self) -> None:
         """Kill the process with all that it has started."""
-        with suppress(ProcessLookupError, PermissionError):
-            os.killpg(self._process.pid, signal.SIGKILL)
-
-
-def how_ended(status: int) -> str:
-    """Return how a process ended, in words."""
-    if status >= 0:
-        return f"ended with exit status {status}"
-    with suppress(ValueError):
-        return f"was killed by {signal.Signals(-status).name}"
-    return f"was killed by signal {-status}"
+        kill_group(self._process.pid)

@@ -15,8 +15,9 @@ from rsltrace import errors
 from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
+from rsltrace.child_processes import how_ended
 from rsltrace.errors import NodeError, RsltraceError, RunError
-from rsltrace.native.apart.children import Child, Start, how_ended
+from rsltrace.native.apart.children import Child, Start
 from rsltrace.native.apart.plans import start_rules, starts_of
 from rsltrace.native.apart.starts import Starts
 from rsltrace.native.apart.wire import Frame, Order, SpanReader

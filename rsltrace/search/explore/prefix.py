@@ -11,7 +11,6 @@ import fcntl
 import json
 import os
 import select
-import signal
 import socket
 import time
 import warnings
@@ -21,6 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.child_processes import kill_group
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import die_with_parent, end_process, fork_beside, open_descriptors, why_not
 from rsltrace.line_protocol import Lines
@@ -153,8 +153,7 @@ class _Prefix:
 
     def _end(self) -> None:
         self._lines.close()
-        with suppress(ProcessLookupError):
-            os.killpg(self._pid, signal.SIGKILL)
+        kill_group(self._pid)
         with suppress(ChildProcessError):
             os.waitpid(self._pid, 0)
 

@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from rsltrace.child_processes import kill_group, signal_name
 from rsltrace.errors import RsltraceError
 from rsltrace.forking import die_with_parent, other_threads
 from rsltrace.guard.libraries import is_library
@@ -148,8 +149,7 @@ def _answer(
     os.close(tell)
     os.close(say)
     answer, output, in_time = _hear(told, said, task.get("timeout_s"))
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
+    kill_group(child)
     os.kill(child, signal.SIGKILL)  # it may not have a group of its own yet
     _, status = os.waitpid(child, 0)
     for end in (told, said):
@@ -201,11 +201,7 @@ def _text(output: bytes) -> str:
 
 def _crash(status: int, output: str) -> Failure:
     code = os.waitstatus_to_exitcode(status)
-    how = f"exit status {code}"
-    if code < 0:
-        how = "SIG" + str(-code)
-        with suppress(ValueError):
-            how = signal.Signals(-code).name
+    how = f"exit status {code}" if code >= 0 else signal_name(-code)
     last = f": {output.splitlines()[-1]}" if output else ""
     return Failure(CRASH, f"its process ended with {how}{last}", f"crash: {how}")
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import select
-import socket
 import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -16,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.child_processes import rsltrace_command
+from rsltrace.child_processes import start_connected
 from rsltrace.errors import DebugError, ExploreError
 from rsltrace.line_protocol import Lines
 from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
@@ -139,21 +138,13 @@ class Worker:
             self._lines.send(self._task or {})
 
     def _start(self) -> None:
-        ours, theirs = socket.socketpair()
-        words = [str(theirs.fileno())] + ["--no-pin"] * (not self._pins)
+        words = ["--no-pin"] * (not self._pins)
         try:
-            self._process = subprocess.Popen(
-                rsltrace_command(words, _MAIN),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                pass_fds=(theirs.fileno(),),
-                start_new_session=True,
+            self._process, ours = start_connected(
+                _MAIN, words, stdout=subprocess.DEVNULL, start_new_session=True
             )
         except OSError as error:
-            ours.close()
             raise ExploreError(f"no worker can be started: {error.strerror}") from None
-        finally:
-            theirs.close()
         self._lines = Lines(ours)
 
 
