@@ -96,6 +96,7 @@ if TYPE_CHECKING:
     "real-time class where permitted: by rate, or by the rules of the job's policy.",
 )
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
+@click.option("--sample-states", is_flag=True, hidden=True)  # as the runs of ``verify`` do
 def record(
     words: tuple[str, ...],
     launch: Path | None,
@@ -116,6 +117,7 @@ def record(
     domain: int | None,
     policy: str | None,
     quiet: bool,
+    sample_states: bool,
 ) -> None:
     """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
 
@@ -165,7 +167,14 @@ def record(
         return
     told: list[str] = []
     result = _recorded(
-        loaded, path, told, force=force, echo=not quiet, shows=not (quiet or as_json), replay=replay
+        loaded,
+        path,
+        told,
+        force=force,
+        echo=not quiet,
+        shows=not (quiet or as_json),
+        replay=replay,
+        samples_states=sample_states,
     )
     status = result.exit_code
     reopen_standard_streams()
@@ -229,6 +238,7 @@ def _recorded(
     echo: bool,
     shows: bool,
     replay: Path | None,
+    samples_states: bool,
 ) -> RunResult:
     """Run a job; notes are shown, and added to ``told``. ``shows``: progress, too."""
     from rsltrace.run import Observer, run
@@ -251,7 +261,7 @@ def _recorded(
             path,
             force=force,
             echo=echo,
-            observer=Observer(progress=on_progress, interrupt=begins, note=note),
+            observer=Observer(on_progress, begins, note, samples_states=samples_states),
             replay=replay,
         )
 

@@ -43,11 +43,13 @@ class Observer:
     """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
     about every thousand events; ``interrupt`` gets a function that ends the run properly;
     ``note`` gets what somebody should know before the run begins (a bag that was cut off,
-    what of a launch file is left out)."""
+    what of a launch file is left out). ``samples_states`` puts samples of nodes' states into the
+    trace."""
 
     progress: Callable[[int, int | None, int], None] | None = None
     interrupt: Callable[[Callable[[Stop], None]], None] | None = None
     note: Callable[[str], None] | None = None
+    samples_states: bool = False
 
 
 def housekeeping(

@@ -70,7 +70,7 @@ from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.loop.timer_queue import timer_queue
 from rsltrace.simulation.middleware.events.event import Census
 from rsltrace.simulation.middleware.interface import FaultsOfAll
-from rsltrace.trace.format import METADATA_ENVIRONMENT
+from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_STATES
 from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.model.drop import kept_drops
 from rsltrace.trace.model.finding import EndlessWait, GuardCount, kept_waits
@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
+    from rsltrace.run.state_samples import StateSamples
     from rsltrace.simulation.chance.channel import NetworkPlan
     from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
 
@@ -177,6 +178,7 @@ class Session:
         self._late: LateLibraries
         self._processes: ProcessDoor
         self._numerics_known = True
+        self._samples: StateSamples | None = None
         self._faults: NodeFaults | None = None
         self.bag_faults: BagFaults | None = None
 
@@ -336,6 +338,11 @@ class Session:
         self._late = LateLibraries(one.code for one in programs if isinstance(one, MainProgram))
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.record(recorder)
+        if self._observer.samples_states:
+            from rsltrace.run.state_samples import StateSamples
+
+            self._samples = StateSamples(self.world.domain.dispatcher)
+            self.world.domain.dispatcher.add_observer(self._samples)
         write_job(writer, job)
         described = environment(job)
         self._numerics_known = "numerics" in described
@@ -505,12 +512,16 @@ class Session:
         with self._engaged():
             outcome.note_end(loop.events)
             self._processes.end()
+            if self._samples is not None:
+                self._samples.take_last()
             self.world.destroy()
         error = self.world.error
         exit_code = error.exit_code if error else self._exit_code(stop)
         if self._writer is not None:
             self._guarded.write(self._writer)
             keep_choices(self._writer, loop)
+            if self._samples is not None:
+                self._writer.add_metadata(METADATA_STATES, self._samples.as_metadata())
             self._writer.close(
                 result={
                     "start_time": str(self.start_ns),

@@ -23,6 +23,8 @@ from typing import Any
 from rsltrace.adapters.workspace.cache import same_place
 from rsltrace.child_processes import Done, Processes, how_ended
 from rsltrace.guard.pin import THREADS
+from rsltrace.trace.format import METADATA_STATES
+from rsltrace.trace.reader import Trace
 
 HASH_SEED = "hash seed"
 FOLDER = "working directory"
@@ -111,7 +113,8 @@ class Recorded:
     """What came of one run.
 
     ``digest`` is empty if the process did not get to the end of a trace. ``failure`` says what went
-    wrong, if anything did; ``errors`` is all that it wrote to stderr.
+    wrong, if anything did; ``errors`` is all that it wrote to stderr. ``states`` are the samples of
+    nodes' states that its trace has, as JSON.
     """
 
     surroundings: Surroundings
@@ -121,11 +124,17 @@ class Recorded:
     exit_code: int
     failure: str
     errors: str
+    states: str = ""
 
     @property
     def outcome(self) -> tuple[str, int]:
         """What must be the same in every run."""
         return self.digest, self.exit_code
+
+    @property
+    def kept(self) -> tuple[str, int, str]:
+        """The same, and what the nodes kept."""
+        return *self.outcome, self.states
 
 
 def surroundings(number: int, seed: int = 0) -> Surroundings:
@@ -261,7 +270,13 @@ def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
         digest, failure = "", f"it {how_ended(done.exit_code)}"
     elif not digest and not failure:
         failure = f"it ended with exit status {done.exit_code} and no trace"
-    return Recorded(around, path, digest, events, done.exit_code, failure, done.errors)
+    states = _states_in(path) if digest and path.is_file() else ""
+    return Recorded(around, path, digest, events, done.exit_code, failure, done.errors, states)
+
+
+def _states_in(path: Path) -> str:
+    with Trace.open(path) as trace:
+        return trace.metadata(METADATA_STATES).get("samples", "")
 
 
 def _result_in(output: str) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -22,12 +23,29 @@ OnRun = Callable[[Recorded], None]
 
 
 @dataclass(frozen=True, slots=True)
+class HiddenDifference:
+    """Two runs of equal events that left the state of a ``node`` different.
+
+    ``attribute`` is one of the node's that differs in the first sample that does, taken after
+    ``event`` of run ``run``. ``traces`` are of two more such runs, with the states after all
+    events; None if these two happened to be the same.
+    """
+
+    node: str
+    attribute: str
+    event: int
+    run: int
+    traces: tuple[Recorded, Recorded] | None
+
+
+@dataclass(frozen=True, slots=True)
 class Verified:
     """What was tried and what came of it.
 
     ``other`` is the run, of those that did something else than ``first``, with the lowest number.
     ``provoked_by`` are the perturbations of it that make a difference on their own; ``narrowed``
     says whether that was tried. ``by_itself``: a second run without perturbations differs, too.
+    ``hidden`` is of runs whose events agree.
     ``trouble`` is a run that came to no end, which is no answer.
     """
 
@@ -40,6 +58,7 @@ class Verified:
     narrowed: bool = False
     provoked_by: tuple[str, ...] = ()
     by_itself: bool = False
+    hidden: HiddenDifference | None = None
 
     @property
     def agrees(self) -> bool:
@@ -63,7 +82,7 @@ class Verification:
         timeout_s: float | None = None,
         keep: bool = False,
     ) -> None:
-        self._arguments = tuple(arguments)
+        self._arguments = (*arguments, "--sample-states")
         self._folder = folder
         self._workers = workers
         self._seed = seed
@@ -93,10 +112,38 @@ class Verification:
                 tuple(sorted({one.digest for one in done if one.digest})),
             )
             if not differing:
-                return tried
+                other = next((one for one in done if one.states != first.states), None)
+                return tried if other is None else self._hidden(tried, other, took_s)
             if not ended:
                 return replace(tried, trouble=differing[0])
             return self._narrowed(replace(tried, other=ended[0]), took_s)
+
+    def _hidden(self, tried: Verified, other: Recorded, took_s: float) -> Verified:
+        """Find what provokes it that states differ, and where: the two runs are made again with
+        the states after all events in their traces."""
+        first = tried.first
+        narrowed = self._narrowed(replace(tried, other=other), took_s)
+        event, node, attribute = _first_sample(first.states, other.states)
+        around = other.surroundings
+        if narrowed.by_itself:
+            around = Surroundings(0, {}, "again")
+        elif narrowed.provoked_by:
+            around = around.only(narrowed.provoked_by[0])
+        one, two = (
+            record_in(
+                perturbed,
+                (*self._arguments, "--set", "guard.state=record"),
+                self._folder,
+                path=self._folder / f"states-{name}.mcap",
+                processes=self._processes,
+                timeout_s=self._timeout_s,
+            )
+            for name, perturbed in (("a", first.surroundings), ("b", around))
+        )
+        differ = one.digest and two.digest and one.digest != two.digest
+        number = other.surroundings.number
+        hidden = HiddenDifference(node, attribute, event, number, (one, two) if differ else None)
+        return replace(narrowed, other=None, hidden=hidden)
 
     @contextmanager
     def _ending(self) -> Iterator[None]:
@@ -161,7 +208,7 @@ class Verification:
         first, other = found.first, found.other
         assert other is not None
         again = self._record(Surroundings(0, {}, "again"))
-        if again.outcome != first.outcome:
+        if again.kept != first.kept:
             self._forget(again)
             return replace(found, narrowed=True, by_itself=True)
         self._forget(again)
@@ -171,8 +218,21 @@ class Verification:
         with self._pool() as pool:
             runs = list(pool.map(self._record, map(other.surroundings.only, kinds)))
         provoked = tuple(
-            kind for kind, run in zip(kinds, runs, strict=True) if run.outcome != first.outcome
+            kind for kind, run in zip(kinds, runs, strict=True) if run.kept != first.kept
         )
         for run in runs:
             self._forget(run)
         return replace(found, narrowed=True, provoked_by=provoked)
+
+
+def _first_sample(one: str, other: str) -> tuple[int, str, str]:
+    """Return event, node and attribute of the first sample that differs."""
+    samples, others = json.loads(one), json.loads(other)
+    found = [
+        (event, node, name)
+        for node, taken in samples.items()
+        for (event, hashes), (_, more) in zip(taken, others.get(node, ()), strict=False)
+        for name in sorted({*hashes, *more})
+        if hashes.get(name) != more.get(name)
+    ]
+    return min(found, default=(0, "", ""))

@@ -76,6 +76,26 @@ def test_one_digest_is_stated_as_what_was_tried(
     assert not (tmp_path / "new.txt").exists()
 
 
+def test_what_differs_and_is_not_published_is_found_in_the_run_in_which_it_begins(
+    rsltrace: Command, job: WriteJob
+) -> None:
+    made = job("self.drawn = random.random()", "guard: {random: allow}\n")
+    module = made.parent / "verified.py"
+    module.write_text("import random\n" + module.read_text())
+    done = rsltrace("verify", made, "--runs", "2")
+    assert done.returncode == 0, done.stderr
+    first, _, _, *lines = done.stdout.splitlines()
+    assert "one digest" in first
+    assert lines[0].startswith("The events agree, but the state of /n differs: its attribute drawn")
+    assert lines[1].startswith("provoked by nothing")
+    assert "drawn  0." in done.stdout  # both values
+    assert "(verified.py:" in done.stdout
+    assert "report it" not in done.stdout  # the job lets it pass
+    told = json.loads(rsltrace("verify", made, "--runs", "2", "--json").stdout)
+    assert told["agrees"]
+    assert told["hidden"]["attribute"] == "drawn"
+
+
 @pytest.mark.parametrize("before", ["", "Input x: ", '{"digest": 1\n{"', "many\nlines {}\n"])
 @pytest.mark.parametrize("after", ["\n", "", " bye", '\nbye {"\n{"a": 1}\n'])
 def test_the_result_is_found_in_what_nodes_print(before: str, after: str) -> None:

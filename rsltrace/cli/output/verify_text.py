@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.search.perturb import CORE_TYPE, KERNEL
+from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
     from rsltrace.search.perturb import Recorded
-    from rsltrace.search.verify import Verified
+    from rsltrace.search.verify import HiddenDifference, Verified
 
 _LINES_MAX = 40
+_UNKNOWN_SOURCE = (
+    "The guard has no finding that explains it: a source of nondeterminism that it does not know.\n"
+    "Please report it, with the callback named above."
+)
 _WAY_OUT = (
     "  OpenBLAS rounds otherwise for each core type: compare such values with a tolerance, or "
     f"choose one\n  that all your machines can be, for every run: {CORE_TYPE}=Haswell rsltrace …"
@@ -30,6 +35,8 @@ def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool)
     if other is None:
         ended = f" (each ended with exit status {first.exit_code})" if first.exit_code else ""
         lines = [f"{tried}, one digest {first.digest}{ended}", perturbed]
+        if result.hidden is not None:
+            lines += ["", *_hidden(result, result.hidden, again[-1], folder)]
         return "\n".join([*lines, f"the traces are in {folder}"] if kept else lines)
     lines = [f"not deterministic: {tried}, {len(result.digests)} digests", perturbed, ""]
     for recorded, command in zip((first, other), again, strict=True):
@@ -40,11 +47,7 @@ def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool)
     lines += ["", _provoked(result, again[-1])]
     if other.failure:
         lines += [f"run {other.surroundings.number} failed: {other.failure}"]
-    from rsltrace.diff import diff_files
-    from rsltrace.diff.report import render
-
-    diff = diff_files(str(_place(first, folder)), str(_place(other, folder)))
-    report = render(diff).rstrip().splitlines()
+    report = _compared(result, first, other, folder)
     if not kept:  # what to do next with traces that are gone
         report = [line for line in report if not line.startswith("next: ")]
     lines += ["", *report]
@@ -73,10 +76,57 @@ def as_values(result: Verified, folder: Path, again: Sequence[str], *, kept: boo
             "reproduce": list(again),
             "by_itself": result.by_itself,
             "provoked_by": list(result.provoked_by) if result.narrowed else None,
+            "hidden": _hidden_values(result.hidden),
             "kept": str(folder) if kept else None,
             "diff": difference,
         }
     )
+
+
+def _hidden(result: Verified, found: HiddenDifference, command: str, folder: Path) -> list[str]:
+    """Return what to say of runs of equal events in which a node did not keep the same."""
+    lines = [
+        f"The events agree, but the state of {found.node} differs: its attribute "
+        f"{found.attribute}, after event {found.event} of run {found.run}.",
+        _provoked(result, command),
+    ]
+    if found.traces is None:
+        return lines
+    report = _compared(result, *found.traces, folder)
+    return [*lines, "", *(line for line in report if not line.startswith("next: "))]
+
+
+def _compared(result: Verified, first: Recorded, other: Recorded, folder: Path) -> list[str]:
+    """Return the lines of a comparison, and whether the guard knows what made the runs differ."""
+    from rsltrace.diff import diff_files
+    from rsltrace.diff.report import render
+
+    diff = diff_files(str(_place(first, folder)), str(_place(other, folder)))
+    lines = render(diff).rstrip().splitlines()
+    has_cause = any(one.likely is not None or one.calls for one in diff.divergences)
+    is_pinned = all(setting.name == "numerics" for setting in diff.settings)
+    if has_cause or not is_pinned or KERNEL in result.provoked_by or not result.narrowed:
+        return lines
+    for recorded in (first, other):
+        with Trace.open(_place(recorded, folder)) as trace:
+            if trace.findings or _lets_pass(json.loads(trace.job.get("resolved", "{}"))):
+                return lines
+    return [*lines, "", _UNKNOWN_SOURCE]
+
+
+def _lets_pass(job: dict[str, Any]) -> bool:
+    """Return whether a job has the guard let something pass without a finding."""
+    guards = [job.get("guard") or {}, *(node.get("guard") or {} for node in job.get("nodes", ()))]
+    return any(
+        guard.get("enabled") is False
+        or guard.get("pin") is False
+        or any(isinstance(one, dict) and _is_allowed(one) for one in guard.values())
+        for guard in guards
+    )
+
+
+def _is_allowed(source: dict[str, Any]) -> bool:
+    return source.get("mode") == "allow" or bool(source.get("allow"))
 
 
 def _run(recorded: Recorded) -> dict[str, object]:
@@ -86,6 +136,17 @@ def _run(recorded: Recorded) -> dict[str, object]:
         "digest": recorded.digest,
         "exit_code": recorded.exit_code,
         "errors": recorded.errors,
+    }
+
+
+def _hidden_values(found: HiddenDifference | None) -> dict[str, object] | None:
+    if found is None:
+        return None
+    return {
+        "node": found.node,
+        "attribute": found.attribute,
+        "event": found.event,
+        "run": found.run,
     }
 
 

@@ -34,6 +34,12 @@ class NodeState:
         """What has no hash: types by attribute."""
         return self._hasher.skipped
 
+    def attribute_hashes(self) -> dict[str, int]:
+        """Return the hash of each of the node's attributes now."""
+        node = self._handle.wrapper
+        with engage(None):
+            return {} if node is None else self._hashes(self._attributes(node))[0]
+
     def after_event(self) -> int:
         """Return the hash of the node's state now, 0 as long as there is no node."""
         node = self._handle.wrapper

@@ -30,20 +30,21 @@ class ObserverOrder(IntEnum):
     VERIFICATION = 1
     """Whether the event was as recorded: it may end the recording."""
     CENSUS = 2
-    LINE_SWITCHES = 3
-    GENERATORS = 4
+    STATE_SAMPLES = 3
+    LINE_SWITCHES = 4
+    GENERATORS = 5
     """The states of random generators that belong to nodes."""
-    RECORDED_ORDER = 5
+    RECORDED_ORDER = 6
     """Whether the run follows the order of a recording."""
-    RATES = 6
-    EXECUTION_TIMES = 7
-    FAULTS = 8
-    SCRIPT = 9
+    RATES = 7
+    EXECUTION_TIMES = 8
+    FAULTS = 9
+    SCRIPT = 10
     """The recorded events that one node is fed with."""
-    OUTPUTS = 10
+    OUTPUTS = 11
     """Whether the outputs of one node were as recorded."""
-    EDITS = 11
-    DEBUGGER = 12
+    EDITS = 12
+    DEBUGGER = 13
 
 
 ExecuteArguments = tuple[Any, int, Any, int, Callable[..., object], tuple[Any, ...], int, int, int]
