@@ -198,7 +198,7 @@ def record_in(
     must be absolute.
     """
     path = path or folder / f"{_name(around)}.mcap"
-    words = record_words(arguments, path)
+    words = record_words([*arguments, "--sample-states"], path)
     done = run_in(around, words, folder, processes=processes, timeout_s=timeout_s)
     return recorded(around, path, done)
 

@@ -82,7 +82,7 @@ class Verification:
         timeout_s: float | None = None,
         keep: bool = False,
     ) -> None:
-        self._arguments = (*arguments, "--sample-states")
+        self._arguments = tuple(arguments)
         self._folder = folder
         self._workers = workers
         self._seed = seed
