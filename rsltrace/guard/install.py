@@ -16,6 +16,7 @@ from functools import partial
 from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
+from rsltrace.guard.call_reports import reported_calls
 from rsltrace.guard.callers import is_nobodys, module_of
 from rsltrace.guard.frames import caller, exchange_special
 from rsltrace.guard.guard import Guard, engage, engaged
@@ -31,7 +32,6 @@ from rsltrace.guard.virtual.object_hashes import watched_hashes
 from rsltrace.guard.virtual.processors import same_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
-from rsltrace.guard.watched.functions import watched_calls
 from rsltrace.trace.model.finding import Mode, Source
 
 # Directory listings in the order of their names: a file system gives them in any order.
@@ -327,7 +327,7 @@ _REPLACEMENTS = (
     watched_hashes,
     ordered_sets,
     own_process_ids,
-    watched_calls,
+    reported_calls,
     same_processors,
     recorded_files,
     recorded_descriptors,

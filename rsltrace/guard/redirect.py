@@ -15,6 +15,7 @@ import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import wraps
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
@@ -174,6 +175,20 @@ def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) ->
     """Set an attribute of a module or class until ``stack`` ends."""
     stack.callback(setattr, owner, name, getattr(owner, name))
     setattr(owner, name, value)
+
+
+def redirect_function(
+    stack: ExitStack, module: Any, name: str, make: Callable[[Any], Callable[..., Any]]
+) -> None:
+    """Redirect a function of a module, if it has it, wherever it is bound, until ``stack`` ends."""
+    function = getattr(module, name, None)
+    if isinstance(function, BuiltinFunctionType):
+        redirect(stack, function, make)
+    elif function is not None:
+        replacement = wraps(function)(make(function))
+        for owner in list(sys.modules.values()):
+            if getattr(owner, "__dict__", {}).get(name) is function:
+                replace_attribute(stack, owner, name, replacement)
 
 
 def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:

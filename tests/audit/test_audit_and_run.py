@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.guard.audit.audit import audit_path
-from rsltrace.guard.audit.rules import Treatment
+from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, NodeSpec, StopSpec
 from rsltrace.run import run
 from rsltrace.trace.model.finding import Mode

@@ -11,13 +11,15 @@ import tokenize
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.calls import Place, find_calls
 from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.rules import Audit, Found, Treatment, allowed
+from rsltrace.guard.audit.rules import Audit, Found
 from rsltrace.guard.audit.scopes import Module, Scope, parse_scopes
+from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.trace.model.finding import Policy
 from rsltrace.trace.model.module_search import find_module
@@ -288,7 +290,7 @@ def _done(
 ) -> tuple[Treatment, str]:
     rule = place.rule
     globs = policy.allowed.get(rule.source, ()) if policy and rule.source else ()
-    if allowed(source.module.name, globs):
+    if any(fnmatchcase(source.module.name, glob) for glob in globs):
         return Treatment.NOTHING, f"{whose} allows it to this module"
     return rule.treated(policy, whose)
 

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from rsltrace.guard.audit import rules
+from rsltrace.guard import rules
 from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, Rule, rule_of
 from rsltrace.guard.audit.scopes import Module, Scope
 from rsltrace.guard.audit.sets import is_set, order_matters
+from rsltrace.guard.rules import METHODS, RULES, SHARED_GENERATORS, Rule, sql_call
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
 # Differences of two looks at a ROS clock in one function: in a simulation they are 0.
@@ -107,10 +106,6 @@ def _called_with(module: Module, node: ast.Call, names: Names) -> str | None:
     return names.of(ast.Attribute(node.args[0], texts[1], ast.Load()), scope)
 
 
-_SQL = re.compile(
-    r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)",
-    re.IGNORECASE,
-)
 _SORTERS = ("builtins.sorted", "builtins.min", "builtins.max")
 _DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 _ORDERINGS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
@@ -147,7 +142,7 @@ def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iter
         if node in skipped:
             continue
         for place in _at(module, node, names):
-            shared = place.rule in SHARED and place.call.startswith(tuple(seeded))
+            shared = place.rule.is_shared and place.call.startswith(tuple(seeded))
             if not shared:
                 yield place
         stack.extend(ast.iter_child_nodes(node))
@@ -155,25 +150,25 @@ def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iter
 
 def _at(module: Module, node: ast.AST, names: Names) -> Iterator[Place]:
     for place, name in exchanged(module, node, names):
-        yield Place(place, name, rules.EXCHANGED)
+        yield Place(place, name, rules.REPLACED_FUNCTION)
     if isinstance(node, ast.Call):
         yield from _call(module, node, names)
     elif isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Load):
         yield from _reference(module, node, names)
     elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
         if node.name == "__del__" and isinstance(module.parents.get(node), ast.ClassDef):
-            yield Place(node, "__del__()", rules.DEL)
+            yield Place(node, "__del__()", rules.FINALIZER)
     elif isinstance(node, ast.FormattedValue):
         spec = node.format_spec
         last = spec.values[-1] if isinstance(spec, ast.JoinedStr) and spec.values else None
         if isinstance(last, ast.Constant) and str(last.value).endswith("n"):
-            yield Place(node.value, "format 'n'", rules.LOCALE_FORMAT)
+            yield Place(node.value, "format 'n'", rules.LOCALE)
     elif (
         isinstance(node, ast.BinOp)
         and isinstance(node.op, _DIVISIONS)
         and is_difference_of_now(node.right, module.scope_of(node))
     ):
-        yield Place(node, f"division by {_text(node.right)}", rules.STANDS_STILL)
+        yield Place(node, f"division by {_text(node.right)}", rules.ZERO_DURATION)
     if isinstance(node, ast.expr):
         scope = module.scope_of(node)
         if is_set(node, scope, names) and order_matters(node, scope, names):
@@ -198,11 +193,10 @@ def _call(module: Module, node: ast.Call, names: Names) -> Iterator[Place]:
             elif node.func.attr == "sort":
                 yield from _sorting(node, scope, names)
         return
-    rule = rule_of(name)
+    rule = RULES.get(name)
     if rule is not None:
-        condition = CONDITIONS.get(name)
         listed = rule.kind == "directory" and _consumed(module, node, scope, names)
-        if (condition is None or condition(node)) and not listed:
+        if (rule.when is None or rule.when(node)) and not listed:
             first = node.args[0] if node.args and rule.kind in ("environment", "clock") else None
             given = repr(first.value) if isinstance(first, ast.Constant) else ""
             yield Place(node, f"{name.removeprefix('builtins.')}({given})", rule)
@@ -237,10 +231,10 @@ def _reference(module: Module, node: ast.Name | ast.Attribute, names: Names) -> 
             return  # an alias: what is read through it is found there
         key = parent.slice if isinstance(parent, ast.Subscript) else None
         shown = f"[{key.value!r}]" if isinstance(key, ast.Constant) else ""
-        yield Place(node, f"os.environ{shown}", rules.ENVIRON)
+        yield Place(node, f"os.environ{shown}", rules.ENVIRONMENT)
         return
-    rule = rule_of(name)
-    if rule is None or name in ("numpy.datetime64", "datetime.datetime.fromtimestamp"):
+    rule = RULES.get(name)
+    if rule is None:
         return
     if rule.is_class or rule.kind in ("finalizer", "locale"):
         is_base = isinstance(parent, ast.ClassDef) and node in parent.bases
@@ -261,7 +255,7 @@ def _environ(module: Module, attribute: ast.Attribute) -> Iterator[Place]:
     call = module.parents.get(attribute)
     first = call.args[0] if isinstance(call, ast.Call) and call.args else None
     given = f"[{first.value!r}]" if isinstance(first, ast.Constant) else ""
-    yield Place(attribute, f"os.environ{given}", rules.ENVIRON)
+    yield Place(attribute, f"os.environ{given}", rules.ENVIRONMENT)
 
 
 def _sorting(node: ast.Call, scope: Scope, names: Names) -> Iterator[Place]:
@@ -276,9 +270,9 @@ def _sorting(node: ast.Call, scope: Scope, names: Names) -> Iterator[Place]:
 def _sql(node: ast.Call) -> Iterator[Place]:
     first = node.args[0]
     if isinstance(first, ast.Constant) and isinstance(first.value, str):
-        match = _SQL.search(first.value)
-        if match is not None:
-            yield Place(first, f"SQLite: {match.group()}", rules.SQL_CLOCK)
+        found = sql_call(first.value)
+        if found is not None:
+            yield Place(first, *found)
 
 
 def _consumed(module: Module, node: ast.expr, scope: Scope, names: Names) -> bool:
@@ -350,9 +344,9 @@ def _seeded(module: Module, names: Names) -> set[str]:
     """Return the prefixes of shared generators that the module seeds itself."""
     found = set()
     for node in ast.walk(module.tree):
-        if isinstance(node, ast.Call) and not rules.unseeded(node):
+        if isinstance(node, ast.Call) and not rules.is_unseeded(node):
             name = names.of(node.func, module.scope_of(node))
-            found |= {prefix for prefix, seed in SEEDED_BY.items() if name == seed}
+            found |= {prefix for prefix, seed in SHARED_GENERATORS.items() if name == seed}
     return found
 
 

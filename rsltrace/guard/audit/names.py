@@ -6,8 +6,8 @@ import ast
 import builtins
 from collections.abc import Iterator, Mapping
 
-from rsltrace.guard.audit.rules import RULES
 from rsltrace.guard.audit.scopes import Annotated, Binding, Imported, Module, Scope
+from rsltrace.guard.rules import RULES
 
 _DEPTH_MAX = 20
 _BUILTINS = frozenset(dir(builtins))

@@ -11,10 +11,12 @@ import builtins
 import importlib.machinery
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import CodeType, ModuleType
 from typing import Any
 
+from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
 from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
@@ -145,10 +147,12 @@ class _Finder:
         packages: frozenset[str],
         on_loaded: Mapping[str, Callable[[], None]],
         rewrites: bool,
+        stack: ExitStack,
     ) -> None:
         self._packages = packages
         self._on_loaded = on_loaded
         self.rewrites = rewrites
+        self._stack = stack
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -166,8 +170,10 @@ class _Finder:
             spec.loader = _Loader(spec.loader, rewrites=self.rewrites, library=library)
         elif is_library(file):
             spec.loader = _Loader(spec.loader, rewrites=False, library=True)
+        if name in REPORTED_MODULES:
+            _call_when_loaded(spec.loader, partial(report_functions, self._stack, name))
         if name in self._on_loaded:
-            _tell(spec.loader, self._on_loaded[name])
+            _call_when_loaded(spec.loader, self._on_loaded[name])
         return spec
 
     def _found_otherwise(
@@ -183,7 +189,7 @@ class _Finder:
         return None
 
 
-def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
+def _call_when_loaded(loader: Any, on_loaded: Callable[[], None]) -> None:
     """Have a loader say when it has loaded its module."""
     real = loader.exec_module
 
@@ -210,11 +216,10 @@ def user_modules(
         _HASH: hash_method,
         _NOW: numpy_now,
     }
-    finder = _Finder(packages, on_loaded, rewrites)
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
-    sys.meta_path.insert(0, finder)
-    try:
+    with ExitStack() as stack:
+        finder = _Finder(packages, on_loaded, rewrites, stack)
+        sys.meta_path.insert(0, finder)
+        stack.callback(sys.meta_path.remove, finder)
         yield
-    finally:
-        sys.meta_path.remove(finder)

@@ -9,7 +9,7 @@ from typing import Any
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import replace_attribute
-from rsltrace.guard.watched.audit_hook import FOREIGN
+from rsltrace.guard.rules import C_FUNCTIONS
 
 LOADS_LIBRARIES = "cffi.api"
 """The module of cffi that opens libraries (``ffi.dlopen``)."""
@@ -27,7 +27,7 @@ class _Library:
     def load_function(self, kind: Any, name: str) -> Any:
         """Return a function; cffi keeps it and asks once."""
         guard = engaged()
-        source = FOREIGN.get(name)
+        source = C_FUNCTIONS.get(name)
         if guard is not None and source is not None:
             guard.watched(source, f"C library: {name}()", "", caller())
         return self._real.load_function(kind, name)
