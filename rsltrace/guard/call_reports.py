@@ -1,7 +1,7 @@
 """Calls that the guard reports, and records or answers where ``rules.RULES`` and the job say so.
 
-Python's audit hooks report files, processes, sockets, addresses and the C library. Functions without
-an audit event are replaced for the run, as are reads of ``os.environ``.
+Python's audit hooks report files, processes, sockets, addresses and the C library. A run replaces
+functions that have no audit event, and the class of ``os.environ``.
 """
 
 from __future__ import annotations
