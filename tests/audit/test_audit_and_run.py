@@ -58,8 +58,8 @@ CALLS = [
     "f'{id(N)}'",
 ]
 IMPORTS = (
-    "import datetime, email.utils, gc, glob, numpy, os, pathlib, random, secrets, socket, subprocess, "
-    "threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
+    "import datetime, email.utils, gc, glob, numpy, os, pathlib, random, secrets, socket, "
+    "subprocess, threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
 )
 
 
