@@ -1,12 +1,16 @@
-"""Files that are read as a whole: named pipes and devices are refused before they are opened.
+"""Files that are read or written as a whole.
 
-Opening a named pipe waits for a writer, and a device may never end.
+Reading refuses named pipes and devices before opening them: a pipe waits for a writer, and a device
+may never end.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
@@ -44,3 +48,24 @@ def in_the_way(path: Path) -> str:
         return not_regular(path)
     except OSError:
         return ""
+
+
+@contextmanager
+def replacement_of(path: Path) -> Iterator[Path]:
+    """Give a path to write to; its file takes the place of ``path`` when the block ends well.
+
+    So nobody sees half a file, and what was there stays if writing fails. It keeps its mode, and a
+    symbolic link still points to it.
+
+    :raises OSError: if the file cannot take the place.
+    """
+    final = Path(os.path.realpath(path))
+    work = final.with_name(f".{final.name}.part-{os.getpid()}")
+    try:
+        yield work
+        with suppress(FileNotFoundError):
+            work.chmod(stat.S_IMODE(final.stat().st_mode))
+        work.replace(final)
+    finally:
+        with suppress(OSError):
+            work.unlink()
