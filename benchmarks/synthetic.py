@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsltrace.trace import chunks
+from rsltrace.trace import segments as chunks
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import (
     CDR_HEADER,

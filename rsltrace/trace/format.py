@@ -10,8 +10,7 @@ import struct
 
 import numpy as np
 
-from rsltrace.trace.mcap.layout import MESSAGE_HEADER_DTYPE
-from rsltrace.trace.mcap.records import Header
+from rsltrace.trace.mcap.records import MESSAGE_HEADER_DTYPE, Header
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1

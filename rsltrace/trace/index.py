@@ -25,8 +25,7 @@ from rsltrace.trace.format import (
     SEGMENT_DTYPE,
 )
 from rsltrace.trace.mcap import chunk as mcap_chunk
-from rsltrace.trace.mcap import summary as mcap_summary
-from rsltrace.trace.mcap import walk
+from rsltrace.trace.mcap import reader as mcap_summary
 from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     CHUNK_BYTES_MAX,
@@ -44,7 +43,6 @@ from rsltrace.trace.mcap.records import (
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary
 
 # Pieces of a trace file, each read with an error that says where it is damaged and what to do.
 
@@ -65,7 +63,7 @@ def damaged(source: ByteSource, offset: int, what: str, why: object) -> TraceErr
 def read_body(source: ByteSource, span: Span, opcode: int, what: str) -> bytes:
     """Return the body of the record at ``span``. Raises TraceError if it is not such a record."""
     try:
-        return walk.read_body(source, span, opcode)
+        return mcap_summary.read_body(source, span, opcode)
     except Damaged as error:
         raise damaged(source, span.offset, what, error) from error
 
@@ -182,7 +180,7 @@ class TraceIndex:
     segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
     chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
 
-    def take(self, summary: Summary) -> None:
+    def take(self, summary: mcap_summary.Summary) -> None:
         """Take over what the records of the file say of it."""
         self.metadata, self.attachments = summary.metadata, summary.attachments
         for channel_id, schema_id, topic, _, metadata in summary.channels.values():

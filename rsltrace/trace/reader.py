@@ -52,7 +52,7 @@ from rsltrace.trace.index import (
     read_metadata,
     read_summary,
 )
-from rsltrace.trace.mcap.place import open_source
+from rsltrace.trace.mcap.reader import Summary, check_data, has_end, read_body, walk_records
 from rsltrace.trace.mcap.records import (
     ENTITY_ID_MAX,
     MAGIC,
@@ -61,9 +61,7 @@ from rsltrace.trace.mcap.records import (
     parse_channel,
     parse_schema,
 )
-from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary, check_data, has_end
-from rsltrace.trace.mcap.walk import read_body, walk_records
+from rsltrace.trace.mcap.source import ByteSource, open_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, Event, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, Mode

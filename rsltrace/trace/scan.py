@@ -32,10 +32,9 @@ from rsltrace.trace.index import (
     read_header,
 )
 from rsltrace.trace.mcap.chunk import read_chunk
+from rsltrace.trace.mcap.reader import Summary, length_by_fields, read_body, whole_records
 from rsltrace.trace.mcap.records import Damaged, Fields, Span
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary
-from rsltrace.trace.mcap.walk import length_by_fields, read_body, whole_records
 from rsltrace.trace.segments import check_numbered, events_in, outputs_in
 
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from rsltrace._version import __version__
 from rsltrace.errors import OutputError
-from rsltrace.trace import chunks
+from rsltrace.trace import segments as chunks
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
@@ -56,8 +56,8 @@ from rsltrace.trace.format import (
     TOPIC_TIMINGS,
 )
 from rsltrace.trace.index import metadata_checksum
-from rsltrace.trace.mcap.chunk_body import Waiting, messages_chunk
-from rsltrace.trace.mcap.deferred import DeferredWriter
+from rsltrace.trace.mcap.buffered_writer import DeferredWriter
+from rsltrace.trace.mcap.chunk import Waiting, messages_chunk
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
 from rsltrace.trace.model.entity import Entity

@@ -17,6 +17,17 @@ from mcap.opcode import Opcode
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import cut_messages, read_chunk
+from rsltrace.trace.mcap.reader import (
+    Footer,
+    Summary,
+    data_crc,
+    has_end,
+    read_body,
+    read_footer,
+    read_header,
+    read_summary,
+    walk_records,
+)
 from rsltrace.trace.mcap.records import (
     MAGIC,
     MESSAGE,
@@ -28,16 +39,6 @@ from rsltrace.trace.mcap.records import (
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource, FileSource
-from rsltrace.trace.mcap.summary import (
-    Footer,
-    Summary,
-    data_crc,
-    has_end,
-    read_footer,
-    read_header,
-    read_summary,
-)
-from rsltrace.trace.mcap.walk import read_body, walk_records
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.recordings.merge import Message
 from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
