@@ -1,4 +1,4 @@
-"""Addresses of objects, where a program can see them: in hashes and in texts."""
+"""Addresses of objects where a program can see them: in hashes and in texts."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.trace.model.finding import Source
 
 _ADDRESS = re.compile(r"\S* at 0x(?!52[0-9a-f]{10}\b)[0-9a-f]{6,}")
-"""An address in a text; not what the guard shows in place of one."""
+"""An address in a text; the numbers that the guard shows instead begin with 0x52."""
 _ALIKE = object.__hash__
 _SEEDED = os.environ.get("PYTHONHASHSEED", "random") == "random"
 _OF_PARTS = (tuple.__hash__, frozenset.__hash__)
-"""What makes a hash of those of its elements; types that are derived have them, too."""
+"""Hash methods that combine the hashes of the elements; subclasses inherit them."""
 _POINTING = frozenset((BuiltinMethodType, GenericAlias, MethodType, MethodWrapperType, UnionType))
-"""Types that make hashes of addresses in a way of their own."""
+"""Types whose own hash methods use addresses."""
 _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
-"""What a method that makes a hash of an address has among its names."""
+"""Names in the code of a method that makes a hash of an address."""
 
 
-def is_by_address(thing: object) -> bool:
+def has_address_hash(thing: object) -> bool:
     """Return whether an object's hash differs from process to process."""
     kind = type(thing)
     if kind in (int, float, bool, complex):
@@ -42,39 +42,41 @@ def is_by_address(thing: object) -> bool:
         return sys.version_info < (3, 12)
     method = getattr(kind, "__hash__", None)
     if method in _OF_PARTS:
-        return any(map(is_by_address, thing))  # type: ignore[call-overload]
+        return any(map(has_address_hash, thing))  # type: ignore[call-overload]
     if isinstance(thing, ReferenceType):
-        return is_by_address(thing())
+        return has_address_hash(thing())
     if method is _ALIKE or kind in _POINTING or kind in _by_address:
         return True
     return not _TAKING.isdisjoint(getattr(getattr(method, "__code__", None), "co_names", ()))
 
 
-def hashed_by_address(frame: FrameType) -> None:
-    """Remember of the ``__hash__`` method that runs in ``frame`` that addresses are in its hash."""
+def note_address_hash(frame: FrameType) -> None:
+    """Remember that the ``__hash__`` method which runs in ``frame`` uses addresses."""
     names = code_of(frame).co_varnames
     if names and code_of(frame).co_argcount:
         _by_address.add(type(frame.f_locals.get(names[0])))
 
 
 _by_address: WeakSet[type] = WeakSet()
-"""Types whose hashes are made of those of objects that are hashed by address."""
+"""Types whose hashes include those of objects that are hashed by address."""
 
 
 def text_with_address(text: str) -> None:
-    """Report a text for others to see in which an object's address stands."""
+    """Report a text for others to read that contains an object's address."""
     guard = engaged()
     if guard is not None:
         match = _ADDRESS.search(text)
         if match is not None:
-            report_here(guard, Source.ADDRESS, "an address in a log record", match.group())
+            report_from_middleware(
+                guard, Source.ADDRESS, "an address in a log record", match.group()
+            )
 
 
-def report_here(guard: Guard, source: Source, call: str, value: str) -> None:
-    """Report something that user code did through our own middleware."""
+def report_from_middleware(guard: Guard, source: Source, call: str, value: str) -> None:
+    """Report something that user code did through rsltrace's middleware."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         if guard.is_user(frame):
-            guard.watched(source, call, value, frame)
+            guard.report_user_call(source, call, value, frame)
             return
         frame = frame.f_back

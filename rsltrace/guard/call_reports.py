@@ -20,8 +20,13 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.callers import is_of_python, module_of, user_frame
-from rsltrace.guard.file_report_filter import NOT_NEWS, READERS_OF_CODE, asking_module, is_installed
+from rsltrace.guard.callers import is_python_frame, module_of, user_frame
+from rsltrace.guard.file_report_filter import (
+    SOURCE_READERS,
+    UNREPORTED_MODULES,
+    calling_module,
+    is_installed_path,
+)
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import is_library
@@ -58,23 +63,23 @@ def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
         if guard is None:
             return real(*arguments, **options)
         frame = caller()
-        if not guard.is_for_user(frame):
+        if not guard.is_user_call(frame):
             return real(*arguments, **options)  # ROS and Python, for themselves
         if answer is not None and answers(source, guard.mode(source, frame)):
-            guard.count(source, f"{name}()", frame)
+            guard.count_call(source, f"{name}()", frame)
             return answer(*arguments, **options)
-        if not is_thread and asking_module(frame) in NOT_NEWS:
+        if not is_thread and calling_module(frame) in UNREPORTED_MODULES:
             return real(*arguments, **options)
         shown = ""
         if is_file:
-            if is_installed(arguments[0] if arguments else options.get("path")):
+            if is_installed_path(arguments[0] if arguments else options.get("path")):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
         text = f"{name}({shown})"
         if restore is not None and guard.mode(source, frame) is Mode.RECORD:
-            return restore(guard.recorded(source, text, lambda: real(*arguments, **options), frame))
+            return restore(guard.record(source, text, lambda: real(*arguments, **options), frame))
         value = real(*arguments, **options)
-        guard.watched(source, text, value, frame, _value_text)
+        guard.report_user_call(source, text, value, frame, _value_text)
         return value
 
     return call
@@ -98,7 +103,7 @@ def _report_statement(sql: str) -> None:
     found = sql_call(sql)
     guard = engaged() if found is not None else None
     if guard is not None and found is not None and found[1].source is not None:
-        guard.watched(found[1].source, found[0], sql[:200], caller())
+        guard.report_user_call(found[1].source, found[0], sql[:200], caller())
 
 
 # -- reads of os.environ --------------------------------------------------------------------------
@@ -112,7 +117,15 @@ _NOT_READ = ("PYTHON", "ROS_PYTHON_", "ROS_VERSION")
 """What Python looks at for itself, what every class of messages does when it is imported, and what
 is the same wherever there is ROS 2."""
 
-_LAYS_OUT = {"os", "_collections_abc", "collections.abc", "shutil", "locale", "gettext", "argparse"}
+_HELP_MODULES = {
+    "os",
+    "_collections_abc",
+    "collections.abc",
+    "shutil",
+    "locale",
+    "gettext",
+    "argparse",
+}
 
 _SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
 
@@ -128,8 +141,8 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
             return str(super().__getitem__(name))
         frame = caller()
         call = f"os.environ[{name!r}]"
-        if guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD and guard.is_for_user(frame):
-            kept = guard.recorded(
+        if guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD and guard.is_user_call(frame):
+            kept = guard.record(
                 Source.ENVIRONMENT, call, lambda: self._data.get(self.encodekey(name)), frame
             )
             if kept is None:
@@ -138,9 +151,11 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         try:
             value = str(super().__getitem__(name))
         except KeyError:
-            guard.watched(Source.ENVIRONMENT, call + _reader(frame), "not set", frame)
+            guard.report_user_call(Source.ENVIRONMENT, call + _reader(frame), "not set", frame)
             raise
-        guard.watched(Source.ENVIRONMENT, call + _reader(frame), _shown(name, value), frame)
+        guard.report_user_call(
+            Source.ENVIRONMENT, call + _reader(frame), _variable_text(name, value), frame
+        )
         return value
 
     def __iter__(self) -> Iterator[str]:
@@ -148,7 +163,7 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         if guard is not None:
             frame = caller()
             call = "os.environ" + _reader(frame)
-            guard.watched(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
+            guard.report_user_call(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
         names: Iterator[str] = super().__iter__()
         return names
 
@@ -158,7 +173,7 @@ def _guard_of(environment: object, name: str = "") -> Guard | None:
     guard = engaged()
     if guard is None or environment is not os.environ or str(name).startswith(_NOT_READ):
         return None
-    return None if _lays_out_help(sys._getframe(2)) else guard
+    return None if _is_formatting_help(sys._getframe(2)) else guard
 
 
 @contextmanager
@@ -173,9 +188,9 @@ def environment_watched() -> Iterator[None]:
         environment.__class__ = kind
 
 
-def _lays_out_help(frame: FrameType | None) -> bool:
+def _is_formatting_help(frame: FrameType | None) -> bool:
     """Whether argparse wants the terminal's width and language, which no node looks at."""
-    while frame is not None and (module := module_of(frame)) in _LAYS_OUT:
+    while frame is not None and (module := module_of(frame)) in _HELP_MODULES:
         if module == "argparse":
             return True
         frame = frame.f_back
@@ -184,14 +199,14 @@ def _lays_out_help(frame: FrameType | None) -> bool:
 
 def _reader(frame: FrameType | None) -> str:
     """Name the library that reads a variable, if the node itself does not."""
-    while frame is not None and is_of_python(frame):
+    while frame is not None and is_python_frame(frame):
         frame = frame.f_back
     if frame is None or not is_library(code_of(frame).co_filename):
         return ""
     return f"{READ_BY}{module_of(frame).partition('.')[0]}"
 
 
-def _shown(name: str, value: str) -> str:
+def _variable_text(name: str, value: str) -> str:
     """Return a variable's value as evidence; of one that may be a secret, only a hash."""
     if _SECRET.search(name) or len(value) > 200:
         return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
@@ -226,20 +241,20 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         source, call, value = wanted
         if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
             return  # starting it is recorded, or else is a finding of its own
-        guard.watched(source, call, value, frame)
+        guard.report_user_call(source, call, value, frame)
 
 
-_Wanted = tuple[Source, str, object] | None
+_Report = tuple[Source, str, object] | None
 
 
-def _opened(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
+def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     path, mode, flags = arguments
-    if isinstance(path, int) or asking_module(frame) in READERS_OF_CODE:
+    if isinstance(path, int) or calling_module(frame) in SOURCE_READERS:
         return None
     name = os.fsdecode(path)
     if name in ("/dev/urandom", "/dev/random"):
         return Source.RANDOM, f"open({name!r})", ""
-    if is_installed(name):
+    if is_installed_path(name):
         return None
     writing = any(c in mode for c in "wax+") if isinstance(mode, str) else flags & _WRITING
     if writing:
@@ -261,26 +276,26 @@ def _content(name: str) -> str:
         return error.strerror or type(error).__name__
 
 
-def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
+def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     name = str(arguments[1])
     source = C_FUNCTIONS.get(name)
     return None if source is None else (source, f"C library: {name}()", "")
 
 
-def _one(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Wanted]:
-    def wanted(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
+def _event_report(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Report]:
+    def wanted(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
         shown = next((a for a in arguments if isinstance(a, (str, bytes, list, tuple))), "")
         return source, f"{name}()", str(shown)[:200]
 
     return wanted
 
 
-_HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Wanted]] = {
-    "open": _opened,
+_HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Report]] = {
+    "open": _open_report,
     "ctypes.dlsym": _foreign_function,
     "ctypes.addressof": lambda arguments, frame: (Source.ADDRESS, "ctypes.addressof()", ""),
     "builtins.id": lambda arguments, frame: (Source.ADDRESS, "id()", hex(arguments[0])),
-    **{event: _one(source, event) for event, source in AUDIT_EVENTS.items()},
+    **{event: _event_report(source, event) for event, source in AUDIT_EVENTS.items()},
 }
 
 

@@ -24,21 +24,21 @@ from rsltrace.guard.callers import (
     in_import,
     is_in,
     module_of,
-    stack_of,
     user_frame,
+    user_stack,
 )
-from rsltrace.guard.context import Context, RandomStreams, RealTimePace
+from rsltrace.guard.context import RandomStreams, RealTimePace, SimulationContext
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.libraries import present_import
-from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
+from rsltrace.guard.object_numbers import ObjectNumbers, TextNumbers
 from rsltrace.guard.recorded_answers import (
     AHEAD_NS_MAX,
     LOOK_NS,
-    Clock,
-    Draw,
+    ClockFunction,
+    RandomFunction,
     RecordedAnswers,
-    Shown,
+    ShownTime,
     decoded,
     encoded_answer,
     finding_value,
@@ -61,15 +61,15 @@ _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
 
 
-def _forked() -> None:
+def _disengage_in_child() -> None:
     for guard in _guards:
         guard.thread = 0  # in charge of no thread of a child
 
 
-os.register_at_fork(after_in_child=_forked)
+os.register_at_fork(after_in_child=_disengage_in_child)
 
 
-def at_least(mode: Mode) -> Mode:
+def reporting_mode(mode: Mode) -> Mode:
     """Return what is done where the run can make no answer and record none: it is reported."""
     return mode if mode in _ALWAYS else Mode.WARN
 
@@ -116,7 +116,7 @@ class Guard:
 
     def __init__(
         self,
-        context: Context,
+        context: SimulationContext,
         *,
         policy: Policy,
         seed: int = 0,
@@ -135,13 +135,13 @@ class Guard:
         self.on_finding = on_finding
         self._found: dict[tuple[Source, Mode, str, str], int] = {}
         self._answered: dict[Source, dict[str, dict[str, int]]] = {source: {} for source in Source}
-        self._draws: dict[str, dict[str, Draw]] = {}
+        self._draws: dict[str, dict[str, RandomFunction]] = {}
         self.streams = RandomStreams(seed)
         self.answers = RecordedAnswers()
         self.descriptors = DescriptorTable()
         self.pace = RealTimePace()
         self.numbers = ObjectNumbers()
-        self.shown = ShownNumbers()
+        self.shown = TextNumbers()
         self._policy = policy
         self.modes = policy.modes if one_policy and not any(policy.allowed.values()) else None
         self.makes_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
@@ -154,10 +154,10 @@ class Guard:
         self._reads = 0
         self._reads_event = -1
         self._passes = 0
-        self._clocks: dict[str, dict[str, Clock]] = {}
-        self._shown: dict[str, Shown] = {}
+        self._clocks: dict[str, dict[str, ClockFunction]] = {}
+        self._shown: dict[str, ShownTime] = {}
 
-    def goes_on_in(self, process: int) -> None:
+    def continue_in(self, process: int) -> None:
         """Take note that the present process is a copy, made by the kernel's own ``fork``, which
         is in charge from now on."""
         self.process = process
@@ -209,7 +209,7 @@ class Guard:
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 
-    def known_draw(self, call: str, kind: int) -> Callable[..., Any] | None:
+    def known_random_function(self, call: str, kind: int) -> Callable[..., Any] | None:
         """Count a draw of the user's or rclpy's code; return what draws for the node that runs, or
         None if none runs or it is its first."""
         try:
@@ -220,7 +220,7 @@ class Guard:
             draw.count += 1
         return draw.function
 
-    def draw(
+    def random_function(
         self, call: str, virtual: Callable[[Guard, str], Callable[..., Any]], frame: FrameType
     ) -> Callable[..., Any]:
         """Count a draw that the run makes; return what draws from the stream of whoever runs."""
@@ -230,11 +230,11 @@ class Guard:
             try:
                 draw = self._draws[call][node]
             except KeyError:
-                draw = self._draws.setdefault(call, {})[node] = Draw(virtual(self, node))
+                draw = self._draws.setdefault(call, {})[node] = RandomFunction(virtual(self, node))
             if kind != OURS:
                 draw.count += 1
             return draw.function
-        self.count(_RANDOM, call, frame)
+        self.count_call(_RANDOM, call, frame)
         return virtual(self, self.stream(frame))
 
     def is_user(self, frame: FrameType) -> bool:
@@ -242,21 +242,21 @@ class Guard:
         is_users = KINDS[code_of(frame).co_filename] == USER
         return is_users or user_frame(frame, self.packages) is frame
 
-    def is_for_user(self, frame: FrameType) -> bool:
+    def is_user_call(self, frame: FrameType) -> bool:
         """Return whether user code has led to a frame."""
         kind = KINDS[code_of(frame).co_filename]
         return kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None)
 
-    def user_of(self, frame: FrameType) -> FrameType | None:
+    def user_frame_of(self, frame: FrameType) -> FrameType | None:
         """Return the frame of user code that has led to a frame, if any has."""
         kind = KINDS[code_of(frame).co_filename]
         if kind <= OURS:
             return frame if kind == USER else None
         return user_frame(frame, self.packages)
 
-    def count(self, source: Source, call: str, frame: FrameType) -> None:
+    def count_call(self, source: Source, call: str, frame: FrameType) -> None:
         """Count a call of user code that the run answers itself."""
-        if self.user_of(frame) is not None:
+        if self.user_frame_of(frame) is not None:
             running = self._running
             present = running.node if running is not None else None
             node = present.key if present is not None else self.context.node()
@@ -265,16 +265,16 @@ class Guard:
             except KeyError:
                 self._answered[source].setdefault(call, {})[node] = 1
 
-    def answered(
+    def note_answer(
         self, source: Source, call: str, told: Callable[[], str], frame: FrameType
     ) -> None:
         """Let the trace keep what user code was told from outside, in an order that the run makes:
         no finding, but what two runs may differ in."""
-        user = user_frame(frame, self.packages) if self.is_for_user(frame) else None
+        user = user_frame(frame, self.packages) if self.is_user_call(frame) else None
         event, entity = self.context.place()
         if user is None or not self._has_room(event):
             return
-        node, stack = self.context.node(), stack_of(user, self.packages)
+        node, stack = self.context.node(), user_stack(user, self.packages)
         self.on_finding(Finding(event, entity, node, source, Mode.VIRTUAL, call, told(), stack))
 
     def _has_room(self, event: int) -> bool:
@@ -284,7 +284,7 @@ class Guard:
         self._in_event += 1
         return self._in_event <= FINDINGS_PER_EVENT
 
-    def found(
+    def report(
         self,
         source: Source,
         mode: Mode,
@@ -305,7 +305,7 @@ class Guard:
         event, entity = self.context.place()
         if self._has_room(event) or mode in _EACH:
             user = user or user_frame(frame, self.packages)
-            stack = stack_of(user or frame, self.packages)
+            stack = user_stack(user or frame, self.packages)
             if told is not None:
                 text = told(value)
             else:
@@ -318,7 +318,7 @@ class Guard:
                     f"{ADVICE[source]}"
                 )
 
-    def recorded(
+    def record(
         self, source: Source, call: str, real: Callable[[], Any], frame: FrameType, of: int = 0
     ) -> Any:
         """Return the answer to a call from outside; the trace keeps it for a re-run.
@@ -334,10 +334,10 @@ class Guard:
         else:
             with engage(None):
                 text = encoded_answer(real)
-        self.found(source, Mode.RECORD, call, finding_value(of, 0, text) if of else text, frame)
+        self.report(source, Mode.RECORD, call, finding_value(of, 0, text) if of else text, frame)
         return decoded(text)
 
-    def watched(
+    def report_user_call(
         self,
         source: Source,
         call: str,
@@ -346,14 +346,14 @@ class Guard:
         told: Callable[[Any], str] | None = None,
     ) -> None:
         """Report a call that cannot be virtual, if user code made it and the job wants to know."""
-        if not self.is_for_user(frame):
+        if not self.is_user_call(frame):
             return
         mode = self.mode(source, frame)
         if mode is _ALLOW:
             return
-        self.found(source, at_least(mode), call, value, frame, told)
+        self.report(source, reporting_mode(mode), call, value, frame, told)
 
-    def whose(self, names: dict[str, Any], frame: FrameType) -> int:
+    def file_kind(self, names: dict[str, Any], frame: FrameType) -> int:
         """Return whose the code of a frame is, be it in a package of the nodes; remember it of its
         module, whose ``names`` these are."""
         file = code_of(frame).co_filename
@@ -407,12 +407,12 @@ class Guard:
             shown.ahead_ns += LOOK_NS
         return now_ns + shown.ahead_ns
 
-    def _shown_by(self, who: str) -> Shown:
-        shown = self._shown[who] = self._shown.get(who) or Shown()
+    def _shown_by(self, who: str) -> ShownTime:
+        shown = self._shown[who] = self._shown.get(who) or ShownTime()
         return shown
 
-    def _new_clock(self, call: str, node: str) -> Clock:
-        clock = Clock(self._shown_by(node))
+    def _new_clock(self, call: str, node: str) -> ClockFunction:
+        clock = ClockFunction(self._shown_by(node))
         self._clocks.setdefault(call, {})[node] = clock
         return clock
 

@@ -17,10 +17,10 @@ from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
 from rsltrace.guard.call_reports import reported_calls
-from rsltrace.guard.callers import is_nobodys, module_of
-from rsltrace.guard.frames import caller, exchange_special
+from rsltrace.guard.callers import is_never_user_code, module_of
+from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.process_ids import meant_id, meant_path, virtual_id
+from rsltrace.guard.process_ids import meant_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
 from rsltrace.guard.recorded.polls import recorded_polls
@@ -28,8 +28,8 @@ from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import virtual_clocks
-from rsltrace.guard.virtual.object_hashes import watched_hashes
-from rsltrace.guard.virtual.processors import same_processors
+from rsltrace.guard.virtual.object_hashes import reported_hashes
+from rsltrace.guard.virtual.processors import virtual_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.trace.model.finding import Mode, Source
@@ -40,19 +40,19 @@ _NAMES_MAX = 20
 """Names of a listing that the trace keeps."""
 
 
-class SortedScan:
+class SortedDirectory:
     """What ``os.scandir`` returns, in the order of names."""
 
     def __init__(self, entries: list[Any]) -> None:
         self._entries = iter(entries)
 
-    def __iter__(self) -> SortedScan:
+    def __iter__(self) -> SortedDirectory:
         return self
 
     def __next__(self) -> Any:
         return next(self._entries)
 
-    def __enter__(self) -> SortedScan:
+    def __enter__(self) -> SortedDirectory:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -68,10 +68,10 @@ def _sorted_names(value: list[Any]) -> tuple[list[Any], list[Any]]:
     return names, names
 
 
-def _sorted_scan(value: Any) -> tuple[SortedScan, list[Any]]:
+def _sorted_scan(value: Any) -> tuple[SortedDirectory, list[Any]]:
     with value:
         entries = sorted(value, key=lambda entry: os.fsencode(entry.name))
-    return SortedScan(entries), [entry.name for entry in entries]
+    return SortedDirectory(entries), [entry.name for entry in entries]
 
 
 def _call(name: str, arguments: tuple[Any, ...]) -> str:
@@ -79,7 +79,7 @@ def _call(name: str, arguments: tuple[Any, ...]) -> str:
     return f"os.{name}({os.fspath(path) if isinstance(path, os.PathLike) else path!r})"
 
 
-def _told(names: list[Any]) -> str:
+def _names_text(names: list[Any]) -> str:
     """Return how many names there are, and which: two runs may have found others."""
     texts = [os.fsdecode(name) for name in names]
     if not texts:
@@ -97,7 +97,7 @@ def _listing(
     call = f"os.{name}()"
 
     def listed(*arguments: Any, **options: Any) -> Any:
-        value = real(*map(meant_path, arguments), **options)
+        value = real(*map(real_path, arguments), **options)
         guard = engaged()
         if guard is None:
             return value
@@ -105,12 +105,14 @@ def _listing(
         mode = guard.mode(Source.DIRECTORY, frame)
         if mode is Mode.VIRTUAL:
             arranged, names = arrange(value)
-            guard.count(Source.DIRECTORY, call, frame)
-            guard.answered(Source.DIRECTORY, _call(name, arguments), partial(_told, names), frame)
+            guard.count_call(Source.DIRECTORY, call, frame)
+            guard.note_answer(
+                Source.DIRECTORY, _call(name, arguments), partial(_names_text, names), frame
+            )
             return arranged
         if mode is not Mode.ALLOW:
             shown = repr(value[:10]) if isinstance(value, list) else ""
-            guard.watched(Source.DIRECTORY, call, shown, frame)
+            guard.report_user_call(Source.DIRECTORY, call, shown, frame)
         return value
 
     return listed
@@ -137,7 +139,7 @@ def sorted_listings() -> Iterator[None]:
 
 _tempfile: Any = tempfile
 _platform: Any = platform
-_ASKED_ONCE: dict[str, tuple[str, Callable[[], object]]] = {
+_PLATFORM_CACHES: dict[str, tuple[str, Callable[[], object]]] = {
     "uname": ("_uname_cache", lambda: None),
     "platform": ("_platform_cache", dict),
     "freedesktop_os_release": ("_os_release_cache", lambda: None),
@@ -145,13 +147,13 @@ _ASKED_ONCE: dict[str, tuple[str, Callable[[], object]]] = {
 """Functions of ``platform``, where each keeps its answer, and what is there before the first."""
 
 
-class _Names:
+class _FileNameSequence:
     """Stands in for ``tempfile``'s sequence of random names: each node has its own."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
 
-    def __iter__(self) -> _Names:
+    def __iter__(self) -> _FileNameSequence:
         return self
 
     def __next__(self) -> str:
@@ -167,7 +169,7 @@ class _Names:
         return str(next(names[stream]))
 
 
-def _unseen(real: Callable[..., str]) -> Callable[..., str]:
+def _unreported(real: Callable[..., str]) -> Callable[..., str]:
     """Where files go is asked by one node for all: neither its chance nor its finding."""
 
     def default_folder(*arguments: Any) -> str:
@@ -177,7 +179,7 @@ def _unseen(real: Callable[..., str]) -> Callable[..., str]:
     return default_folder
 
 
-def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
+def _uncached(real: Any, cache: str, empty: Callable[[], object]) -> Any:
     """Ask the machine again each time: whoever asked before may have been a library."""
 
     def ask(*arguments: Any, **options: Any) -> Any:
@@ -191,19 +193,21 @@ def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
 def fresh_module_caches() -> Iterator[None]:
     """Let nothing be remembered from before, and put it back afterwards."""
     with ExitStack() as stack:
-        for name, (cache, empty) in _ASKED_ONCE.items():
+        for name, (cache, empty) in _PLATFORM_CACHES.items():
             if hasattr(platform, cache):
                 replace_attribute(stack, platform, cache, empty())
                 replace_attribute(
-                    stack, platform, name, _asking(getattr(platform, name), cache, empty)
+                    stack, platform, name, _uncached(getattr(platform, name), cache, empty)
                 )
         find = _tempfile._get_default_tempdir
         chosen = tempfile.tempdir
         if chosen is not None and chosen == find():
             chosen = None  # nobody has chosen it
         replace_attribute(stack, tempfile, "tempdir", chosen)
-        replace_attribute(stack, tempfile, "_get_default_tempdir", _unseen(find))
-        replace_attribute(stack, tempfile, "_name_sequence", _Names(_tempfile._name_sequence))
+        replace_attribute(stack, tempfile, "_get_default_tempdir", _unreported(find))
+        replace_attribute(
+            stack, tempfile, "_name_sequence", _FileNameSequence(_tempfile._name_sequence)
+        )
         yield
 
 
@@ -211,14 +215,14 @@ def fresh_module_caches() -> Iterator[None]:
 
 _CALL = "os.getpid()"
 _LOGGING = "logging"
-_TAKE_IDS = (
+_ID_FUNCTIONS = (
     *("getpgid", "getsid", "getpriority", "setpriority", "pidfd_open"),
     *("sched_getparam", "sched_setparam", "sched_getscheduler", "sched_setscheduler"),
     "sched_rr_get_interval",
 )
 """Functions of ``os`` that are given the id of a process; ``os.kill`` is the door's."""
 
-_TAKE_PATHS = ("readlink", "access")
+_PATH_FUNCTIONS = ("readlink", "access")
 """Functions of ``os`` that are given a path and that nobody else redirects."""
 
 
@@ -228,26 +232,26 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         if guard is None:
             return real()
         frame = caller()
-        if is_nobodys(frame):
+        if is_never_user_code(frame):
             return real()
         mode = guard.mode(Source.PID, frame)
         shown = module_of(frame) == _LOGGING  # which notes it in every record, whoever logs
         if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
             if not shown:
-                guard.count(Source.PID, _CALL, frame)
+                guard.count_call(Source.PID, _CALL, frame)
             return virtual_id(guard)
         if shown:
             return real()
-        if mode is Mode.RECORD and guard.is_for_user(frame):
-            return int(guard.recorded(Source.PID, _CALL, real, frame))
+        if mode is Mode.RECORD and guard.is_user_call(frame):
+            return int(guard.record(Source.PID, _CALL, real, frame))
         value = real()
-        guard.watched(Source.PID, _CALL, value, frame)
+        guard.report_user_call(Source.PID, _CALL, value, frame)
         return value
 
     return getpid
 
 
-def _taking(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[..., Any]:
+def _translating(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any, **options: Any) -> Any:
         options = {name: meant(value) for name, value in options.items()}
         return real(*map(meant, arguments), **options)
@@ -260,12 +264,12 @@ def own_process_ids() -> Iterator[None]:
     """Give each main a process id of its own, and take it back where one is asked for."""
     with ExitStack() as stack:
         redirect(stack, os.getpid, _getpid)
-        for name in _TAKE_IDS:
+        for name in _ID_FUNCTIONS:
             if hasattr(os, name):
-                redirect(stack, getattr(os, name), partial(_taking, meant_id))
-        redirect(stack, resource.prlimit, partial(_taking, meant_id))
-        for name in _TAKE_PATHS:
-            redirect(stack, getattr(os, name), partial(_taking, meant_path))
+                redirect(stack, getattr(os, name), partial(_translating, meant_id))
+        redirect(stack, resource.prlimit, partial(_translating, meant_id))
+        for name in _PATH_FUNCTIONS:
+            redirect(stack, getattr(os, name), partial(_translating, real_path))
         yield
 
 
@@ -289,7 +293,7 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
             return text
         with engage(None):
             address = f"0x{id(self):x}"
-            return text.replace(address, _shown(guard, self) or address)
+            return text.replace(address, _address_text(guard, self) or address)
 
     # Neither a function nor new: numba's jitclass looks for what a class adds to ``object``.
     vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
@@ -297,7 +301,7 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     return method
 
 
-def _shown(guard: Guard, thing: Any) -> str | None:
+def _address_text(guard: Guard, thing: Any) -> str | None:
     """Return what stands for the address of an object: the node's number for it, in hexadecimal.
 
     Addresses do not begin like that. None for an object that cannot be recognised later.
@@ -314,7 +318,7 @@ def numbered_texts() -> Iterator[None]:
     """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
     with ExitStack() as stack:
         for kind in (object, *_SHOWN_ALIKE):
-            exchange_special(stack, kind, "__repr__", _numbered)
+            replace_special_method(stack, kind, "__repr__", _numbered)
         yield
 
 
@@ -324,11 +328,11 @@ _REPLACEMENTS = (
     virtual_randomness,
     sorted_listings,
     numbered_texts,
-    watched_hashes,
+    reported_hashes,
     ordered_sets,
     own_process_ids,
     reported_calls,
-    same_processors,
+    virtual_processors,
     recorded_files,
     recorded_descriptors,
     recorded_sockets,
@@ -336,23 +340,23 @@ _REPLACEMENTS = (
     recorded_processes,
 )
 
-_users = 0
+_user_count = 0
 _stack = ExitStack()
 
 
 @contextmanager
 def installed() -> Iterator[None]:
     """Redirect the sources; the last one to leave takes everything back."""
-    global _users, _stack
-    if _users == 0:
+    global _user_count, _stack
+    if _user_count == 0:
         with ExitStack() as stack:
             for replacement in _REPLACEMENTS:
                 stack.enter_context(replacement())
             _stack = stack.pop_all()
-    _users += 1
+    _user_count += 1
     try:
         yield
     finally:
-        _users -= 1
-        if _users == 0:
+        _user_count -= 1
+        if _user_count == 0:
             _stack.close()

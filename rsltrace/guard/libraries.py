@@ -193,6 +193,3 @@ def _is_of_workspace(path: str, record: bytes) -> bool:
     packages = {os.fsdecode(found) for found in _PACKAGE_OF_ROS.findall(record)}
     is_own = packages == {own} and _name_of(os.path.basename(path)) != own
     return bool(packages) and not is_own
-
-
-__all__ = ["INSTALLED", "TARGETS", "LibraryImport", "importing", "is_library", "present_import"]

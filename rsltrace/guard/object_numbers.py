@@ -70,7 +70,7 @@ class ObjectNumbers:
         return kept[1] if kept is not None and kept[0]() is thing else None
 
     def _keep(self, thing: Any) -> None:
-        thing = _meant(thing)
+        thing = _referent(thing)
         if isinstance(thing, (*_PLAIN, types.MethodType)):
             return
         key, kept = _address(thing), self._kept
@@ -91,7 +91,7 @@ class ObjectNumbers:
 
     def _describe(self, thing: Any, parts: list[str], depth: int) -> None:
         """Write down what tells an object apart, without asking its own code."""
-        thing = _meant(thing)
+        thing = _referent(thing)
         kind = type(thing)
         if len(parts) >= _PARTS_MAX:
             return
@@ -159,7 +159,7 @@ class ObjectNumbers:
             self._describe(value, parts, depth + 1)
 
 
-class ShownNumbers:
+class TextNumbers:
     """Numbers of the objects that were shown in a text, by the node that first did."""
 
     def __init__(self) -> None:
@@ -189,7 +189,7 @@ class ShownNumbers:
         return number
 
 
-def _meant(thing: Any) -> Any:
+def _referent(thing: Any) -> Any:
     """Return what a weak reference refers to, whose hash it has; another object is itself."""
     return thing() if isinstance(thing, weakref.ref) else thing
 
@@ -210,6 +210,3 @@ def _bound_in(function: types.FunctionType) -> list[Any]:
 
 def _has_plain_data(array: np.ndarray[Any, Any]) -> bool:
     return not array.dtype.hasobject and array.nbytes <= _ARRAY_BYTES_MAX
-
-
-__all__ = ["ObjectNumbers", "ShownNumbers"]

@@ -34,7 +34,7 @@ def meant_id(pid: Any) -> Any:
     return pid
 
 
-def meant_path(path: Any) -> Any:
+def real_path(path: Any) -> Any:
     """Return a path below ``/proc`` with the real process id in it."""
     if type(path) is str and path[:6] != _PROC:
         return path
@@ -44,6 +44,3 @@ def meant_path(path: Any) -> Any:
         if match is not None:
             return f"{_PROC}{meant_id(int(match[1]))}{text[match.end() :]}"
     return path
-
-
-__all__ = ["FIRST", "meant_id", "meant_path", "virtual_id"]

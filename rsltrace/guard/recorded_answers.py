@@ -26,7 +26,7 @@ LOOK_NS = 1_000
 AHEAD_NS_MAX = 1_000_000
 
 
-class Draw:
+class RandomFunction:
     """What draws for a node that calls one function, and how often user code did."""
 
     __slots__ = ("count", "function")
@@ -36,7 +36,7 @@ class Draw:
         self.function = function
 
 
-class Shown:
+class ShownTime:
     """How far what the clocks of a node showed last was ahead of simulated time, which was
     ``now_ns``."""
 
@@ -55,12 +55,12 @@ class Shown:
         self.now_ns, self.ahead_ns = now_ns, ahead_ns
 
 
-class Clock:
+class ClockFunction:
     """One clock function of a node: how often user code looked, and what all of its clocks show."""
 
     __slots__ = ("looks", "shown")
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: ShownTime) -> None:
         self.looks = 0
         self.shown = shown
 

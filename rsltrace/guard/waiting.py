@@ -13,7 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.context import STEP_NS, Context
+from rsltrace.guard.context import STEP_NS, SimulationContext
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import present_import
@@ -58,7 +58,7 @@ def wait_recorded(
     context = guard.context
     step = step or context.step
     deadline_ns = _deadline_ns(context, timeout_s)
-    steps, first_s = 0, at_first_s(frame, timeout_s)
+    steps, first_s = 0, initial_wait_s(frame, timeout_s)
     kept = guard.answers.next_answer(context.node(), call, of) if guard.answers.replays else None
     text: str | None = None
     try:
@@ -66,7 +66,7 @@ def wait_recorded(
             if kept is None:
                 with engage(None):
                     seconds = guard.pace.ahead_s(context.now_ns()) if steps else first_s
-                    text = _looked(look, seconds)
+                    text = _attempt_text(look, seconds)
                 if text is not None:
                     break
             elif steps >= kept.steps and kept.text is not None:
@@ -85,7 +85,7 @@ def wait_recorded(
                 break
     finally:
         # None: the run ends before the answer has come, and a re-run will wait as long for it.
-        guard.found(source, Mode.RECORD, call, finding_value(of, steps, text), frame)
+        guard.report(source, Mode.RECORD, call, finding_value(of, steps, text), frame)
     return decoded(text)
 
 
@@ -102,7 +102,7 @@ def wait_unrecorded(
     """
     context, steps = guard.context, 0
     step = step or context.step
-    first_s = at_first_s(frame, timeout_s)
+    first_s = initial_wait_s(frame, timeout_s)
     deadline_ns = _deadline_ns(context, timeout_s)
     while True:
         with engage(None):
@@ -123,11 +123,11 @@ def wait_unrecorded(
         steps += 1
 
 
-def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
+def _deadline_ns(context: SimulationContext, timeout_s: float | None) -> int | None:
     return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
 
 
-def at_first_s(frame: FrameType, timeout_s: float | None) -> float:
+def initial_wait_s(frame: FrameType, timeout_s: float | None) -> float:
     """Return how long simulated time stands still for whoever waits, in real seconds.
 
     It does for a program of ``subprocess``, but not for one that can still be told something: it
@@ -157,7 +157,7 @@ def waiting_guard(frame: FrameType) -> Guard | None:
     return None
 
 
-def _looked(look: Attempt, seconds: float) -> str | None:
+def _attempt_text(look: Attempt, seconds: float) -> str | None:
     found: list[Any] = []
 
     def real() -> Any:
@@ -168,7 +168,7 @@ def _looked(look: Attempt, seconds: float) -> str | None:
     return None if found and found[0] is NOT_YET else text
 
 
-def when_readable(fd: int, real: Callable[[], Any]) -> Attempt:
+def wait_readable(fd: int, real: Callable[[], Any]) -> Attempt:
     """Return a look that does ``real`` as soon as there is something to read."""
 
     def look(seconds: float) -> Any:
@@ -179,7 +179,7 @@ def when_readable(fd: int, real: Callable[[], Any]) -> Attempt:
     return look
 
 
-def polled(real: Callable[[], Any]) -> Attempt:
+def poll_until(real: Callable[[], Any]) -> Attempt:
     """Return a look at something that nobody can wait for: ``real`` returns it, or ``NOT_YET``."""
 
     def look(seconds: float) -> Any:

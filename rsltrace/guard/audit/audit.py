@@ -15,10 +15,10 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rsltrace.errors import JobError
-from rsltrace.guard.audit.calls import Place, find_calls
-from rsltrace.guard.audit.names import Names
+from rsltrace.guard.audit.calls import CallSite, find_calls
+from rsltrace.guard.audit.names import NameResolver
 from rsltrace.guard.audit.rules import Audit, Found
-from rsltrace.guard.audit.scopes import Module, Scope, parse_scopes
+from rsltrace.guard.audit.scopes import ModuleSource, NameScope, parse_scopes
 from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.trace.model.finding import Policy
@@ -38,7 +38,7 @@ class SourceFile:
     set allows all."""
 
     path: Path
-    module: Module
+    module: ModuleSource
     as_script: bool = False
     allowed: dict[int, frozenset[str]] = field(default_factory=dict)
 
@@ -67,7 +67,7 @@ def _allowed(text: str) -> dict[int, frozenset[str]]:
     return found
 
 
-class Collection:
+class SourceCollection:
     """Files by module name, each once, with those that could not be read."""
 
     def __init__(self) -> None:
@@ -99,18 +99,18 @@ class Collection:
         return None
 
 
-def collect_path(path: Path) -> Collection:
+def collect_path(path: Path) -> SourceCollection:
     """Return the Python file at a path, or those below a folder."""
-    found = Collection()
+    found = SourceCollection()
     if path.is_dir():
-        for file in _below(path):
+        for file in _python_files(path):
             found.add(file, module_name(file))
     else:
         found.add(path, module_name(path), as_script=True)
     return found
 
 
-def _below(folder: Path) -> Iterator[Path]:
+def _python_files(folder: Path) -> Iterator[Path]:
     for here, folders, files in os.walk(folder):
         if "pyvenv.cfg" in files:
             folders.clear()
@@ -140,14 +140,14 @@ def collect_modules(
     scripts: Sequence[Path],
     folders: Sequence[Path],
     programs: AbstractSet[str] = frozenset(),
-) -> tuple[Collection, list[str]]:
+) -> tuple[SourceCollection, list[str]]:
     """Return modules by name, and what they import as far as it is the user's own; also the names
     that were not found. ``programs`` are those that ``python -m`` runs.
 
     The user's own are modules below ``folders`` (no virtual environment there), and of an installed
     package those of the package itself.
     """
-    found = Collection()
+    found = SourceCollection()
     path = [*map(str, folders), *sys.path]
     missing = []
     waiting: list[tuple[str, str]] = [(name, name.partition(".")[0]) for name in names]
@@ -207,7 +207,7 @@ _LEAST_SAFE_FIRST = (
 
 
 @dataclass
-class _Group:
+class _NodeGroup:
     """Nodes that are guarded alike.
 
     ``targets`` are theirs (``module:Class``, or scripts), ``files`` what these and their imports
@@ -223,7 +223,7 @@ class _Group:
 class GuardTreatment:
     """Says what is done about a place. ``policy`` is the job's, None if it has no guard at all."""
 
-    def __init__(self, policy: Policy | None, groups: Sequence[_Group] = ()) -> None:
+    def __init__(self, policy: Policy | None, groups: Sequence[_NodeGroup] = ()) -> None:
         self._policy = policy
         self._groups = groups
 
@@ -237,14 +237,14 @@ class GuardTreatment:
         of_job = policy_of(job.guard)
         if all(spec.guard is None for spec in job.nodes):
             return cls(of_job)
-        groups: list[_Group] = []
+        groups: list[_NodeGroup] = []
         for spec, target in zip(job.nodes, targets, strict=True):
             policy, whose = of_job, "the job"
             if spec.guard is not None:
                 policy, whose = policy_of(job.guard, spec.guard), f"node {spec.name or spec.target}"
             group = next((one for one in groups if one.policy == policy), None)
             if group is None:
-                groups.append(group := _Group(policy, whose, []))
+                groups.append(group := _NodeGroup(policy, whose, []))
             group.targets.append(target)
         for group in groups:
             names = [module_of(target) for target in group.targets if isinstance(target, str)]
@@ -253,12 +253,12 @@ class GuardTreatment:
             group.files = frozenset(one.path.resolve() for one in reached.files.values())
         return cls(of_job, groups)
 
-    def of(self, source: SourceFile, place: Place) -> tuple[Treatment, str]:
+    def of(self, source: SourceFile, place: CallSite) -> tuple[Treatment, str]:
         """Return the treatment of a place, and what that means; of several, the least safe."""
         groups = self._that_get_to(source, place)
         if not groups:
-            return _done(source, place, self._policy, "the job")
-        all_done = [_done(source, place, group.policy, group.whose) for group in groups]
+            return _treatment(source, place, self._policy, "the job")
+        all_done = [_treatment(source, place, group.policy, group.whose) for group in groups]
         least = min(all_done, key=lambda done: _LEAST_SAFE_FIRST.index(done[0]))
         group = groups[all_done.index(least)]
         treatment, does = least
@@ -268,8 +268,8 @@ class GuardTreatment:
         runs_in = "" if group.whose in does else f" when {group.whose} runs it"
         return treatment, f"{does}{runs_in} ({other[0].value} elsewhere)"
 
-    def _that_get_to(self, source: SourceFile, place: Place) -> Sequence[_Group]:
-        scope: Scope | None = source.module.scope_of(place.node)
+    def _that_get_to(self, source: SourceFile, place: CallSite) -> Sequence[_NodeGroup]:
+        scope: NameScope | None = source.module.scope_of(place.node)
         if scope is source.module.top or not self._groups:
             return ()
         while scope is not None and scope.parent is not source.module.top:
@@ -285,8 +285,8 @@ def module_of(target: str) -> str:
     return target.partition(":")[0]
 
 
-def _done(
-    source: SourceFile, place: Place, policy: Policy | None, whose: str
+def _treatment(
+    source: SourceFile, place: CallSite, policy: Policy | None, whose: str
 ) -> tuple[Treatment, str]:
     rule = place.rule
     globs = policy.allowed.get(rule.source, ()) if policy and rule.source else ()
@@ -360,11 +360,11 @@ def audit_job(
     return _audit(collection, GuardTreatment.of_job(job, targets, folders))
 
 
-def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
+def _audit(collection: SourceCollection, guard: GuardTreatment) -> Audit:
     sources = list(collection.files.values())
-    names = Names({source.module.name: source.module for source in sources})
+    names = NameResolver({source.module.name: source.module for source in sources})
     called: set[ast.AST] = set()
-    places: list[tuple[SourceFile, Place]] = []
+    places: list[tuple[SourceFile, CallSite]] = []
     for source in sources:
         for place in find_calls(source.module, names, as_script=source.as_script):
             if place.alias is None:
@@ -378,7 +378,7 @@ def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
         if _is_silenced(source, place):
             silenced += 1
             continue
-        found.add(_found(source, place, guard))
+        found.add(_finding(source, place, guard))
     return Audit(
         tuple(sorted(found)),
         len(sources),
@@ -388,7 +388,7 @@ def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
     )
 
 
-def _is_silenced(source: SourceFile, place: Place) -> bool:
+def _is_silenced(source: SourceFile, place: CallSite) -> bool:
     first = place.node.lineno
     last = first if isinstance(place.node, ast.stmt) else place.node.end_lineno or first
     for line in range(first, last + 1):
@@ -398,7 +398,7 @@ def _is_silenced(source: SourceFile, place: Place) -> bool:
     return False
 
 
-def _found(source: SourceFile, place: Place, guard: GuardTreatment) -> Found:
+def _finding(source: SourceFile, place: CallSite, guard: GuardTreatment) -> Found:
     treatment, does = guard.of(source, place)
     node = place.node
     return Found(

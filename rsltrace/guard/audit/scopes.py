@@ -13,51 +13,51 @@ from typing import TypeAlias
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
+class ImportedName:
     """A name that stands for a module or something in one, by its full name."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class Annotated:
+class AnnotatedName:
     """A name of which only the type is known."""
 
     type: ast.expr
 
 
-Binding: TypeAlias = "ast.expr | Imported | Annotated | ast.ClassDef | None"
+Binding: TypeAlias = "ast.expr | ImportedName | AnnotatedName | ast.ClassDef | None"
 
 
 @dataclass(eq=False)
-class Scope:
+class NameScope:
     """Names of a module, class, function or comprehension."""
 
     kind: str
-    parent: Scope | None
-    module: Module
+    parent: NameScope | None
+    module: ModuleSource
     node: ast.AST | None = None
     names: dict[str, list[Binding]] = field(default_factory=lambda: defaultdict(list))
     attributes: dict[str, list[Binding]] = field(default_factory=lambda: defaultdict(list))
     """Of a class: what its methods bind to ``self.name``."""
 
     @property
-    def own_class(self) -> Scope | None:
+    def own_class(self) -> NameScope | None:
         """The class of the method that this scope is in."""
-        scope: Scope | None = self
+        scope: NameScope | None = self
         while scope is not None and scope.kind != "class":
             scope = scope.parent
         return scope
 
 
 @dataclass(eq=False)
-class Module:
+class ModuleSource:
     """One source file, taken apart."""
 
     name: str
     is_package: bool
     tree: ast.Module
-    scopes: dict[ast.AST, Scope] = field(default_factory=dict)
+    scopes: dict[ast.AST, NameScope] = field(default_factory=dict)
     """The scope that each function, class, lambda and comprehension opens, and the file's own."""
     parents: dict[ast.AST, ast.AST] = field(default_factory=dict)
     stars: list[str] = field(default_factory=list)
@@ -65,11 +65,11 @@ class Module:
     """Full names of all that is imported anywhere in the file."""
 
     @property
-    def top(self) -> Scope:
+    def top(self) -> NameScope:
         """The scope of the file itself."""
         return self.scopes[self.tree]
 
-    def scope_of(self, node: ast.AST) -> Scope:
+    def scope_of(self, node: ast.AST) -> NameScope:
         """Return the scope in which an expression is evaluated."""
         child, place = node, self.parents.get(node)
         while place is not None:
@@ -96,9 +96,9 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
-def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> Module:
+def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> ModuleSource:
     """Return a module with its scopes filled in."""
-    module = Module(name, is_package, tree)
+    module = ModuleSource(name, is_package, tree)
     for parent in ast.walk(tree):
         for child in ast.iter_child_nodes(parent):
             module.parents[child] = parent
@@ -107,14 +107,14 @@ def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> Mo
 
 
 class _Binder(ast.NodeVisitor):
-    def __init__(self, module: Module) -> None:
+    def __init__(self, module: ModuleSource) -> None:
         self.module = module
-        self.scope = Scope("module", None, module)
+        self.scope = NameScope("module", None, module)
         module.scopes[module.tree] = self.scope
 
     def _within(self, node: ast.AST, kind: str) -> None:
         outer = self.scope
-        self.scope = Scope(kind, outer, self.module, node)
+        self.scope = NameScope(kind, outer, self.module, node)
         self.module.scopes[node] = self.scope
         if isinstance(node, _FUNCTIONS):
             self._parameters(node.args)
@@ -146,7 +146,7 @@ class _Binder(ast.NodeVisitor):
         for parameter, default in pairs:
             annotation = parameter.annotation
             given = default is not None and not isinstance(default, ast.Constant)
-            known = Annotated(annotation) if annotation is not None else None
+            known = AnnotatedName(annotation) if annotation is not None else None
             self.scope.names[parameter.arg].append(default if given else known)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
@@ -177,11 +177,11 @@ class _Binder(ast.NodeVisitor):
         for alias in node.names:
             self.module.imports.add(alias.name)
             first = alias.name.partition(".")[0]
-            bound = Imported(alias.name if alias.asname else first)
+            bound = ImportedName(alias.name if alias.asname else first)
             self.scope.names[alias.asname or first].append(bound)
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        source = _source(self.module, node)
+        source = _imported_module(self.module, node)
         self.module.imports.add(source)
         for alias in node.names:
             if alias.name == "*":
@@ -189,7 +189,7 @@ class _Binder(ast.NodeVisitor):
                 continue
             full = f"{source}.{alias.name}" if source else alias.name
             self.module.imports.add(full)
-            self.scope.names[alias.asname or alias.name].append(Imported(full))
+            self.scope.names[alias.asname or alias.name].append(ImportedName(full))
 
     def visit_Assign(self, node: ast.Assign) -> None:
         for target in node.targets:
@@ -197,7 +197,7 @@ class _Binder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        self._bind(node.target, Annotated(node.annotation))
+        self._bind(node.target, AnnotatedName(node.annotation))
         self.generic_visit(node)
 
     def visit_NamedExpr(self, node: ast.NamedExpr) -> None:
@@ -229,7 +229,7 @@ def _is_self(node: ast.expr) -> bool:
     return isinstance(node, ast.Name) and node.id in ("self", "cls")
 
 
-def _source(module: Module, node: ast.ImportFrom) -> str:
+def _imported_module(module: ModuleSource, node: ast.ImportFrom) -> str:
     """Return the full name of the module that ``from … import`` means."""
     if not node.level:
         return node.module or ""
@@ -237,6 +237,3 @@ def _source(module: Module, node: ast.ImportFrom) -> str:
     up = node.level - 1 if module.is_package else node.level
     parts = parts[: len(parts) - up] if up else parts
     return ".".join([*parts, *([node.module] if node.module else [])])
-
-
-__all__ = ["Annotated", "Binding", "Imported", "Module", "Scope", "parse_scopes"]

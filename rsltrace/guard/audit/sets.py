@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import ast
 
-from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.scopes import Annotated, Binding, Scope
+from rsltrace.guard.audit.names import NameResolver
+from rsltrace.guard.audit.scopes import AnnotatedName, Binding, NameScope
 
 _MAKERS = {"builtins.set", "builtins.frozenset", "weakref.WeakSet"}
 _TYPES = _MAKERS | {
@@ -42,12 +42,14 @@ _KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
 
-def is_set(node: ast.expr, scope: Scope, names: Names) -> bool:
+def is_set(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     """Return whether an expression is a set whose order is not known."""
     return _is_set(node, scope, names, frozenset()) is True
 
 
-def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]) -> bool | None:
+def _is_set(
+    node: ast.expr, scope: NameScope, names: NameResolver, asked: frozenset[object]
+) -> bool | None:
     """Do ``is_set``; None says nothing either way: ``s = s | more`` leaves ``s`` what it is.
 
     ``asked`` are the bindings in question.
@@ -70,7 +72,7 @@ def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]
             return _is_set(function.value, scope, names, asked)
         made = names.of(function, scope) in _MAKERS
         return made and not (node.args and _is_range(node.args[0], scope, names))
-    bindings: list[tuple[Binding, Scope]] = []
+    bindings: list[tuple[Binding, NameScope]] = []
     if isinstance(node, ast.Name):
         bindings = list(names.bindings(node, scope))
     elif isinstance(node, ast.Attribute):
@@ -92,16 +94,16 @@ def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]
 
 
 def _binds_set(
-    binding: Binding, scope: Scope, names: Names, asked: frozenset[object]
+    binding: Binding, scope: NameScope, names: NameResolver, asked: frozenset[object]
 ) -> bool | None:
-    if isinstance(binding, Annotated):
+    if isinstance(binding, AnnotatedName):
         return _annotates_set(binding.type, scope, names)
     if isinstance(binding, ast.expr):
         return _is_set(binding, scope.module.scope_of(binding), names, asked)
     return False
 
 
-def _annotates_set(node: ast.expr, scope: Scope, names: Names) -> bool:
+def _annotates_set(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         try:
             node = ast.parse(node.value, mode="eval").body
@@ -115,11 +117,11 @@ def _annotates_set(node: ast.expr, scope: Scope, names: Names) -> bool:
     return names.of(node, scope) in _TYPES
 
 
-def _is_range(node: ast.expr, scope: Scope, names: Names) -> bool:
+def _is_range(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     return isinstance(node, ast.Call) and names.of(node.func, scope) == "builtins.range"
 
 
-def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
+def order_matters(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     """Return whether the place in which a set stands sees the order of its members."""
     parent = scope.module.parents.get(node)
     if isinstance(parent, (ast.For, ast.AsyncFor)):
@@ -131,7 +133,7 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
     if isinstance(parent, ast.AugAssign):
         return isinstance(parent.op, ast.Add)  # to a list
     if isinstance(parent, ast.Assign):
-        return any(map(_takes_apart, parent.targets))
+        return any(map(_unpacks, parent.targets))
     if isinstance(parent, ast.Attribute):
         used = scope.module.parents.get(parent)
         called = isinstance(used, ast.Call) and used.func is parent
@@ -144,14 +146,14 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
     return isinstance(parent, ast.YieldFrom)
 
 
-def _takes_apart(target: ast.expr) -> bool:
+def _unpacks(target: ast.expr) -> bool:
     """Whether an assignment gives the members of a set to several: ``a, b = s``, ``r[1:] = s``."""
     if isinstance(target, ast.Subscript):
         return isinstance(target.slice, ast.Slice)
     return isinstance(target, (ast.Tuple, ast.List))
 
 
-def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
+def _call_matters(call: ast.Call, scope: NameScope, names: NameResolver) -> bool:
     name = names.of(call.func, scope) or ""
     if name in _UNORDERED:
         return any(word.arg == "key" for word in call.keywords)
@@ -160,14 +162,14 @@ def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
     return isinstance(call.func, ast.Attribute) and call.func.attr in _KEEPING
 
 
-def _comprehension_matters(part: ast.comprehension, scope: Scope, names: Names) -> bool:
+def _comprehension_matters(part: ast.comprehension, scope: NameScope, names: NameResolver) -> bool:
     whole = scope.module.parents[part]
     if isinstance(whole, ast.SetComp):
         return False
     return not _ends_unordered(whole, scope, names)
 
 
-def _ends_unordered(node: ast.AST, scope: Scope, names: Names) -> bool:
+def _ends_unordered(node: ast.AST, scope: NameScope, names: NameResolver) -> bool:
     """Whether what is made of a set goes right into something that does not see its order."""
     user = scope.module.parents.get(node)
     return (

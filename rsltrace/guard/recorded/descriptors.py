@@ -18,11 +18,11 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.descriptor_table import Descriptor, number_of
+from rsltrace.guard.descriptor_table import RecordedDescriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.process_ids import meant_path
+from rsltrace.guard.process_ids import real_path
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
+from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Mode, Source
 
 _RECORD = Mode.RECORD
@@ -40,15 +40,15 @@ _isatty = copy_of(os.isatty)  # type: ignore[arg-type]
 _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
-def recording(source: Source, frame: FrameType) -> Guard | None:
+def recording_guard(source: Source, frame: FrameType) -> Guard | None:
     """Return the guard if user code asks and the job records this source."""
     guard = engaged()
     if guard is None or guard.mode(source, frame) is not _RECORD:
         return None
-    return guard if guard.is_for_user(frame) else None
+    return guard if guard.is_user_call(frame) else None
 
 
-def tracked(fd: object) -> tuple[Guard, Descriptor] | None:
+def recorded_descriptor(fd: object) -> tuple[Guard, RecordedDescriptor] | None:
     """Return the guard and what it knows of a descriptor, if its answers are recorded."""
     guard = engaged()
     if guard is None:
@@ -57,7 +57,7 @@ def tracked(fd: object) -> tuple[Guard, Descriptor] | None:
     return None if found is None or found.is_folder else (guard, found)
 
 
-def stand_in(flags: int = 0) -> int:
+def unconnected_descriptor(flags: int = 0) -> int:
     """Return a descriptor for a re-run that leads nowhere, and that event loops accept."""
     nonblocking = os.EFD_NONBLOCK if flags & os.O_NONBLOCK else 0
     return os.eventfd(0, os.EFD_CLOEXEC | nonblocking)
@@ -65,25 +65,27 @@ def stand_in(flags: int = 0) -> int:
 
 def _opening(real: Callable[..., int]) -> Any:
     def open_(path: Any, flags: int, *more: Any, **options: Any) -> int:
-        path = meant_path(path)
+        path = real_path(path)
         frame = sys._getframe(1)
         wanted = not flags & _MAKES_FILES and flags & os.O_ACCMODE != os.O_WRONLY
-        guard = recording(Source.FILE, frame) if wanted else None
+        guard = recording_guard(Source.FILE, frame) if wanted else None
         if guard is None:
             return real(path, flags, *more, **options)
-        opened: list[int] = []
+        open_raw: list[int] = []
 
         def is_folder() -> bool:
-            opened.append(real(path, flags, *more, **options))
-            return stat.S_ISDIR(os.fstat(opened[0]).st_mode)
+            open_raw.append(real(path, flags, *more, **options))
+            return stat.S_ISDIR(os.fstat(open_raw[0]).st_mode)
 
         call = f"os.open({os.fsdecode(path)!r})"
-        folder = bool(guard.recorded(Source.FILE, call, is_folder, frame))
-        if not opened:  # a folder is the run's own, or its listing is not recorded anyway
-            opened.append(real(path, flags, *more, **options) if folder else stand_in(flags))
-        guard.descriptors.drop(opened[0])
-        guard.descriptors.add(opened[0], Source.FILE, is_folder=folder)
-        return opened[0]
+        folder = bool(guard.record(Source.FILE, call, is_folder, frame))
+        if not open_raw:  # a folder is the run's own, or its listing is not recorded anyway
+            open_raw.append(
+                real(path, flags, *more, **options) if folder else unconnected_descriptor(flags)
+            )
+        guard.descriptors.drop(open_raw[0])
+        guard.descriptors.add(open_raw[0], Source.FILE, is_folder=folder)
+        return open_raw[0]
 
     return open_
 
@@ -93,11 +95,11 @@ def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
     call = f"{module}.{name}()"
 
     def function(fd: Any, *arguments: Any, **options: Any) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, *arguments, **options)
         guard, known = found
-        return guard.recorded(
+        return guard.record(
             known.source,
             call,
             lambda: real(fd, *arguments, **options),
@@ -108,7 +110,7 @@ def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
     return function
 
 
-def _looking(real: Callable[..., Any]) -> Any:
+def _recording_fstat(real: Callable[..., Any]) -> Any:
     def fstat(fd: int) -> Any:
         guard = engaged()
         known = guard.descriptors.find(fd) if guard is not None else None
@@ -135,19 +137,19 @@ def recorded_stat(
         found = real()
         return [list(found), found.st_atime_ns, found.st_mtime_ns, found.st_ctime_ns]
 
-    values, *times = guard.recorded(source, call, fields, frame, of)
+    values, *times = guard.record(source, call, fields, frame, of)
     names = ("st_atime_ns", "st_mtime_ns", "st_ctime_ns")
     return os.stat_result(tuple(values), dict(zip(names, times, strict=True)))
 
 
 def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             frame = sys._getframe(1)
             patient = waiting_guard(frame)
             if patient is not None and _blocks(fd):
-                return wait_unrecorded(patient, when_readable(fd, lambda: real(fd, size)), frame)
+                return wait_unrecorded(patient, wait_readable(fd, lambda: real(fd, size)), frame)
             return real(fd, size)
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 
@@ -167,7 +169,7 @@ def _blocks(fd: int) -> bool:
 
 def _reading_into(real: Callable[..., int]) -> Any:
     def readv(fd: int, buffers: Any, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, buffers)
 
@@ -187,21 +189,21 @@ def _reading_into(real: Callable[..., int]) -> Any:
 
 def _read(
     guard: Guard,
-    known: Descriptor,
+    known: RecordedDescriptor,
     call: str,
     fd: int,
     real: Callable[[], bytes],
     frame: FrameType,
 ) -> Any:
     if _get_blocking(fd) and guard.context.is_aside():
-        look = when_readable(fd, real)
+        look = wait_readable(fd, real)
         return wait_recorded(guard, known.source, call, look, frame, of=known.number)
-    return guard.recorded(known.source, call, real, frame, known.number)
+    return guard.record(known.source, call, real, frame, known.number)
 
 
 def _controlling(real: Callable[..., Any]) -> Any:
     def ioctl(fd: Any, request: int, arg: Any = 0, mutate_flag: bool = True, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, request, arg, mutate_flag)
         guard, known = found
@@ -212,7 +214,7 @@ def _controlling(real: Callable[..., Any]) -> Any:
             return [value, bytes(arg) if fills else None]
 
         frame = sys._getframe(1)
-        value, after = guard.recorded(
+        value, after = guard.record(
             known.source, f"fcntl.ioctl({request:#x})", control, frame, known.number
         )
         if fills and after is not None:
@@ -234,7 +236,7 @@ def _closing(real: Callable[[int], None]) -> Any:
 
 def _duplicating(real: Callable[..., int]) -> Any:
     def dup(fd: int, /) -> int:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         copy = real(fd)
         if found is not None:
             found[0].descriptors.drop(copy)
@@ -244,7 +246,7 @@ def _duplicating(real: Callable[..., int]) -> Any:
     return dup
 
 
-def joining(real: Callable[..., Any]) -> Any:
+def connected_ends(real: Callable[..., Any]) -> Any:
     """Return the stand-in for a function that makes two ends of something."""
 
     def ends(*arguments: Any, **options: Any) -> Any:
@@ -325,7 +327,7 @@ class RawDescriptor(io.RawIOBase):
                     os.close(self._fd)
 
 
-def opened(
+def open_raw(
     raw: RawDescriptor,
     mode: str,
     buffering: int = -1,
@@ -357,12 +359,12 @@ def recorded_descriptors() -> Iterator[None]:
         (os, "open", _opening),
         (os, "read", _reading),
         (os, "readv", _reading_into),
-        (os, "fstat", _looking),
+        (os, "fstat", _recording_fstat),
         (os, "close", _closing),
         (os, "dup", _duplicating),
-        (os, "pipe", joining),
-        (os, "pipe2", joining),
-        (os, "openpty", joining),
+        (os, "pipe", connected_ends),
+        (os, "pipe2", connected_ends),
+        (os, "openpty", connected_ends),
         (fcntl, "ioctl", _controlling),
         *((os, name, partial(_on, "os", name)) for name in _PLAIN),
         *((termios, name, partial(_on, "termios", name)) for name in _TERMINAL),

@@ -17,7 +17,7 @@ from typing import Any
 
 from rsltrace.guard.descriptor_table import number_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.recorded.descriptors import recording
+from rsltrace.guard.recorded.descriptors import recording_guard
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.waiting import NOT_YET, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Source
@@ -29,7 +29,7 @@ _real_epoll = select.epoll
 
 def _recording(frame: FrameType) -> tuple[Guard, Source] | None:
     for source in _RECORDED:
-        guard = recording(source, frame)
+        guard = recording_guard(source, frame)
         if guard is not None:
             return guard, source
     return None
@@ -47,7 +47,7 @@ def _answer(
 ) -> list[Any]:
     """Return what is ready; whoever can be set aside is, while nothing is."""
     if timeout_s == 0 or (step is None and not guard.context.is_aside()):
-        return list(guard.recorded(source, call, lambda: real(timeout_s), frame, of) or ())
+        return list(guard.record(source, call, lambda: real(timeout_s), frame, of) or ())
 
     def look(seconds: float) -> Any:
         return real(seconds) or NOT_YET

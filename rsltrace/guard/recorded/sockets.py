@@ -18,9 +18,9 @@ from typing import Any
 
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import Guard
-from rsltrace.guard.recorded.descriptors import joining, recording
+from rsltrace.guard.recorded.descriptors import connected_ends, recording_guard
 from rsltrace.guard.redirect import redirect
-from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
+from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Source
 
 _RECEIVING = ("recv", "recvfrom", "recvmsg")
@@ -42,7 +42,7 @@ _BUFFERED = ("read", "write")
 
 def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
     """Return the guard if what a socket answers is recorded: it leads outside of the run."""
-    guard = recording(Source.SOCKET, frame)
+    guard = recording_guard(Source.SOCKET, frame)
     if guard is None or guard.descriptors.far_end(sock.fileno()) is not None:
         return None
     return guard
@@ -53,9 +53,9 @@ def _answer(
 ) -> Any:
     number = guard.descriptors.number(sock)
     if not waits or not guard.context.is_aside() or sock.gettimeout() == 0:
-        return guard.recorded(Source.SOCKET, call, real, frame, number)
+        return guard.record(Source.SOCKET, call, real, frame, number)
     timeout_s = sock.gettimeout()
-    look = when_readable(sock.fileno(), lambda: [real()])
+    look = wait_readable(sock.fileno(), lambda: [real()])
     found = wait_recorded(
         guard,
         Source.SOCKET,
@@ -75,7 +75,7 @@ def _wait_for(sock: Any, frame: FrameType) -> None:
     guard, timeout_s = waiting_guard(frame), sock.gettimeout()
     if guard is None or timeout_s == 0 or sock.fileno() < 0:
         return
-    look = when_readable(sock.fileno(), lambda: True)
+    look = wait_readable(sock.fileno(), lambda: True)
     if wait_unrecorded(guard, look, frame, timeout_s) is None:
         raise TimeoutError("timed out")
 
@@ -145,10 +145,10 @@ def _accepting(real: Callable[[Any], Any]) -> Any:
 def _resolving(name: str, real: Callable[..., Any]) -> Any:
     def resolve(*arguments: Any, **options: Any) -> Any:
         frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
+        guard = recording_guard(Source.SOCKET, frame)
         if guard is None:
             return real(*arguments, **options)
-        return guard.recorded(
+        return guard.record(
             Source.SOCKET, f"socket.{name}()", lambda: real(*arguments, **options), frame
         )
 
@@ -161,10 +161,10 @@ def _resolving(name: str, real: Callable[..., Any]) -> Any:
 def _of_tls(kind: str, name: str, real: Callable[..., Any]) -> Any:
     def method(self: Any, *arguments: Any) -> Any:
         frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
+        guard = recording_guard(Source.SOCKET, frame)
         if guard is None:
             return real(self, *arguments)
-        return guard.recorded(
+        return guard.record(
             Source.SOCKET, f"{kind}.{name}()", lambda: real(self, *arguments), frame
         )
 
@@ -174,7 +174,7 @@ def _of_tls(kind: str, name: str, real: Callable[..., Any]) -> Any:
 def _reading(real: Callable[..., Any]) -> Any:
     def read(self: Any, size: int, buffer: Any = None, /) -> Any:
         frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
+        guard = recording_guard(Source.SOCKET, frame)
         if guard is None:
             return real(self, size) if buffer is None else real(self, size, buffer)
 
@@ -187,7 +187,7 @@ def _reading(real: Callable[..., Any]) -> Any:
         if isinstance(owner, socket.socket):
             data = _answer_tls(guard, self, owner, call, receive, frame)
         else:
-            data = guard.recorded(Source.SOCKET, call, receive, frame)
+            data = guard.record(Source.SOCKET, call, receive, frame)
         if buffer is None:
             return data
         memoryview(buffer).cast("B")[: len(data)] = data
@@ -208,8 +208,8 @@ def _answer_tls(
     number = guard.descriptors.number(sock)
     timeout_s = sock.gettimeout()
     if timeout_s == 0 or not guard.context.is_aside():
-        return guard.recorded(Source.SOCKET, call, receive, frame, number)
-    wire = when_readable(sock.fileno(), lambda: [receive()])
+        return guard.record(Source.SOCKET, call, receive, frame, number)
+    wire = wait_readable(sock.fileno(), lambda: [receive()])
 
     def look(seconds: float) -> Any:
         return [receive()] if tls.pending() else wire(seconds)
@@ -222,10 +222,10 @@ def _answer_tls(
 
 def _pending(real: Any) -> property:
     def pending(self: Any) -> Any:
-        guard = recording(Source.SOCKET, sys._getframe(1))
+        guard = recording_guard(Source.SOCKET, sys._getframe(1))
         if guard is None:
             return real.__get__(self)
-        return guard.recorded(
+        return guard.record(
             Source.SOCKET, "MemoryBIO.pending", lambda: real.__get__(self), sys._getframe(1)
         )
 
@@ -238,7 +238,7 @@ def recorded_sockets() -> Iterator[None]:
     with ExitStack() as stack:
         for name in _RESOLVING:
             redirect(stack, getattr(_socket, name), partial(_resolving, name))
-        redirect(stack, _socket.socketpair, joining)
+        redirect(stack, _socket.socketpair, connected_ends)
         kind: Any = socket.socket
         makers: list[tuple[str, Any]] = [
             *((name, partial(_of_socket, name)) for name in _PLAIN),

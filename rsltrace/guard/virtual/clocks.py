@@ -19,9 +19,9 @@ from typing import Any
 
 from rsltrace.guard import frames
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.frames import caller, code_of, put_member
+from rsltrace.guard.frames import caller, code_of, set_member
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_read
+from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_reader
 from rsltrace.trace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
@@ -66,9 +66,7 @@ def clock_call(
             return real()
         if guard.context.is_aside():
             return virtual(guard.context.now_ns())
-        return virtual(
-            guard.recorded(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame)
-        )
+        return virtual(guard.record(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame))
     mode = guard.mode(_CLOCK, frame)
     if mode is _VIRTUAL:
         kind = KINDS[code_of(frame).co_filename]
@@ -78,9 +76,9 @@ def clock_call(
     if mode is Mode.RECORD:
         if real_ns is None:
             real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
-        return virtual(guard.recorded(Source.CLOCK, call, real_ns, frame))
+        return virtual(guard.record(Source.CLOCK, call, real_ns, frame))
     value = real()
-    guard.found(Source.CLOCK, mode, call, value, frame)
+    guard.report(Source.CLOCK, mode, call, value, frame)
     return value
 
 
@@ -108,7 +106,7 @@ def _reading(name: str, real: Callable[[], Any]) -> Callable[[dict[str, Any]], A
             kind = guard.kinds[names["__file__"]]
         except (KeyError, TypeError):
             frame = caller()
-            kind = guard.whose(names, frame)
+            kind = guard.file_kind(names, frame)
         if kind > OURS or not guard.makes_clocks:
             if frame is None:
                 try:
@@ -254,7 +252,7 @@ def virtual_clocks() -> Iterator[None]:
                 how(stack, function, make)
 
         for name in (*_READERS, *(f"{name}_ns" for name in _READERS)):
-            redirect_time(name, partial(_reading, name), redirect_read)
+            redirect_time(name, partial(_reading, name), redirect_reader)
         localtime = copy_of(time.localtime)  # type: ignore[arg-type]
         redirect_time(
             "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
@@ -268,11 +266,11 @@ def virtual_clocks() -> Iterator[None]:
         redirect_time("asctime", lambda real: _formatting("asctime", 0, real, localtime))
         bound_before = _bound_before("now", "utcnow")
         for name, make in (("now", _now), ("utcnow", _utcnow)):
-            _exchange(stack, name, make, bound_before[name])
+            _replace_method(stack, name, make, bound_before[name])
         yield
 
 
-def _exchange(
+def _replace_method(
     stack: ExitStack,
     name: str,
     make: Callable[[Any], Any],
@@ -284,8 +282,8 @@ def _exchange(
     for bound in bound_before:
         target = ours.__get__(bound.__self__)
         stack.callback(Redirected(bound, target).restore)
-    put_member(datetime, name, classmethod(ours))
-    stack.callback(put_member, datetime, name, real)
+    set_member(datetime, name, classmethod(ours))
+    stack.callback(set_member, datetime, name, real)
 
 
 def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:

@@ -11,7 +11,7 @@ from functools import partial
 from types import FrameType, MethodWrapperType
 from typing import Any
 
-from rsltrace.guard.addresses import hashed_by_address, is_by_address
+from rsltrace.guard.addresses import has_address_hash, note_address_hash
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
@@ -20,31 +20,31 @@ from rsltrace.trace.model.finding import Source
 _of_object = object.__hash__
 
 
-def _seen(thing: object, value: int, frame: FrameType) -> int:
+def _report_hash(thing: object, value: int, frame: FrameType) -> int:
     """Report a hash that code asked for, if addresses are in it."""
     guard = engaged()
-    if guard is not None and is_by_address(thing):
+    if guard is not None and has_address_hash(thing):
         if code_of(frame).co_name == "__hash__":
-            hashed_by_address(frame)  # matters where a set of such objects is gone through
+            note_address_hash(frame)  # matters where a set of such objects is gone through
         elif guard.is_user(frame):
             kind = type(thing).__qualname__
-            guard.watched(Source.ADDRESS, f"hash() of {kind}", value, frame)
+            guard.report_user_call(Source.ADDRESS, f"hash() of {kind}", value, frame)
     return value
 
 
 def _hashing(real: Callable[[Any], int]) -> Any:
     def hash_of(thing: Any, /) -> int:
-        return _seen(thing, real(thing), caller())
+        return _report_hash(thing, real(thing), caller())
 
     return hash_of
 
 
 def _objects_hash(thing: Any, /) -> int:
-    return _seen(thing, _of_object(thing), caller())
+    return _report_hash(thing, _of_object(thing), caller())
 
 
 def _bound_hash(real: Callable[[], int], /) -> int:
-    return _seen(real.__self__, real(), caller())  # type: ignore[attr-defined]
+    return _report_hash(real.__self__, real(), caller())  # type: ignore[attr-defined]
 
 
 def hash_method(owner: Any) -> Any:
@@ -56,11 +56,8 @@ def hash_method(owner: Any) -> Any:
 
 
 @contextmanager
-def watched_hashes() -> Iterator[None]:
+def reported_hashes() -> Iterator[None]:
     """Report what the built-in ``hash`` gives."""
     with ExitStack() as stack:
         redirect(stack, hash, _hashing)
         yield
-
-
-__all__ = ["hash_method", "watched_hashes"]

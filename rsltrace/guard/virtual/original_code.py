@@ -59,14 +59,14 @@ def _original_for_numba(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
             if original is not code:
                 thing.__code__ = original
             if code.co_filename in _sources:
-                _tell_of_sets(original)
+                _report_sets(original)
             return original
         return code
 
     return get_code_object
 
 
-def _tell_of_sets(code: CodeType) -> None:
+def _report_sets(code: CodeType) -> None:
     """Report a function that has sets: they keep the order that they have."""
     if not any(_SETS & set(part.co_names) or _makes_set(part) for part in _all_in(code)):
         return
@@ -77,7 +77,7 @@ def _tell_of_sets(code: CodeType) -> None:
     if guard.mode(Source.ORDER, frame) is not Mode.ALLOW:
         call = f"order of sets in {code.co_name}, which numba compiles"
         line = f"{code.co_filename.rpartition('/')[2]}:{code.co_firstlineno}"
-        guard.found(Source.ORDER, Mode.WARN, call, line, frame)
+        guard.report(Source.ORDER, Mode.WARN, call, line, frame)
 
 
 def _makes_set(code: CodeType) -> bool:
@@ -125,6 +125,3 @@ def show_original(name: str, stack: ExitStack) -> None:
         _READERS[name](name, stack)
     except (AttributeError, KeyError):
         pass  # a version that does it otherwise
-
-
-__all__ = ["READERS", "keep_source", "original_of", "show_original"]

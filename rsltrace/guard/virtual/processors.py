@@ -29,11 +29,11 @@ _affinities: WeakKeyDictionary[Guard, frozenset[int]] = WeakKeyDictionary()
 def _answering_guard(call: str, frame: FrameType) -> Guard | None:
     """Return the guard if user code calls and the run answers."""
     guard = engaged()
-    if guard is None or not guard.is_for_user(frame):
+    if guard is None or not guard.is_user_call(frame):
         return None
     if guard.mode(Source.ENVIRONMENT, frame) is Mode.ALLOW:
         return None
-    guard.count(Source.ENVIRONMENT, call, frame)
+    guard.count_call(Source.ENVIRONMENT, call, frame)
     return guard
 
 
@@ -83,7 +83,7 @@ def _setting(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
 
 
 @contextmanager
-def same_processors() -> Iterator[None]:
+def virtual_processors() -> Iterator[None]:
     """Show user code the same processors on every machine."""
     with ExitStack() as stack:
         for name, make in (
@@ -95,4 +95,4 @@ def same_processors() -> Iterator[None]:
         yield
 
 
-__all__ = ["PROCESSORS", "same_processors"]
+__all__ = ["PROCESSORS", "virtual_processors"]

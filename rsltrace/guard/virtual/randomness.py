@@ -26,11 +26,11 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import (
     Redirected,
     RedirectedMethod,
-    RedirectedRead,
+    RedirectedReader,
     copy_of,
+    has_no_arguments,
     redirect,
     replace_attribute,
-    takes_nothing,
 )
 from rsltrace.trace.model.finding import Mode, Source
 
@@ -46,7 +46,7 @@ _Virtual = Callable[[Guard, str], Callable[..., Any]]
 """Returns what draws from the stream of that name."""
 
 
-def _drawn(
+def _drawing(
     call: str, real: Callable[..., Any], virtual: _Virtual, *, is_method: bool = False
 ) -> Any:
     """Return the stand-in for a function that answers by chance; a method's owner is dropped."""
@@ -63,17 +63,17 @@ def _drawn(
             frame = frames.lost_caller()
         if guard.makes_chance:
             kind = KINDS[code_of(frame).co_filename]
-            drawing = guard.known_draw(call, kind) if kind <= OURS else None
-            return (drawing or guard.draw(call, virtual, frame))(*arguments, **options)
+            drawing = guard.known_random_function(call, kind) if kind <= OURS else None
+            return (drawing or guard.random_function(call, virtual, frame))(*arguments, **options)
         return _answer(guard, frame, call, virtual, partial(real, *arguments, **options))
 
     return draw
 
 
-def _drawn_plainly(
+def _drawing_without_arguments(
     call: str, real: Callable[[], Any], virtual: _Virtual
 ) -> Callable[[dict[str, Any]], Any]:
-    """Return the same for a function without arguments, for ``RedirectedRead``."""
+    """Return the same for a function without arguments, for ``RedirectedReader``."""
 
     def draw(names: dict[str, Any]) -> Any:
         guard = engaged()
@@ -84,10 +84,10 @@ def _drawn_plainly(
             kind = guard.kinds[names["__file__"]]
         except (KeyError, TypeError):
             frame = caller()
-            kind = guard.whose(names, frame)
+            kind = guard.file_kind(names, frame)
         if guard.makes_chance:
-            drawing = guard.known_draw(call, kind) if kind <= OURS else None
-            return (drawing or guard.draw(call, virtual, frame or caller()))()
+            drawing = guard.known_random_function(call, kind) if kind <= OURS else None
+            return (drawing or guard.random_function(call, virtual, frame or caller()))()
         return _answer(guard, frame or caller(), call, virtual, partial(real))
 
     return draw
@@ -99,17 +99,17 @@ def _answer(
     """Draw as the job says."""
     mode = guard.mode(_RANDOM, frame)
     if mode is Mode.VIRTUAL:
-        return guard.draw(call, virtual, frame)(*real.args, **real.keywords)
+        return guard.random_function(call, virtual, frame)(*real.args, **real.keywords)
     if mode is Mode.RECORD:
         stream = guard.stream(frame)
         guard.streams.begin(
             stream,
-            lambda: guard.recorded(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
+            lambda: guard.record(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
         )
         return virtual(guard, stream)(*real.args, **real.keywords)
     value = real()
     if mode is not Mode.ALLOW:
-        guard.found(_RANDOM, mode, call, value, frame, _shown)
+        guard.report(_RANDOM, mode, call, value, frame, _shown)
     return value
 
 
@@ -123,7 +123,7 @@ def virtual_randomness() -> Iterator[None]:
     """Redirect what answers by chance; which guard answers is asked at each call."""
     with ExitStack() as stack:
         _module_functions(stack, random, random._inst, "random", _random_of)
-        replace_attribute(stack, random, "_inst", _Shared())
+        replace_attribute(stack, random, "_inst", _SharedGenerator())
         _entropy(stack)
         _unseeded(stack)
         _uuids(stack)
@@ -132,11 +132,11 @@ def virtual_randomness() -> Iterator[None]:
 
             _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
             _shared_numpy(stack, np.random)
-            redirect(stack, np.empty, _emptying)
+            redirect(stack, np.empty, _zeroing)
         yield
 
 
-class _Shared(random.Random):
+class _SharedGenerator(random.Random):
     """What libraries (networkx) take for the generator behind ``random``'s functions."""
 
     def __init__(self) -> None:
@@ -175,12 +175,14 @@ def _module_functions(
 
         call = f"{prefix}.{name}()"
         if isinstance(function, MethodType):
-            draw = _drawn(call, real, virtual, is_method=True)
+            draw = _drawing(call, real, virtual, is_method=True)
             stack.callback(RedirectedMethod(function, draw).restore)
-        elif takes_nothing(function):
-            stack.callback(RedirectedRead(function, _drawn_plainly(call, real, virtual)).restore)
+        elif has_no_arguments(function):
+            stack.callback(
+                RedirectedReader(function, _drawing_without_arguments(call, real, virtual)).restore
+            )
         else:
-            stack.callback(Redirected(function, _drawn(call, real, virtual)).restore)
+            stack.callback(Redirected(function, _drawing(call, real, virtual)).restore)
 
 
 def _entropy(stack: ExitStack) -> None:
@@ -195,7 +197,7 @@ def _entropy(stack: ExitStack) -> None:
     for name in ("urandom", "getrandom"):
         function = getattr(os, name, None)
         if isinstance(function, BuiltinFunctionType):
-            redirect(stack, function, partial(_drawn, f"os.{name}()", virtual=bytes_of))
+            redirect(stack, function, partial(_drawing, f"os.{name}()", virtual=bytes_of))
 
 
 def _unseeded(stack: ExitStack) -> None:
@@ -258,12 +260,12 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
         seed: Callable[..., Any] = _numpy_of(guard, stream).seed
         return seed
 
-    draw = _drawn("numpy.random.seed()", real, seeding)
+    draw = _drawing("numpy.random.seed()", real, seeding)
     for place in (module, module.mtrand):
         replace_attribute(stack, place, "seed", draw)
 
 
-def _emptying(real: Callable[..., Any]) -> Any:
+def _zeroing(real: Callable[..., Any]) -> Any:
     """``np.empty`` shows what was in the memory before; in user code, it shows zeros."""
 
     def empty(*arguments: Any, **options: Any) -> Any:

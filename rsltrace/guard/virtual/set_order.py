@@ -26,9 +26,9 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.addresses import is_by_address
+from rsltrace.guard.addresses import has_address_hash
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.frames import caller, code_of, exchange, exchange_special
+from rsltrace.guard.frames import caller, code_of, exchange, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import Mode, Source
@@ -60,43 +60,47 @@ def _iterating(real: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator
                     frame = frames.lost_caller()
                 in_order = _order(guard, self, frame)
                 if in_order is not None:
-                    return _through(self, in_order)
+                    return _iterate(self, in_order)
         return real(self)
 
     return __iter__
 
 
-def _ordered(thing: Any) -> list[Any] | None:
+def _elements_in_order(thing: Any) -> list[Any] | None:
     """Return the elements of a set in an order that stays, or None if they are left as they are."""
-    if len(thing) < 2 or _NUMBERS.issuperset(map(type, _plainly(thing))):
+    if len(thing) < 2 or _NUMBERS.issuperset(map(type, _unordered(thing))):
         return None
     guard = engaged()
     return None if guard is None else _order(guard, thing, caller())
 
 
-def _plainly(thing: Any) -> Iterator[Any]:
+def _unordered(thing: Any) -> Iterator[Any]:
     """Go through a set as Python does."""
     return _through_frozen(thing) if isinstance(thing, frozenset) else _through_set(thing)
 
 
 def _order(guard: Guard, thing: Any, frame: FrameType | None) -> list[Any] | None:
-    """Do ``_ordered`` for code of the user and what that calls: ``frame`` is where it is asked."""
-    if frame is None or KINDS[code_of(frame).co_filename] == OURS or guard.user_of(frame) is None:
+    """Do ``_elements_in_order`` for code of the user and what that calls: ``frame`` is where it is asked."""
+    if (
+        frame is None
+        or KINDS[code_of(frame).co_filename] == OURS
+        or guard.user_frame_of(frame) is None
+    ):
         return None
     mode = guard.mode(_ORDER, frame)
     if mode is _ALLOW:
         return None
-    items = [*_plainly(thing)]
+    items = [*_unordered(thing)]
     are_texts = _TEXTS.issuperset(map(type, items))
     if not are_texts and (_are_tuples_of_numbers(items) or not any(map(_has_no_order, items))):
         return None
     if mode is _VIRTUAL:
         in_order = sorted(items) if are_texts else _in_order(guard, items)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
-            guard.count(_ORDER, "order of a set", frame)
+            guard.count_call(_ORDER, "order of a set", frame)
             return in_order
-    kinds = ", ".join(sorted(dict.fromkeys(type(_meant(one)).__qualname__ for one in items)))
-    guard.watched(
+    kinds = ", ".join(sorted(dict.fromkeys(type(_referent(one)).__qualname__ for one in items)))
+    guard.report_user_call(
         _ORDER, f"order of a {type(thing).__name__} of {kinds}", f"{len(items)} elements", frame
     )
     return None
@@ -118,7 +122,7 @@ def _in_order(guard: Guard, items: list[Any]) -> list[Any] | None:
 
 def _has_no_order(item: object) -> bool:
     """Whether an element's place in a set differs from process to process, pinned or not."""
-    return isinstance(item, (str, bytes)) or is_by_address(item)
+    return isinstance(item, (str, bytes)) or has_address_hash(item)
 
 
 def _key(item: Any) -> tuple[str, Any]:
@@ -130,11 +134,11 @@ def _key(item: Any) -> tuple[str, Any]:
     raise TypeError
 
 
-def _meant(item: Any) -> Any:
+def _referent(item: Any) -> Any:
     return item() if isinstance(item, weakref.ref) else item
 
 
-def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
+def _iterate(thing: Any, in_order: list[Any]) -> Iterator[Any]:
     """Go through elements in order; like a set, notice when it changes on the way."""
     size = len(thing)
     for item in in_order:
@@ -145,7 +149,7 @@ def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
 
 def _popping(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def pop(self: Any, /) -> Any:
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         if in_order is None:
             return real(self)
         self.remove(in_order[0])
@@ -156,7 +160,7 @@ def _popping(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 def _from_keys(real: Any) -> Any:
     def fromkeys(cls: Any, iterable: Iterable[Any], value: Any = None, /) -> Any:
-        return real.__get__(None, cls)(ordered(iterable), value)
+        return real.__get__(None, cls)(in_set_order(iterable), value)
 
     return classmethod(fromkeys)
 
@@ -167,7 +171,7 @@ def _dumping(real: Callable[..., bytes]) -> Callable[..., bytes]:
         guard = engaged()
         if guard is None or not any(mark in data for mark in _PICKLED_SETS):
             return data
-        if guard.user_of(caller()) is None:
+        if guard.user_frame_of(caller()) is None:
             return data
         file = io.BytesIO()
         pickle._Pickler(file, *arguments, **options).dump(obj)
@@ -186,7 +190,7 @@ def _dumping_into(real: Callable[..., None]) -> Callable[..., None]:
     return dump
 
 
-def ordered(thing: Any) -> Any:
+def in_set_order(thing: Any) -> Any:
     """Return what stands for ``thing`` for those who would go through a set without asking it."""
     return [*iter(thing)] if type(thing) in _TYPES else thing
 
@@ -197,7 +201,7 @@ def ordered(thing: Any) -> Any:
 def _making(real: Callable[..., Any]) -> Callable[..., Any]:
     def make(*arguments: Any, **options: Any) -> Any:
         if arguments and type(arguments[-1]) in _TYPES:
-            arguments = (*arguments[:-1], ordered(arguments[-1]))
+            arguments = (*arguments[:-1], in_set_order(arguments[-1]))
         return real(*arguments, **options)
 
     return make
@@ -206,7 +210,7 @@ def _making(real: Callable[..., Any]) -> Callable[..., Any]:
 def _reducing(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def __reduce__(self: Any, /) -> Any:  # noqa: N807
         kind, elements, state = real(self)
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         return kind, elements if in_order is None else (in_order,), state
 
     return __reduce__
@@ -215,7 +219,7 @@ def _reducing(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def _showing(real: Callable[[Any], str]) -> Callable[[Any], str]:
     @reprlib.recursive_repr("set(...)")
     def __repr__(self: Any, /) -> str:  # noqa: N807
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         if in_order is None:
             return real(self)
         inside = "{" + ", ".join(map(repr, in_order)) + "}"
@@ -229,7 +233,7 @@ def ordered_sets() -> Iterator[None]:
     """Let sets be gone through in order; which guard wants it is asked at each."""
     with ExitStack() as stack:
         for kind in _TYPES:
-            exchange_special(stack, kind, "__iter__", _iterating)
+            replace_special_method(stack, kind, "__iter__", _iterating)
         exchange(stack, set, "pop", _popping)
         exchange(stack, dict, "fromkeys", _from_keys)
         redirect(stack, pickle.dumps, _dumping)
@@ -237,13 +241,10 @@ def ordered_sets() -> Iterator[None]:
         if LISTS_READ_SETS:
             for function in (sorted, operator.iadd):
                 redirect(stack, function, _making)
-            exchange_special(stack, list, "__init__", _making)
+            replace_special_method(stack, list, "__init__", _making)
             for name in ("extend", "__iadd__"):
                 exchange(stack, list, name, _making)
             for kind in _TYPES:
-                exchange_special(stack, kind, "__repr__", _showing)
+                replace_special_method(stack, kind, "__repr__", _showing)
                 exchange(stack, kind, "__reduce__", _reducing)
         yield
-
-
-__all__ = ["LISTS_READ_SETS", "ordered", "ordered_sets"]

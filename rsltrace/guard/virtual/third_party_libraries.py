@@ -24,7 +24,7 @@ from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
 from rsltrace.guard.virtual.object_hashes import hash_method
-from rsltrace.guard.virtual.set_order import ordered
+from rsltrace.guard.virtual.set_order import in_set_order
 from rsltrace.guard.virtual.user_modules import rewrite
 
 # PyTorch's generator, for each node as if it were alone in the process.
@@ -106,8 +106,8 @@ def _call(function: Any, text: str, *more: Any) -> Any:
     return function(text, *more)
 
 
-_MEANT = {
-    ordered: _as_it_is,
+_PLAIN_FUNCTIONS = {
+    in_set_order: _as_it_is,
     hash_method: _hash_method,
     numpy_now: _call,
 }
@@ -120,7 +120,7 @@ def plain_in_graphs() -> None:
     if substitute is None or substitute in _known:
         return  # a torch that does it otherwise; or it is told already, and for good
     _known.append(substitute)
-    for function, meant in _MEANT.items():
+    for function, meant in _PLAIN_FUNCTIONS.items():
         substitute(function)(meant)
 
 
@@ -248,7 +248,7 @@ def pygame_clock(stack: ExitStack) -> None:
 # over.
 
 
-class _Names(NamedTuple):
+class _TbbFunctions(NamedTuple):
     """Functions of a generation of TBB, as the linker knows them."""
 
     processors: str
@@ -257,12 +257,12 @@ class _Names(NamedTuple):
 
 
 _GENERATIONS = (
-    _Names(  # oneTBB, from 2021 on
+    _TbbFunctions(  # oneTBB, from 2021 on
         "_ZN3tbb6detail2r115max_concurrencyEPKNS0_2d115task_arena_baseE",
         "_ZN3tbb6detail2r16createERNS0_2d114global_controlE",
         "_ZN3tbb6detail2r17destroyERNS0_2d114global_controlE",
     ),
-    _Names(
+    _TbbFunctions(
         "_ZN3tbb19task_scheduler_init19default_num_threadsEv",
         "_ZN3tbb10interface914global_control15internal_createEv",
         "_ZN3tbb10interface914global_control16internal_destroyEv",
@@ -282,7 +282,7 @@ _without: set[str] = set()
 """Files of this process that are known to have no TBB."""
 
 
-class _Control(ctypes.Structure):
+class _TbbControl(ctypes.Structure):
     """TBB's ``global_control``: ``kind`` 0 is how many threads may run at most."""
 
     _fields_ = (
@@ -292,7 +292,7 @@ class _Control(ctypes.Structure):
     )
 
 
-class _Threads:
+class _TbbThreads:
     """The copies of TBB that were met in a run. ``told`` takes a library and what is wrong."""
 
     def __init__(self, stack: ExitStack, told: Callable[[str, str], None]) -> None:
@@ -332,7 +332,7 @@ class _Threads:
             return
         self._held.add(processors)
         count = _asked_on_one_processor(ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(processors))
-        control = _Control(1, None, 0)
+        control = _TbbControl(1, None, 0)
         act = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
         act(hold)(ctypes.byref(control))
         self._stack.callback(act(release), ctypes.byref(control))
@@ -370,7 +370,7 @@ def one_tbb_thread(told: Callable[[str, str], None]) -> Iterator[None]:
     ``told`` is called for a library where that cannot be done, with its name and why.
     """
     with ExitStack() as stack:
-        threads = _Threads(stack, told)
+        threads = _TbbThreads(stack, told)
         threads.look_at_all()
 
         def importing(real: Callable[..., Any]) -> Callable[..., Any]:
@@ -393,13 +393,3 @@ def one_tbb_thread(told: Callable[[str, str], None]) -> Iterator[None]:
         redirect(stack, _imp.create_dynamic, importing)
         redirect(stack, _ctypes.dlopen, opening)
         yield
-
-
-__all__ = [
-    "COMPILES",
-    "REWRITES",
-    "one_tbb_thread",
-    "plain_in_graphs",
-    "pygame_clock",
-    "rewritten_in_pytest",
-]

@@ -22,7 +22,7 @@ from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.object_hashes import hash_method
 from rsltrace.guard.virtual.original_code import keep_source
-from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, ordered
+from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
 
 _ORDERED = "__rsltrace_ordered__"
 _HASH = "__rsltrace_hash__"
@@ -212,7 +212,7 @@ def user_modules(
     ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
     """
     helpers: dict[str, Callable[..., Any]] = {
-        _ORDERED: ordered,
+        _ORDERED: in_set_order,
         _HASH: hash_method,
         _NOW: numpy_now,
     }

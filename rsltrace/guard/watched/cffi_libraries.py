@@ -29,7 +29,7 @@ class _Library:
         guard = engaged()
         source = C_FUNCTIONS.get(name)
         if guard is not None and source is not None:
-            guard.watched(source, f"C library: {name}()", "", caller())
+            guard.report_user_call(source, f"C library: {name}()", "", caller())
         return self._real.load_function(kind, name)
 
 
@@ -39,6 +39,3 @@ def watched_libraries(stack: ExitStack) -> None:
     real = getattr(module, "_load_backend_lib", None)
     if real is not None:
         replace_attribute(stack, module, "_load_backend_lib", lambda *given: _Library(real(*given)))
-
-
-__all__ = ["LOADS_LIBRARIES", "watched_libraries"]

@@ -60,6 +60,3 @@ def _times(matrix: _Matrix, vector: int) -> int:
             result ^= column
         vector >>= 1
     return result
-
-
-__all__ = ["crc32", "crc_of", "joined_crc"]
