@@ -31,20 +31,20 @@ _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
 """Names in the code of a method that makes a hash of an address."""
 
 
-def has_address_hash(thing: object) -> bool:
+def has_address_hash(obj: object) -> bool:
     """Return whether an object's hash differs from process to process."""
-    kind = type(thing)
+    kind = type(obj)
     if kind in (int, float, bool, complex):
         return False
     if kind in (str, bytes):
         return _SEEDED
-    if thing is None:
+    if obj is None:
         return sys.version_info < (3, 12)
     method = getattr(kind, "__hash__", None)
     if method in _OF_PARTS:
-        return any(map(has_address_hash, thing))  # type: ignore[call-overload]
-    if isinstance(thing, ReferenceType):
-        return has_address_hash(thing())
+        return any(map(has_address_hash, obj))  # type: ignore[call-overload]
+    if isinstance(obj, ReferenceType):
+        return has_address_hash(obj())
     if method is _ALIKE or kind in _POINTING or kind in _by_address:
         return True
     return not _TAKING.isdisjoint(getattr(getattr(method, "__code__", None), "co_names", ()))

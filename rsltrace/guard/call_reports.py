@@ -108,14 +108,13 @@ def _report_statement(sql: str) -> None:
 
 # -- reads of os.environ --------------------------------------------------------------------------
 #
-# ``os.environ`` is an object of a Python class. For the time of a run it gets a class derived from
-# that one. Its own class is left alone: methods that are set on a class again and again (twice per
-# run) cost it its place in the interpreter's caches, and Python 3.13 then goes on to call the
-# ``__getitem__`` that it has cached, whatever the class says.
+# For the time of a run, ``os.environ`` gets a class derived from its own. Its own class is left
+# alone: methods that are set on a class twice per run cost it its place in the interpreter's
+# caches, and Python 3.13 then calls the cached ``__getitem__``.
 
 _NOT_READ = ("PYTHON", "ROS_PYTHON_", "ROS_VERSION")
-"""What Python looks at for itself, what every class of messages does when it is imported, and what
-is the same wherever there is ROS 2."""
+"""Variables that Python itself reads, that every message class reads when imported, and that are
+the same wherever ROS 2 is."""
 
 _HELP_MODULES = {
     "os",
@@ -169,7 +168,7 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
 
 
 def _guard_of(environment: object, name: str = "") -> Guard | None:
-    """Return the guard in charge if the read of who calls this is one to tell it of."""
+    """Return the engaged guard if the caller's read is to be reported."""
     guard = engaged()
     if guard is None or environment is not os.environ or str(name).startswith(_NOT_READ):
         return None
@@ -189,7 +188,7 @@ def environment_watched() -> Iterator[None]:
 
 
 def _is_formatting_help(frame: FrameType | None) -> bool:
-    """Whether argparse wants the terminal's width and language, which no node looks at."""
+    """Whether argparse reads the terminal's width and language, which no node uses."""
     while frame is not None and (module := module_of(frame)) in _HELP_MODULES:
         if module == "argparse":
             return True
@@ -198,7 +197,7 @@ def _is_formatting_help(frame: FrameType | None) -> bool:
 
 
 def _reader(frame: FrameType | None) -> str:
-    """Name the library that reads a variable, if the node itself does not."""
+    """Return which library reads a variable, if not the node itself."""
     while frame is not None and is_python_frame(frame):
         frame = frame.f_back
     if frame is None or not is_library(code_of(frame).co_filename):
@@ -207,7 +206,7 @@ def _reader(frame: FrameType | None) -> str:
 
 
 def _variable_text(name: str, value: str) -> str:
-    """Return a variable's value as evidence; of one that may be a secret, only a hash."""
+    """Return a variable's value as evidence; only a hash if it may be a secret."""
     if _SECRET.search(name) or len(value) > 200:
         return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
     return repr(value)
@@ -224,7 +223,7 @@ _is_hooked = False
 
 
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    """Take an audit event: hundreds of kinds, of which few matter."""
+    """Take an audit event: of hundreds of kinds, few matter."""
     handle = _HANDLERS.get(event)
     guard = engaged() if handle is not None else None
     if handle is None or guard is None:
@@ -263,7 +262,7 @@ def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
 
 
 def _content(name: str) -> str:
-    """Say what is in a file, in few characters."""
+    """Describe the content of a file in few characters."""
     try:
         size = os.stat(name).st_size
         if not os.path.isfile(name):
@@ -300,7 +299,7 @@ _HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Report]] = {
 
 
 def report_audit_events() -> None:
-    """Report what the audit hooks tell of from now on, while a guard is in charge."""
+    """Report audit events from now on, while a guard is engaged."""
     global _is_hooked
     if not _is_hooked:
         sys.addaudithook(_hook)
@@ -309,7 +308,7 @@ def report_audit_events() -> None:
 
 @contextmanager
 def reported_calls() -> Iterator[None]:
-    """Report calls until the block ends; which guard is told is asked at each call."""
+    """Report calls until the block ends."""
     report_audit_events()
     with ExitStack() as stack:
         for module in sorted(REPORTED_MODULES & sys.modules.keys()):

@@ -104,11 +104,11 @@ class DescriptorTable:
             return False
         return is_socket and self.far_end(number) is None
 
-    def number(self, thing: Any) -> int:
+    def number(self, obj: Any) -> int:
         """Return the number of an object without descriptor, or whose descriptor may change."""
-        found = self._numbers.get(thing)
+        found = self._numbers.get(obj)
         if found is None:
-            found = self._numbers[thing] = self._next()
+            found = self._numbers[obj] = self._next()
         return found
 
     def _next(self) -> int:

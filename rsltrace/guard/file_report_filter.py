@@ -1,4 +1,4 @@
-"""Which file accesses are reported: not those of installed files, nor by code that reads sources."""
+"""Which file accesses are reported: not of installed files, nor by code that reads sources."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Putting all replacements in place for the time of a run, and taking them back."""
+"""Install all replacements for the time of a run, and remove them afterwards."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.trace.model.finding import Mode, Source
 
-# Directory listings in the order of their names: a file system gives them in any order.
+# Directory listings are sorted by name: a file system returns them in any order.
 
 _NAMES_MAX = 20
-"""Names of a listing that the trace keeps."""
+"""The number of names of a listing that the trace keeps."""
 
 
 class SortedDirectory:
-    """What ``os.scandir`` returns, in the order of names."""
+    """The result of ``os.scandir``, sorted by name."""
 
     def __init__(self, entries: list[Any]) -> None:
         self._entries = iter(entries)
@@ -59,7 +59,7 @@ class SortedDirectory:
         self.close()
 
     def close(self) -> None:
-        """Give nothing more."""
+        """Return no more entries."""
         self._entries = iter(())
 
 
@@ -80,7 +80,7 @@ def _call(name: str, arguments: tuple[Any, ...]) -> str:
 
 
 def _names_text(names: list[Any]) -> str:
-    """Return how many names there are, and which: two runs may have found others."""
+    """Describe a listing: how many names, and which; two runs may have found others."""
     texts = [os.fsdecode(name) for name in names]
     if not texts:
         return "no names"
@@ -120,7 +120,8 @@ def _listing(
 
 @contextmanager
 def sorted_listings() -> Iterator[None]:
-    """Sort what ``os.listdir`` and ``os.scandir`` give, and so glob, pathlib and ``os.walk``."""
+    """Sort the results of ``os.listdir`` and ``os.scandir``, and so of glob, pathlib and
+    ``os.walk``."""
     with ExitStack() as stack:
         for name, arrange in (
             ("listdir", _sorted_names),
@@ -130,12 +131,10 @@ def sorted_listings() -> Iterator[None]:
         yield
 
 
-# What Python's own modules remember for a whole process: forgotten for the time of a run.
-#
-# ``tempfile`` finds its folder once and has one sequence of names, ``platform`` asks the machine
-# once. A second run in the same process would get other names and miss what the first was told of;
-# so each run begins as in a process of its own, each node has names of its own and is told itself
-# what it asks, and afterwards everything is as it was.
+# Python's own modules cache answers for a whole process: ``tempfile`` its folder and sequence of
+# names, ``platform`` the machine. A second run in the same process would get other names and miss
+# findings. So each run begins with empty caches, each node has its own names and asks itself, and
+# afterwards the old caches return.
 
 _tempfile: Any = tempfile
 _platform: Any = platform
@@ -144,11 +143,11 @@ _PLATFORM_CACHES: dict[str, tuple[str, Callable[[], object]]] = {
     "platform": ("_platform_cache", dict),
     "freedesktop_os_release": ("_os_release_cache", lambda: None),
 }
-"""Functions of ``platform``, where each keeps its answer, and what is there before the first."""
+"""Functions of ``platform``, the name of each one's cache, and its initial value."""
 
 
 class _FileNameSequence:
-    """Stands in for ``tempfile``'s sequence of random names: each node has its own."""
+    """Replaces ``tempfile``'s sequence of random names: each node has its own."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -170,7 +169,7 @@ class _FileNameSequence:
 
 
 def _unreported(real: Callable[..., str]) -> Callable[..., str]:
-    """Where files go is asked by one node for all: neither its chance nor its finding."""
+    """One node finds the folder for all: neither its random stream nor its findings show it."""
 
     def default_folder(*arguments: Any) -> str:
         with engage(None):
@@ -180,7 +179,7 @@ def _unreported(real: Callable[..., str]) -> Callable[..., str]:
 
 
 def _uncached(real: Any, cache: str, empty: Callable[[], object]) -> Any:
-    """Ask the machine again each time: whoever asked before may have been a library."""
+    """Ask the machine again each time: a library may have asked before."""
 
     def ask(*arguments: Any, **options: Any) -> Any:
         setattr(_platform, cache, empty())
@@ -191,7 +190,7 @@ def _uncached(real: Any, cache: str, empty: Callable[[], object]) -> Any:
 
 @contextmanager
 def fresh_module_caches() -> Iterator[None]:
-    """Let nothing be remembered from before, and put it back afterwards."""
+    """Start with empty caches of Python's modules, and restore them afterwards."""
     with ExitStack() as stack:
         for name, (cache, empty) in _PLATFORM_CACHES.items():
             if hasattr(platform, cache):
@@ -211,7 +210,7 @@ def fresh_module_caches() -> Iterator[None]:
         yield
 
 
-# ``os.getpid`` in user code: names, seeds and files made of it are the same in every run.
+# ``os.getpid`` in user code: names, seeds and files made from it are the same in every run.
 
 _CALL = "os.getpid()"
 _LOGGING = "logging"
@@ -220,10 +219,10 @@ _ID_FUNCTIONS = (
     *("sched_getparam", "sched_setparam", "sched_getscheduler", "sched_setscheduler"),
     "sched_rr_get_interval",
 )
-"""Functions of ``os`` that are given the id of a process; ``os.kill`` is the door's."""
+"""Functions of ``os`` that take a process id; adapters replace ``os.kill``."""
 
 _PATH_FUNCTIONS = ("readlink", "access")
-"""Functions of ``os`` that are given a path and that nobody else redirects."""
+"""Functions of ``os`` that take a path and that nothing else redirects."""
 
 
 def _getpid(real: Callable[[], int]) -> Callable[[], int]:
@@ -261,7 +260,7 @@ def _translating(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Calla
 
 @contextmanager
 def own_process_ids() -> Iterator[None]:
-    """Give each main a process id of its own, and take it back where one is asked for."""
+    """Give each main its own process id, and accept it where a real one is expected."""
     with ExitStack() as stack:
         redirect(stack, os.getpid, _getpid)
         for name in _ID_FUNCTIONS:
@@ -273,11 +272,9 @@ def own_process_ids() -> Iterator[None]:
         yield
 
 
-# Texts of objects that have none of their own: a number of the run's in place of the address.
-#
-# ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. ``object.__repr__`` and
-# those of functions, generators and coroutines are exchanged for the time of a run; every type
-# that takes its text from them is told to look for it by name.
+# ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. For the time of a run
+# ``__repr__`` of objects, functions, generators and coroutines shows a number instead of the
+# address; every type that inherits one of these looks it up by name.
 
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
@@ -295,19 +292,19 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
             address = f"0x{id(self):x}"
             return text.replace(address, _address_text(guard, self) or address)
 
-    # Neither a function nor new: numba's jitclass looks for what a class adds to ``object``.
+    # numba's jitclass rejects a class that adds a function to ``object``.
     vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
     method: Callable[[Any], str] = _as_method(__repr__)
     return method
 
 
-def _address_text(guard: Guard, thing: Any) -> str | None:
-    """Return what stands for the address of an object: the node's number for it, in hexadecimal.
+def _address_text(guard: Guard, obj: Any) -> str | None:
+    """Return what replaces an object's address: the node's number for it, in hexadecimal.
 
-    Addresses do not begin like that. None for an object that cannot be recognised later.
+    Real addresses do not begin like that. None for an object that cannot be recognized later.
     """
     node = guard.context.node()
-    number = guard.shown.number(node, thing)
+    number = guard.shown.number(node, obj)
     if number is None:
         return None
     return f"0x52{zlib.crc32(node.encode('utf-8', 'replace')) & 0xFFFF:04x}{number * 16:06x}"
@@ -315,7 +312,7 @@ def _address_text(guard: Guard, thing: Any) -> str | None:
 
 @contextmanager
 def numbered_texts() -> Iterator[None]:
-    """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
+    """Replace the methods that make texts with addresses."""
     with ExitStack() as stack:
         for kind in (object, *_SHOWN_ALIKE):
             replace_special_method(stack, kind, "__repr__", _numbered)
@@ -346,7 +343,7 @@ _stack = ExitStack()
 
 @contextmanager
 def installed() -> Iterator[None]:
-    """Redirect the sources; the last one to leave takes everything back."""
+    """Install the replacements; the last run to leave removes them."""
     global _user_count, _stack
     if _user_count == 0:
         with ExitStack() as stack:

@@ -1,4 +1,4 @@
-"""Auditing a path or a job: from files to findings."""
+"""Audit a path or a job: from files to findings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from rsltrace.trace.model.finding import Policy
 from rsltrace.trace.model.module_search import find_module
 from rsltrace.trace.model.regular_file import read_regular
 
-# Which files to look at: those of a path, or those that a job's nodes come from, and no others.
+# Which files to read: those of a path, or those of a job's nodes and their imports.
 
 _INSTALLED = {"site-packages", "dist-packages"}
 _NOT_SOURCES = {"build", "install", "log", "node_modules", "__pycache__"}
@@ -34,7 +34,7 @@ _ALLOW = re.compile(r"#.*\brsltrace:\s*allow\b(?P<kinds>[\w ,\t-]*)")
 
 @dataclass(eq=False)
 class SourceFile:
-    """A Python file to look at. ``allowed`` has the kinds that a comment allows, by line; an empty
+    """A Python file to audit. ``allowed`` maps lines to the kinds that a comment allows; an empty
     set allows all."""
 
     path: Path
@@ -44,7 +44,7 @@ class SourceFile:
 
 
 def read_source(path: Path, name: str, *, as_script: bool = False) -> SourceFile:
-    """Return a file taken apart.
+    """Parse a file.
 
     :raises OSError, SyntaxError, ValueError: if it is no Python source.
     """
@@ -68,7 +68,7 @@ def _allowed(text: str) -> dict[int, frozenset[str]]:
 
 
 class SourceCollection:
-    """Files by module name, each once, with those that could not be read."""
+    """Source files by module name, each once, and those that could not be read."""
 
     def __init__(self) -> None:
         self.files: dict[str, SourceFile] = {}
@@ -125,7 +125,7 @@ def _python_files(folder: Path) -> Iterator[Path]:
 
 
 def module_name(path: Path) -> str:
-    """Return the full name of a file's module: as far up as there are packages."""
+    """Return the full name of a file's module, its packages included."""
     path = path.absolute()
     parts = [] if path.name == "__init__.py" else [path.stem]
     folder = path.parent
@@ -141,11 +141,10 @@ def collect_modules(
     folders: Sequence[Path],
     programs: AbstractSet[str] = frozenset(),
 ) -> tuple[SourceCollection, list[str]]:
-    """Return modules by name, and what they import as far as it is the user's own; also the names
-    that were not found. ``programs`` are those that ``python -m`` runs.
+    """Return modules by name with the user's modules that they import, and the names not found.
 
-    The user's own are modules below ``folders`` (no virtual environment there), and of an installed
-    package those of the package itself.
+    ``programs`` are the modules that ``python -m`` runs. The user's modules are those below
+    ``folders`` (virtual environments excluded), and those of the same installed package.
     """
     found = SourceCollection()
     path = [*map(str, folders), *sys.path]
@@ -190,11 +189,9 @@ def _is_own(file: Path, name: str, package: str, folders: Sequence[Path]) -> boo
     )
 
 
-# What the guard does about a place in the sources: the job's, or that of the node that runs it.
-#
-# A node may have a ``guard:`` of its own. Code at the top of a module runs under the job's, since
-# no node is there yet; what stands in a node's class runs under the node's; any other function
-# under that of each node whose imports lead to it.
+# What the guard does about a call site depends on the policy of the job or of the node that runs
+# it. Code at the top of a module runs under the job's, since no node exists yet; code in a node's
+# class under the node's; any other function under that of each node whose imports lead to it.
 
 _LEAST_SAFE_FIRST = (
     Treatment.NOTHING,
@@ -208,11 +205,7 @@ _LEAST_SAFE_FIRST = (
 
 @dataclass
 class _NodeGroup:
-    """Nodes that are guarded alike.
-
-    ``targets`` are theirs (``module:Class``, or scripts), ``files`` what these and their imports
-    are.
-    """
+    """Nodes with equal policies, with their targets (``module:Class`` or scripts) and files."""
 
     policy: Policy
     whose: str
@@ -221,7 +214,7 @@ class _NodeGroup:
 
 
 class GuardTreatment:
-    """Says what is done about a place. ``policy`` is the job's, None if it has no guard at all."""
+    """Returns what the guard does about a call site. ``policy`` is the job's; None: no guard."""
 
     def __init__(self, policy: Policy | None, groups: Sequence[_NodeGroup] = ()) -> None:
         self._policy = policy
@@ -231,7 +224,7 @@ class GuardTreatment:
     def of_job(
         cls, job: Job, targets: Sequence[str | Path], folders: Sequence[Path]
     ) -> GuardTreatment:
-        """Return what the guards of a job and its nodes do; ``targets`` are those of the nodes."""
+        """Return the treatment by the guards of a job and its nodes, which have ``targets``."""
         if not job.guard.enabled:
             return cls(None)
         of_job = policy_of(job.guard)
@@ -254,7 +247,7 @@ class GuardTreatment:
         return cls(of_job, groups)
 
     def of(self, source: SourceFile, place: CallSite) -> tuple[Treatment, str]:
-        """Return the treatment of a place, and what that means; of several, the least safe."""
+        """Return the treatment of a call site and its meaning; of several, the least safe."""
         groups = self._that_get_to(source, place)
         if not groups:
             return _treatment(source, place, self._policy, "the job")
@@ -296,14 +289,14 @@ def _treatment(
 
 
 Executables = Callable[[str, str], "str | Path"]
-"""Given ``package/executable`` and where it is written: ``module:function``, or a script's path."""
+"""Maps ``package/executable``, and where it is written, to ``module:function`` or a script."""
 ModuleFolders = Callable[[Iterable[Path]], list[Path]]
 
 
 def audit_path(path: Path) -> Audit:
-    """Look at a Python file, or at all below a folder; the guard's defaults are taken.
+    """Audit a Python file, or all files below a folder, with the guard's defaults.
 
-    :raises JobError: if there is nothing to look at.
+    :raises JobError: if there is nothing to audit.
     """
     if not path.exists():
         raise JobError(f"{path}: there is no such file or folder")
@@ -316,9 +309,9 @@ def audit_path(path: Path) -> Audit:
 def audit_job(
     job: Job, executable: Executables, module_folders: ModuleFolders | None = None
 ) -> Audit:
-    """Look at the modules of a job's nodes, and at what those import below its search path.
+    """Audit the modules of a job's nodes, and their imports below its search path.
 
-    Where nodes are executables of packages, ``module_folders`` tells the folders of their modules.
+    ``module_folders`` returns the folders of the modules of packages' executables.
 
     :raises JobError: if a node's module is not found.
     """

@@ -1,4 +1,4 @@
-"""Going through one file: every call, and every function that is passed on to be called later."""
+"""Find call sites in one module: calls, and functions passed on to be called later."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from rsltrace.guard.audit.sets import is_set, order_matters
 from rsltrace.guard.rules import METHODS, RULES, SHARED_GENERATORS, Rule, sql_call
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
-# Differences of two looks at a ROS clock in one function: in a simulation they are 0.
+# Differences of two reads of a ROS clock in one function: 0 in a simulation.
 
 _DEPTH_MAX = 8
 _CONVERSIONS = ("float", "int", "abs")
 
 
 def is_difference_of_now(node: ast.expr, scope: NameScope, depth: int = 0) -> bool:
-    """Return whether an expression is a difference of two times that this function looked up,
-    however converted."""
+    """Return whether an expression is the difference of two times read in this function."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return all(_is_now(side, scope, depth) for side in (node.left, node.right))
     return _within(node, scope, depth, is_difference_of_now)
@@ -34,7 +33,7 @@ def _is_now(node: ast.expr, scope: NameScope, depth: int) -> bool:
 
 
 def _is_clock(node: ast.expr) -> bool:
-    """Return whether an expression is a ROS clock, as far as its name tells."""
+    """Return whether an expression is a ROS clock, judging by its name."""
     if isinstance(node, ast.Call):
         return isinstance(node.func, ast.Attribute) and node.func.attr == "get_clock"
     name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
@@ -44,7 +43,7 @@ def _is_clock(node: ast.expr) -> bool:
 def _within(
     node: ast.expr, scope: NameScope, depth: int, holds: Callable[[ast.expr, NameScope, int], bool]
 ) -> bool:
-    """Look below conversions of a time, and behind names of the function."""
+    """Look through conversions of a time and names of the function."""
     if depth > _DEPTH_MAX:
         return False
     if isinstance(node, ast.Attribute) and node.attr in ("nanoseconds", "nanosec", "sec"):
@@ -70,11 +69,11 @@ _READERS = ("builtins.getattr", "builtins.hasattr")
 def replaced_functions(
     module: ModuleSource, node: ast.AST, names: NameResolver
 ) -> Iterator[tuple[ast.stmt | ast.expr, str]]:
-    """Yield where ``node`` replaces such a function, or overrides it, and its full name.
+    """Yield where ``node`` replaces or overrides such a function, and its full name.
 
-    Found are ``Executor._take_timer = …``, ``setattr(Executor, "_take_timer", …)`` and what else is
-    called with a class and a name (``patch.object``), full names in a text (``patch``), and methods
-    of an executor of one's own.
+    Finds ``Executor._take_timer = …``, ``setattr(Executor, "_take_timer", …)`` and other calls with
+    a class and a name (``patch.object``), full names in a text (``patch``), and methods of the
+    user's executors.
     """
     if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
         yield from _never_called(node, names.of(node, module.scope_of(node)))
@@ -124,7 +123,7 @@ _SHOWING = ("str", "repr", "hex", "print", "format", "sorted", "min", "max", "di
 
 @dataclass(frozen=True, slots=True)
 class CallSite:
-    """A place that is worth a line. ``alias`` is the expression of a mere alias."""
+    """A call that the audit reports. ``alias`` is the expression if it only binds a name."""
 
     node: ast.expr | ast.stmt
     call: str
@@ -135,7 +134,7 @@ class CallSite:
 def find_calls(
     module: ModuleSource, names: NameResolver, *, as_script: bool = False
 ) -> Iterator[CallSite]:
-    """Yield what is found in a module; ``as_script``: its ``if __name__ == "__main__"`` runs."""
+    """Yield the call sites of a module; ``as_script``: its ``__main__`` block runs, too."""
     skipped = set() if as_script else set(_never_run(module))
     seeded = _seeded_generators(module, names)
     stack: list[ast.AST] = [module.tree]
@@ -263,7 +262,7 @@ def _environ(module: ModuleSource, attribute: ast.Attribute) -> Iterator[CallSit
 
 
 def _sorting(node: ast.Call, scope: NameScope, names: NameResolver) -> Iterator[CallSite]:
-    """``sorted(things, key=id)``."""
+    """Find ``sorted(items, key=id)``."""
     for word in node.keywords:
         name = names.of(word.value, scope) if word.arg == "key" else None
         if name in ("builtins.id", "builtins.hash"):
@@ -282,7 +281,7 @@ def _sql(node: ast.Call) -> Iterator[CallSite]:
 def _is_order_ignored(
     module: ModuleSource, node: ast.expr, scope: NameScope, names: NameResolver
 ) -> bool:
-    """Whether the order of a listing is not looked at: ``sorted(os.listdir(folder))``."""
+    """Whether the order of a listing does not matter: ``sorted(os.listdir(folder))``."""
     place: ast.AST = node
     user = module.parents.get(place)
     while isinstance(user, (ast.comprehension, ast.GeneratorExp, ast.ListComp, ast.SetComp)):
@@ -331,7 +330,7 @@ def _plain_number(node: ast.Call) -> bool:
 
 
 def _in_annotation(module: ModuleSource, node: ast.AST) -> bool:
-    """Whether a name stands for a type only: an annotation, ``isinstance``, ``except``."""
+    """Whether a name only names a type: in an annotation, ``isinstance``, ``except``."""
     child, parent = node, module.parents.get(node)
     while isinstance(parent, ast.expr):
         if isinstance(parent, ast.Call) and isinstance(parent.func, ast.Name):
@@ -359,7 +358,7 @@ def _seeded_generators(module: ModuleSource, names: NameResolver) -> set[str]:
 
 
 def _never_run(module: ModuleSource) -> Iterator[ast.stmt]:
-    """Yield what only runs when the file is started itself, and what is for type checkers."""
+    """Yield the statements that run only as a script, or only for type checkers."""
     for node in module.tree.body:
         if isinstance(node, ast.If):
             text = ast.dump(node.test)

@@ -1,4 +1,4 @@
-"""What an expression stands for, by its full name, through aliases and the user's own modules."""
+"""Resolve expressions to full names, through aliases and the user's own modules."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ class NameResolver:
         self._modules = modules
         self.passed: set[ast.AST] = set()
         self._asked: set[tuple[NameScope, str]] = set()
-        """NameResolver that are being resolved. What ``line = line.strip()`` says of ``line`` is nothing;
-        without this, a dozen such lines would take forever."""
+        """Names being resolved: ``line = line.strip()`` says nothing about ``line``, and a dozen
+        such lines would take forever."""
 
     def of(self, node: ast.expr, scope: NameScope, depth: int = 0) -> str | None:
-        """Return the full name of what ``node`` stands for, or None if that is not known."""
+        """Return the full name of an expression, or None if it is not known."""
         if depth > _DEPTH_MAX:
             return None
         if isinstance(node, ast.Name):
@@ -62,7 +62,7 @@ class NameResolver:
         return None
 
     def bindings(self, node: ast.Name, scope: NameScope) -> Iterator[tuple[Binding, NameScope]]:
-        """Yield what a name is bound to, innermost scope that knows it."""
+        """Yield what a name is bound to in the innermost scope that knows it."""
         place = _binding_scope(node.id, scope)
         if place is not None:
             for binding in place.names[node.id]:
@@ -86,7 +86,7 @@ class NameResolver:
         depth: int,
         place: NameScope | None,
     ) -> str | None:
-        """Return what a name of ``place`` (None: Python's own) stands for, as far as known."""
+        """Return the full name of a name in ``place`` (None: a built-in), or None."""
         key = None if place is None else (place, name)
         if key in self._asked:
             return None
@@ -122,7 +122,7 @@ class NameResolver:
         return name in _LOADERS or name == "builtins.getattr"
 
     def _called(self, node: ast.Call, scope: NameScope, depth: int) -> str | None:
-        """Return what ``__import__("time")`` and ``getattr(time, "time")`` stand for."""
+        """Return the full name of ``__import__("time")`` or ``getattr(time, "time")``."""
         name = self.of(node.func, scope, depth + 1)
         texts = [a.value if isinstance(a, ast.Constant) else None for a in node.args]
         if name in _LOADERS and texts and isinstance(texts[0], str):
@@ -133,7 +133,7 @@ class NameResolver:
         return None
 
     def _canonical(self, name: str, depth: int) -> str | None:
-        """Follow a name through the modules at hand: their imports, the bases of their classes."""
+        """Follow a name through the modules: their imports and the bases of their classes."""
         if depth > _DEPTH_MAX or name in RULES:
             return name
         parts = name.split(".")
@@ -197,7 +197,7 @@ def _binding_scope(name: str, scope: NameScope) -> NameScope | None:
 
 
 def _evaluated_in(binding: Binding, scope: NameScope) -> NameScope:
-    """Return the scope of an expression bound in ``scope``: a default is of the outer one."""
+    """Return the scope in which a bound expression is evaluated: of a default the outer one."""
     if isinstance(binding, ast.expr) and binding in scope.module.parents:
         return scope.module.scope_of(binding)
     return scope

@@ -1,7 +1,7 @@
-"""Names and what they stand for: ``now`` is ``time.time`` after ``from time import time as now``.
+"""Scopes and their names: ``now`` is ``time.time`` after ``from time import time as now``.
 
-A scope keeps, for each name bound in it, every expression it was ever bound to; what is unknown
-(a parameter, a loop variable) is None. Order of execution is not looked at.
+A scope keeps for each name every expression bound to it; None if unknown (a parameter, a loop
+variable). The order of execution does not matter.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeAlias
 
 @dataclass(frozen=True, slots=True)
 class ImportedName:
-    """A name that stands for a module or something in one, by its full name."""
+    """A name of a module or of something in one, by its full name."""
 
     name: str
 
@@ -31,7 +31,7 @@ Binding: TypeAlias = "ast.expr | ImportedName | AnnotatedName | ast.ClassDef | N
 
 @dataclass(eq=False)
 class NameScope:
-    """Names of a module, class, function or comprehension."""
+    """The names of a module, class, function or comprehension."""
 
     kind: str
     parent: NameScope | None
@@ -52,17 +52,17 @@ class NameScope:
 
 @dataclass(eq=False)
 class ModuleSource:
-    """One source file, taken apart."""
+    """One parsed source file."""
 
     name: str
     is_package: bool
     tree: ast.Module
     scopes: dict[ast.AST, NameScope] = field(default_factory=dict)
-    """The scope that each function, class, lambda and comprehension opens, and the file's own."""
+    """The scopes of functions, classes, lambdas and comprehensions, and of the file."""
     parents: dict[ast.AST, ast.AST] = field(default_factory=dict)
     stars: list[str] = field(default_factory=list)
     imports: set[str] = field(default_factory=set)
-    """Full names of all that is imported anywhere in the file."""
+    """Full names of everything that the file imports."""
 
     @property
     def top(self) -> NameScope:
@@ -80,7 +80,7 @@ class ModuleSource:
 
 
 def _outside_of(child: ast.AST, place: ast.AST) -> bool:
-    """Whether a part of a function or class is evaluated where that stands: defaults, bases, …"""
+    """Whether a part of a function or class is evaluated outside: defaults, bases, …"""
     if isinstance(place, ast.ClassDef):
         return child not in place.body
     if isinstance(place, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -97,7 +97,7 @@ _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
 def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> ModuleSource:
-    """Return a module with its scopes filled in."""
+    """Return a module with its scopes."""
     module = ModuleSource(name, is_package, tree)
     for parent in ast.walk(tree):
         for child in ast.iter_child_nodes(parent):
@@ -230,7 +230,7 @@ def _is_self(node: ast.expr) -> bool:
 
 
 def _imported_module(module: ModuleSource, node: ast.ImportFrom) -> str:
-    """Return the full name of the module that ``from … import`` means."""
+    """Return the full name of the module in ``from … import``."""
     if not node.level:
         return node.module or ""
     parts = module.name.split(".")

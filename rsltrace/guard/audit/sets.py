@@ -1,7 +1,7 @@
-"""Which expressions are sets, and where the order of one matters.
+"""Which expressions are sets, and where their order matters.
 
-A set of plain integers has the same order in every process, and what only counts, sorts or tests
-the members does not see the order; neither is worth a line.
+A set of plain integers has the same order in every process. Counting, sorting and testing members
+does not depend on the order. Neither is reported.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _UNORDERED = {
     *(f"statistics.{name}" for name in "mean fmean median pstdev pvariance stdev variance".split()),
     "math.fsum",
 }
-"""They give the same in whatever order the members come, unless a key makes some alike."""
+"""Their results do not depend on the order of members, unless a key makes some equal."""
 _ORDERED = {
     *(
         f"builtins.{name}"
@@ -37,7 +37,7 @@ _ORDERED = {
     "pickle.dumps",
 }
 _ORDERED_IN = ("collections.", "heapq.", "itertools.", "numpy.", "random.", "statistics.")
-"""Modules whose functions go through what they are given."""
+"""Modules whose functions iterate over their arguments."""
 _KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
@@ -50,10 +50,8 @@ def is_set(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
 def _is_set(
     node: ast.expr, scope: NameScope, names: NameResolver, asked: frozenset[object]
 ) -> bool | None:
-    """Do ``is_set``; None says nothing either way: ``s = s | more`` leaves ``s`` what it is.
-
-    ``asked`` are the bindings in question.
-    """
+    """Do ``is_set``; None: unknown, as ``s = s | more`` leaves ``s`` what it is. ``asked`` are the
+    bindings being resolved."""
     if isinstance(node, ast.Set):
         return not all(isinstance(x, ast.Constant) and type(x.value) is int for x in node.elts)
     if isinstance(node, ast.SetComp):
@@ -122,7 +120,7 @@ def _is_range(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
 
 
 def order_matters(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
-    """Return whether the place in which a set stands sees the order of its members."""
+    """Return whether the context of a set depends on the order of its members."""
     parent = scope.module.parents.get(node)
     if isinstance(parent, (ast.For, ast.AsyncFor)):
         return parent.iter is node and not _only_collects(parent)
@@ -147,7 +145,7 @@ def order_matters(node: ast.expr, scope: NameScope, names: NameResolver) -> bool
 
 
 def _unpacks(target: ast.expr) -> bool:
-    """Whether an assignment gives the members of a set to several: ``a, b = s``, ``r[1:] = s``."""
+    """Whether an assignment unpacks a set: ``a, b = s``, ``r[1:] = s``."""
     if isinstance(target, ast.Subscript):
         return isinstance(target.slice, ast.Slice)
     return isinstance(target, (ast.Tuple, ast.List))
@@ -170,7 +168,7 @@ def _comprehension_matters(part: ast.comprehension, scope: NameScope, names: Nam
 
 
 def _ends_unordered(node: ast.AST, scope: NameScope, names: NameResolver) -> bool:
-    """Whether what is made of a set goes right into something that does not see its order."""
+    """Whether the result goes directly into a function that ignores its order."""
     user = scope.module.parents.get(node)
     return (
         isinstance(user, ast.Call)
@@ -181,7 +179,7 @@ def _ends_unordered(node: ast.AST, scope: NameScope, names: NameResolver) -> boo
 
 
 def _only_collects(loop: ast.For | ast.AsyncFor) -> bool:
-    """Whether a loop does nothing but put members into other sets, or delete what they name."""
+    """Whether a loop only adds members to other sets, or deletes what they name."""
     return all(
         isinstance(line, ast.Delete)
         or (

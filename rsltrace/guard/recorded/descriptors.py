@@ -1,7 +1,6 @@
 """File descriptors whose answers are recorded: ``os.open``, ``os.read``, terminals, devices.
 
-In a re-run such a descriptor leads nowhere: what is read from it comes from the trace, what is
-written to it is dropped.
+In a re-run such a descriptor is not connected: reads come from the trace, writes are dropped.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
 def recording_guard(source: Source, frame: FrameType) -> Guard | None:
-    """Return the guard if user code asks and the job records this source."""
+    """Return the guard if user code calls and the job records this source."""
     guard = engaged()
     if guard is None or guard.mode(source, frame) is not _RECORD:
         return None
@@ -49,7 +48,7 @@ def recording_guard(source: Source, frame: FrameType) -> Guard | None:
 
 
 def recorded_descriptor(fd: object) -> tuple[Guard, RecordedDescriptor] | None:
-    """Return the guard and what it knows of a descriptor, if its answers are recorded."""
+    """Return the guard and its entry of a descriptor, if its answers are recorded."""
     guard = engaged()
     if guard is None:
         return None
@@ -58,7 +57,7 @@ def recorded_descriptor(fd: object) -> tuple[Guard, RecordedDescriptor] | None:
 
 
 def unconnected_descriptor(flags: int = 0) -> int:
-    """Return a descriptor for a re-run that leads nowhere, and that event loops accept."""
+    """Return a descriptor for a re-run that leads nowhere and that event loops accept."""
     nonblocking = os.EFD_NONBLOCK if flags & os.O_NONBLOCK else 0
     return os.eventfd(0, os.EFD_CLOEXEC | nonblocking)
 
@@ -91,7 +90,7 @@ def _opening(real: Callable[..., int]) -> Any:
 
 
 def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function of a descriptor and plain values."""
+    """Return the replacement of a function that takes a descriptor and plain values."""
     call = f"{module}.{name}()"
 
     def function(fd: Any, *arguments: Any, **options: Any) -> Any:
@@ -129,15 +128,15 @@ def recorded_stat(
     call: str,
     real: Callable[[], Any],
     frame: FrameType,
-    of: int = 0,
+    number: int = 0,
 ) -> os.stat_result:
-    """Return what ``os.stat`` and its like tell, from outside or from the trace."""
+    """Return the result of ``os.stat`` and the like, from outside or from the trace."""
 
     def fields() -> list[Any]:
         found = real()
         return [list(found), found.st_atime_ns, found.st_mtime_ns, found.st_ctime_ns]
 
-    values, *times = guard.record(source, call, fields, frame, of)
+    values, *times = guard.record(source, call, fields, frame, number)
     names = ("st_atime_ns", "st_mtime_ns", "st_ctime_ns")
     return os.stat_result(tuple(values), dict(zip(names, times, strict=True)))
 
@@ -157,7 +156,7 @@ def _reading(real: Callable[..., bytes]) -> Any:
 
 
 def _blocks(fd: int) -> bool:
-    """Return whether reading from a descriptor may have to wait for somebody."""
+    """Return whether a read from a descriptor may have to wait."""
     try:
         kind = _real_fstat(fd).st_mode
         waits = stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)
@@ -197,7 +196,7 @@ def _read(
 ) -> Any:
     if _get_blocking(fd) and guard.context.is_aside():
         look = wait_readable(fd, real)
-        return wait_recorded(guard, known.source, call, look, frame, of=known.number)
+        return wait_recorded(guard, known.source, call, look, frame, number=known.number)
     return guard.record(known.source, call, real, frame, known.number)
 
 
@@ -247,7 +246,7 @@ def _duplicating(real: Callable[..., int]) -> Any:
 
 
 def connected_ends(real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function that makes two ends of something."""
+    """Return the replacement of a function that makes two connected descriptors."""
 
     def ends(*arguments: Any, **options: Any) -> Any:
         made = real(*arguments, **options)
@@ -260,7 +259,7 @@ def connected_ends(real: Callable[..., Any]) -> Any:
 
 
 class RawDescriptor(io.RawIOBase):
-    """What ``open`` makes of a descriptor (or a device) whose answers are recorded."""
+    """A recorded descriptor or device as ``open`` returns it."""
 
     def __init__(self, fd: int, mode: str, *, name: object, closes: bool = True) -> None:
         self._fd = fd
@@ -301,7 +300,7 @@ class RawDescriptor(io.RawIOBase):
         return os.isatty(self.fileno())
 
     def readinto(self, buffer: Any, /) -> int | None:
-        """Read what there is, at most as much as fits."""
+        """Read what is there, at most as much as fits."""
         view = memoryview(buffer).cast("B")
         try:
             data = os.read(self.fileno(), len(view))
@@ -311,14 +310,14 @@ class RawDescriptor(io.RawIOBase):
         return len(data)
 
     def write(self, data: Any, /) -> int | None:
-        """Write as much as goes at once."""
+        """Write as much as possible at once."""
         try:
             return os.write(self.fileno(), data)
         except BlockingIOError:
             return None
 
     def close(self) -> None:
-        """Close the descriptor, unless it is somebody else's."""
+        """Close the descriptor, unless ``closefd`` was false."""
         if not self.closed:
             try:
                 super().close()
@@ -354,7 +353,7 @@ def open_raw(
 
 @contextmanager
 def recorded_descriptors() -> Iterator[None]:
-    """Let descriptors answer from the trace in a re-run."""
+    """Record the answers of descriptors; in a re-run, return them from the trace."""
     makers: list[tuple[Any, str, Callable[[Any], Any]]] = [
         (os, "open", _opening),
         (os, "read", _reading),

@@ -1,4 +1,4 @@
-"""Files whose content and times are recorded (mode ``record``), and given again."""
+"""Files whose content and times are recorded (mode ``record``), and returned again."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ BYTES_MAX = 64 << 20
 
 
 class _Content(io.BytesIO):
-    """What a file held when it was opened."""
+    """The content of a file when it was opened."""
 
     def __init__(self, content: bytes, name: str) -> None:
         super().__init__(content)
         self.name = name
 
     def writable(self) -> bool:
-        """Return False, as a file opened for reading does."""
+        """Return False, as for a file opened for reading."""
         return False
 
 
@@ -89,7 +89,7 @@ def _is_device(file: Any) -> bool:
 
 
 def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[..., Any]) -> Any:
-    """Return a file object of what is recorded: of a device piece by piece, of a file all of it."""
+    """Return a recorded file object: of a device piece by piece, of a file as a whole."""
     name = os.fsdecode(file)
     fd: list[int] = []
 
@@ -151,12 +151,12 @@ def _recording_stat(name: str, real: Callable[..., Any]) -> Any:
 
 
 def _report_name(name: str, path: Any) -> str:
-    """Return what a look at a file is called, an empty text if it is none worth telling."""
+    """Return the text of a call that accesses a file; empty if it is not reported."""
     return "" if is_installed_path(path) else f"{name}({repr(path)[:100]})"
 
 
 _report_name_of_path = lru_cache(maxsize=4096)(_report_name)
-"""The same for an absolute path, which means the same whatever the working directory is."""
+"""The same for an absolute path, which does not depend on the working directory."""
 
 
 def _stat_text(found: os.stat_result) -> str:
@@ -165,8 +165,7 @@ def _stat_text(found: os.stat_result) -> str:
 
 @contextmanager
 def recorded_files() -> Iterator[None]:
-    """Let files that are read, and their times, answer from the trace in a re-run; report looks
-    at files that are not recorded."""
+    """Record contents and times of files; report accesses to files that are not recorded."""
     with ExitStack() as stack:
         redirect(stack, io.open, _opening)
         for name in ("stat", "lstat"):

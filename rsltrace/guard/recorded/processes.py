@@ -1,7 +1,7 @@
-"""Processes that are recorded: their number, their output, how they end. A re-run starts none.
+"""Recorded processes: their ids, output and end. A re-run starts none.
 
-``subprocess`` is Python but for a few functions below it. With those recorded, all of it (and
-``os.popen``, and asyncio's subprocesses) works in a re-run without the program being there.
+``subprocess`` is Python code above a few functions. With those recorded, all of it (and
+``os.popen`` and asyncio's subprocesses) works in a re-run without the program.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from rsltrace.trace.model.finding import Source
 _KEPT_OPEN = 3
 _LOOKED = "_rsltrace_looked"
 _CHILDS_ENDS = (6, 9, 11, 13)
-"""Arguments of ``fork_exec``: which descriptors stay open in the child; its standard streams, and
-the pipe through which it tells that it cannot start the program."""
+"""Arguments of ``fork_exec``: descriptors that stay open in the child, its standard streams, and
+the pipe that reports a failed start."""
 
 
 def _starting(real: Callable[..., int]) -> Any:
     def fork_exec(*arguments: Any) -> int:
         frame = sys._getframe(1)
-        # multiprocessing shares memory and locks with its processes: that cannot be recorded
+        # multiprocessing shares memory and locks with its processes, which cannot be recorded
         by_subprocess = frame.f_globals.get("__name__") == "subprocess"
         guard = recording_guard(Source.PROCESS, frame) if by_subprocess else None
         if guard is None:
@@ -85,14 +85,13 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
             return guard.record(
                 Source.PROCESS, call, lambda: real(process, options), frame, process
             )
-        return wait_recorded(guard, Source.PROCESS, call, poll_until(ended), frame, of=process)
+        return wait_recorded(guard, Source.PROCESS, call, poll_until(ended), frame, number=process)
 
     return waitpid
 
 
 def _first_wait_s(frame: FrameType) -> float:
-    """Return how long to wait for a program's end where ``subprocess`` looks again and again, in
-    real seconds: when it looks for the first time."""
+    """Return how many real seconds ``subprocess`` waits at its first look for a program's end."""
     waiting = frame.f_back
     first_s = initial_wait_s(frame, None)
     if not first_s or waiting is None or vars(waiting.f_locals["self"]).get(_LOOKED):
@@ -102,7 +101,7 @@ def _first_wait_s(frame: FrameType) -> float:
 
 
 def _of_process(name: str, real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function of a process that was started."""
+    """Return the replacement of a function that takes the id of a started process."""
 
     def function(process: int, *arguments: Any) -> Any:
         guard = engaged()
@@ -142,15 +141,15 @@ def _running(real: Callable[..., int]) -> Any:
 
 
 def sleep_for_process(seconds: float, real: Callable[[float], None], frame: FrameType) -> None:
-    """Let ``subprocess`` sleep until it looks again whether a process has ended: for real."""
+    """Let ``subprocess`` sleep in real time until it looks again for a program's end."""
     guard = recording_guard(Source.PROCESS, frame)
     if guard is None:
         real(seconds)
     elif guard.context.is_aside():
         call = "time.sleep() of subprocess"
-        # What is left of a timeout may be less than its clock can show: time must go on.
+        # The rest of a timeout may be less than its clock can show, but time must go on.
         timeout_s = max(seconds, 1e-6)
-        wait_recorded(guard, Source.PROCESS, call, _no_answer, frame, of=0, timeout_s=timeout_s)
+        wait_recorded(guard, Source.PROCESS, call, _no_answer, frame, number=0, timeout_s=timeout_s)
     elif not guard.answers.replays:
         real(seconds)
 
@@ -161,7 +160,7 @@ def _no_answer(seconds: float) -> Any:
 
 def _acquiring(real: Callable[..., bool]) -> Any:
     def acquire(self: Any, block: bool = True, timeout: float | None = None) -> bool:
-        """Take a lock of multiprocessing, which a process may give back after others went on."""
+        """Take a lock of multiprocessing; a process may release it only after others went on."""
         guard = engaged()
         if guard is None or not block or not guard.context.can_step():
             return real(self, block, timeout)
@@ -173,7 +172,7 @@ def _acquiring(real: Callable[..., bool]) -> Any:
 
 @contextmanager
 def recorded_processes() -> Iterator[None]:
-    """Let processes answer from the trace in a re-run."""
+    """Record processes; in a re-run, return their answers from the trace."""
     with ExitStack() as stack:
         redirect(stack, _posixsubprocess.fork_exec, _starting)
         redirect(stack, os.system, _running)
@@ -183,6 +182,6 @@ def recorded_processes() -> Iterator[None]:
         acquire: Any = _multiprocessing.SemLock.acquire
         exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
         exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
-        # A second way to do the same, which is not recorded.
+        # posix_spawn is not recorded.
         replace_attribute(stack, subprocess, "_USE_POSIX_SPAWN", False)
         yield

@@ -1,7 +1,6 @@
-"""Sockets whose answers are recorded, TLS and all, and given again without anybody there.
+"""Sockets whose answers are recorded, TLS included, and returned again without a peer.
 
-Of TLS the plain text is recorded: the keys of a connection are drawn in C, so what goes over the
-wire differs each time.
+Of TLS the plain text is recorded: keys are drawn in C, so the encrypted bytes differ each time.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _BUFFERED = ("read", "write")
 
 
 def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
-    """Return the guard if what a socket answers is recorded: it leads outside of the run."""
+    """Return the guard if a socket's answers are recorded: it leads outside of the run."""
     guard = recording_guard(Source.SOCKET, frame)
     if guard is None or guard.descriptors.far_end(sock.fileno()) is not None:
         return None
@@ -62,7 +61,7 @@ def _answer(
         call,
         look,
         frame,
-        of=number,
+        number=number,
         timeout_s=timeout_s,
     )
     if found is None:
@@ -71,7 +70,7 @@ def _answer(
 
 
 def _wait_for(sock: Any, frame: FrameType) -> None:
-    """Let others go on until there is something to read; what it is is not recorded."""
+    """Let others go on until an unrecorded socket is readable."""
     guard, timeout_s = waiting_guard(frame), sock.gettimeout()
     if guard is None or timeout_s == 0 or sock.fileno() < 0:
         return
@@ -204,7 +203,7 @@ def _answer_tls(
     receive: Callable[[], Any],
     frame: FrameType,
 ) -> Any:
-    """Wait for a TLS socket: what has been deciphered already makes it not readable."""
+    """Wait for a TLS socket, which is not readable while decrypted bytes are left."""
     number = guard.descriptors.number(sock)
     timeout_s = sock.gettimeout()
     if timeout_s == 0 or not guard.context.is_aside():
@@ -214,7 +213,9 @@ def _answer_tls(
     def look(seconds: float) -> Any:
         return [receive()] if tls.pending() else wire(seconds)
 
-    found = wait_recorded(guard, Source.SOCKET, call, look, frame, of=number, timeout_s=timeout_s)
+    found = wait_recorded(
+        guard, Source.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
+    )
     if found is None:
         raise TimeoutError("The read operation timed out")
     return found[0]
@@ -234,7 +235,7 @@ def _pending(real: Any) -> property:
 
 @contextmanager
 def recorded_sockets() -> Iterator[None]:
-    """Let sockets answer from the trace in a re-run."""
+    """Record the answers of sockets; in a re-run, return them from the trace."""
     with ExitStack() as stack:
         for name in _RESOLVING:
             redirect(stack, getattr(_socket, name), partial(_resolving, name))

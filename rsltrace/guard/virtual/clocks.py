@@ -1,8 +1,8 @@
-"""Every clock a node can read shows simulated time: ``time``, ``datetime``, also where it is bound.
+"""Every clock that a node can read shows simulated time: ``time``, ``datetime``, wherever bound.
 
-Built-in functions are redirected, ``datetime.now`` and ``utcnow`` (which belong to a type) are
-exchanged in the type. Clocks of processor time show what has passed of the simulation: computing
-takes no simulated time, looking at a clock again 1 us.
+Built-in functions are redirected; ``datetime.now`` and ``utcnow`` are replaced in their type.
+Clocks of processor time show simulated time, too: computing takes none of it, and each further read
+of a clock takes 1 us.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ REAL_TIME_MODULES = {
     "socketserver",
     "subprocess",
 }
-"""Modules whose clocks measure how long the operating system takes: they wait for real, so what
-they read must go on. Their users get simulated time."""
+"""Modules that wait for the operating system in real time: their clocks must go on. Their users get
+simulated time."""
 
 
 _wall_ns = copy_of(time.time_ns)  # type: ignore[arg-type]
@@ -59,7 +59,7 @@ def clock_call(
     real: Callable[[], Any],
     real_ns: Callable[[], int] | None = None,
 ) -> Any:
-    """Answer the reading of a clock as the job says; ``real_ns`` is read if it is recorded."""
+    """Answer a read of a clock as the job says; ``real_ns`` is read if it is recorded."""
     module = frame.f_globals.get("__name__")
     if module in REAL_TIME_MODULES:
         if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
@@ -107,13 +107,13 @@ def _reading(name: str, real: Callable[[], Any]) -> Callable[[dict[str, Any]], A
         except (KeyError, TypeError):
             frame = caller()
             kind = guard.file_kind(names, frame)
-        if kind > OURS or not guard.makes_clocks:
+        if kind > OURS or not guard.answers_clocks:
             if frame is None:
                 try:
                     frame = frames.next_caller()
                 except frames.INTERRUPTED:
                     frame = frames.lost_caller()
-            if not guard.makes_clocks or names.get("__name__") in REAL_TIME_MODULES:
+            if not guard.answers_clocks or names.get("__name__") in REAL_TIME_MODULES:
                 return clock_call(guard, frame, call, virtual, real)
         now_ns = guard.clock_ns(call, kind, names, frame)
         return now_ns if in_ns else now_ns / _NS
@@ -140,7 +140,7 @@ def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[...,
 
 
 def _broken_down(name: str, real: Callable[..., Any]) -> Any:
-    """``localtime()`` and its like: without an argument, or with None, they mean now."""
+    """``localtime()`` and the like: without an argument, or with None, they mean now."""
 
     def read(*arguments: Any) -> Any:
         guard = engaged() if arguments in ((), (None,)) else None
@@ -212,7 +212,7 @@ def _utcnow(real: Any) -> Any:
 
 
 def numpy_now(function: Any, text: str, *more: Any) -> Any:
-    """Do ``np.datetime64("now")``, which asks the C library: user modules come here instead."""
+    """Answer ``np.datetime64("now")`` in user modules; numpy itself asks the C library."""
     real = function(text, *more)
     guard = engaged()
     if guard is None:
@@ -243,7 +243,7 @@ def opencv_clock(stack: ExitStack) -> None:
 
 @contextmanager
 def virtual_clocks() -> Iterator[None]:
-    """Redirect every clock; which guard answers is asked at each call."""
+    """Redirect every clock."""
     with ExitStack() as stack:
 
         def redirect_time(name: str, make: Callable[[Any], Any], how: Any = redirect) -> None:
@@ -276,7 +276,7 @@ def _replace_method(
     make: Callable[[Any], Any],
     bound_before: list[BuiltinFunctionType],
 ) -> None:
-    """Exchange a class method of ``datetime``, in the type and where it was bound before."""
+    """Replace a class method of ``datetime``, in the type and where it was bound before."""
     real = datetime.__dict__[name]
     ours = make(real)
     for bound in bound_before:
@@ -287,12 +287,12 @@ def _replace_method(
 
 
 def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:
-    """Return the bound class methods that somebody keeps (``now = datetime.now``), by name."""
+    """Return the bound class methods that code keeps (``now = datetime.now``), by name."""
     found: dict[str, list[BuiltinFunctionType]] = {name: [] for name in names}
     owners = [datetime]
     for owner in owners:
         owners += type.__subclasses__(owner)
-    for thing in gc.get_referrers(*owners):
-        if type(thing) is BuiltinFunctionType and thing.__name__ in found:
-            found[thing.__name__].append(thing)
+    for obj in gc.get_referrers(*owners):
+        if type(obj) is BuiltinFunctionType and obj.__name__ in found:
+            found[obj.__name__].append(obj)
     return found

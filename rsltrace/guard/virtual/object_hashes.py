@@ -1,6 +1,6 @@
-"""Hashes of objects that are made of their addresses: reported to who looks at one.
+"""Hashes made of object addresses: reported when code asks for one.
 
-That a set or a dictionary asks for them is nobody's business: neither shows them.
+Sets and dictionaries ask for them, too, but show none.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from rsltrace.trace.model.finding import Source
 _of_object = object.__hash__
 
 
-def _report_hash(thing: object, value: int, frame: FrameType) -> int:
-    """Report a hash that code asked for, if addresses are in it."""
+def _report_hash(obj: object, value: int, frame: FrameType) -> int:
+    """Report a hash that code asked for, if it contains addresses."""
     guard = engaged()
-    if guard is not None and has_address_hash(thing):
+    if guard is not None and has_address_hash(obj):
         if code_of(frame).co_name == "__hash__":
             note_address_hash(frame)  # matters where a set of such objects is gone through
         elif guard.is_user(frame):
-            kind = type(thing).__qualname__
+            kind = type(obj).__qualname__
             guard.report_user_call(Source.ADDRESS, f"hash() of {kind}", value, frame)
     return value
 
 
 def _hashing(real: Callable[[Any], int]) -> Any:
-    def hash_of(thing: Any, /) -> int:
-        return _report_hash(thing, real(thing), caller())
+    def hash_of(obj: Any, /) -> int:
+        return _report_hash(obj, real(obj), caller())
 
     return hash_of
 
 
-def _objects_hash(thing: Any, /) -> int:
-    return _report_hash(thing, _of_object(thing), caller())
+def _objects_hash(obj: Any, /) -> int:
+    return _report_hash(obj, _of_object(obj), caller())
 
 
 def _bound_hash(real: Callable[[], int], /) -> int:
@@ -48,7 +48,7 @@ def _bound_hash(real: Callable[[], int], /) -> int:
 
 
 def hash_method(owner: Any) -> Any:
-    """Return what ``owner.__hash__`` is, or what does the same and reports it."""
+    """Return ``owner.__hash__``, or a function that does the same and reports it."""
     real = owner.__hash__
     if real is _of_object:
         return _objects_hash
@@ -57,7 +57,7 @@ def hash_method(owner: Any) -> Any:
 
 @contextmanager
 def reported_hashes() -> Iterator[None]:
-    """Report what the built-in ``hash`` gives."""
+    """Report the results of the built-in ``hash``."""
     with ExitStack() as stack:
         redirect(stack, hash, _hashing)
         yield

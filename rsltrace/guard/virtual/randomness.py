@@ -1,9 +1,9 @@
-"""Chance, made of seeds: every node draws from streams of its own, named after it.
+"""Random numbers from seeds: every node draws from its own streams.
 
-``random``'s and numpy's module functions share one generator per process; here each node has its
-own, as if it were a process of its own, so adding a node changes nothing for the others. Whatever
-else asks for entropy (``Random()``, ``secrets``, ``uuid4``, ``default_rng()``) gets it through
-``os.urandom`` or ``Random.seed``, and so from the node's stream, too.
+The module functions of ``random`` and numpy share one generator per process; here each node has its
+own, so adding a node does not change the others. Everything else that needs entropy (``Random()``,
+``secrets``, ``uuid4``, ``default_rng()``) gets it through ``os.urandom`` or ``Random.seed``, and so
+from the node's stream, too.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ _real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
 
 
 _Virtual = Callable[[Guard, str], Callable[..., Any]]
-"""Returns what draws from the stream of that name."""
+"""Returns the function that draws from the stream of that name."""
 
 
 def _drawing(
     call: str, real: Callable[..., Any], virtual: _Virtual, *, is_method: bool = False
 ) -> Any:
-    """Return the stand-in for a function that answers by chance; a method's owner is dropped."""
+    """Return the replacement of a random function; of a method the object is dropped."""
 
     def draw(*arguments: Any, **options: Any) -> Any:
         if is_method:
@@ -61,7 +61,7 @@ def _drawing(
             frame = frames.next_caller()
         except frames.INTERRUPTED:
             frame = frames.lost_caller()
-        if guard.makes_chance:
+        if guard.answers_random:
             kind = KINDS[code_of(frame).co_filename]
             drawing = guard.known_random_function(call, kind) if kind <= OURS else None
             return (drawing or guard.random_function(call, virtual, frame))(*arguments, **options)
@@ -73,7 +73,7 @@ def _drawing(
 def _drawing_without_arguments(
     call: str, real: Callable[[], Any], virtual: _Virtual
 ) -> Callable[[dict[str, Any]], Any]:
-    """Return the same for a function without arguments, for ``RedirectedReader``."""
+    """Return the replacement of a function without arguments, for ``RedirectedReader``."""
 
     def draw(names: dict[str, Any]) -> Any:
         guard = engaged()
@@ -85,7 +85,7 @@ def _drawing_without_arguments(
         except (KeyError, TypeError):
             frame = caller()
             kind = guard.file_kind(names, frame)
-        if guard.makes_chance:
+        if guard.answers_random:
             drawing = guard.known_random_function(call, kind) if kind <= OURS else None
             return (drawing or guard.random_function(call, virtual, frame or caller()))()
         return _answer(guard, frame or caller(), call, virtual, partial(real))
@@ -120,7 +120,7 @@ def _shown(value: object) -> str:
 
 @contextmanager
 def virtual_randomness() -> Iterator[None]:
-    """Redirect what answers by chance; which guard answers is asked at each call."""
+    """Redirect all random functions."""
     with ExitStack() as stack:
         _module_functions(stack, random, random._inst, "random", _random_of)
         replace_attribute(stack, random, "_inst", _SharedGenerator())
@@ -137,13 +137,13 @@ def virtual_randomness() -> Iterator[None]:
 
 
 class _SharedGenerator(random.Random):
-    """What libraries (networkx) take for the generator behind ``random``'s functions."""
+    """What libraries (networkx) use as the generator behind ``random``'s functions."""
 
     def __init__(self) -> None:
-        """Seed nothing: that would seed the module."""
+        """Do not seed: that would seed the module."""
 
     def __getattribute__(self, name: str) -> Any:
-        """Return the module's function of that name, which asks whose code it is."""
+        """Return the module's function of that name, which finds the caller's stream."""
         if name.startswith("_"):
             return super().__getattribute__(name)
         return vars(random).get(name) or super().__getattribute__(name)
@@ -201,7 +201,7 @@ def _entropy(stack: ExitStack) -> None:
 
 
 def _unseeded(stack: ExitStack) -> None:
-    """``Random()`` without a seed takes entropy in C, past any redirected function."""
+    """``Random()`` without a seed takes entropy in C, past redirected functions."""
     real = random.Random.seed
 
     def seed(self: random.Random, a: Any = None, version: int = 2) -> None:
@@ -215,7 +215,7 @@ def _unseeded(stack: ExitStack) -> None:
 
 
 def _uuids(stack: ExitStack) -> None:
-    """``uuid1`` then asks ``time`` and ``random``; the machine's address is replaced, too."""
+    """Replace what ``uuid1`` uses besides ``time`` and ``random``: the machine's address."""
     for name, value in (
         ("_generate_time_safe", None),
         ("_node", _NODE_ID),
@@ -238,7 +238,7 @@ def _uuid1_code(node=None, clock_seq=None):  # type: ignore[no-untyped-def]
 
 
 def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
-    """Do ``uuid.uuid1``, which never gives a time twice, for each node as if it were alone."""
+    """Call ``uuid.uuid1``, which never returns a time twice, with a state per node."""
     real, guard = _real_uuid1[0], engaged()
     if guard is None:
         return real(node, clock_seq)
@@ -251,7 +251,7 @@ def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
 
 
 def _shared_numpy(stack: ExitStack, module: Any) -> None:
-    """Libraries (scipy.stats) use numpy's shared generator itself: give it its state back."""
+    """Restore the state of numpy's shared generator afterwards: scipy.stats uses it directly."""
     shared = module.mtrand._rand
     stack.callback(shared.set_state, shared.get_state())
     real = module.seed  # a function of its own that goes past the redirected methods
@@ -266,7 +266,7 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
 
 
 def _zeroing(real: Callable[..., Any]) -> Any:
-    """``np.empty`` shows what was in the memory before; in user code, it shows zeros."""
+    """``np.empty`` shows old memory; in user code it shows zeros."""
 
     def empty(*arguments: Any, **options: Any) -> Any:
         made = real(*arguments, **options)
@@ -281,7 +281,7 @@ def _zeroing(real: Callable[..., Any]) -> Any:
 
 
 def begin_shared(seed: int) -> None:
-    """Seed what cannot be divided into streams: numpy's shared generator."""
+    """Seed numpy's shared generator, which cannot be divided into streams."""
     if "numpy" in sys.modules:
         import numpy as np
 

@@ -1,4 +1,4 @@
-"""Functions of the C library that nodes call through cffi, reported as those through ctypes."""
+"""Functions of the C library that nodes load through cffi, reported like those through ctypes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LOADS_LIBRARIES = "cffi.api"
 
 
 class _Library:
-    """A library as cffi has it, which tells what is taken from it."""
+    """A library of cffi that reports the functions taken from it."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -25,7 +25,7 @@ class _Library:
         return getattr(self._real, name)
 
     def load_function(self, kind: Any, name: str) -> Any:
-        """Return a function; cffi keeps it and asks once."""
+        """Return a function; cffi keeps it and calls this once."""
         guard = engaged()
         source = C_FUNCTIONS.get(name)
         if guard is not None and source is not None:
@@ -34,7 +34,7 @@ class _Library:
 
 
 def watched_libraries(stack: ExitStack) -> None:
-    """Report what nodes take from libraries that they open from now on, until ``stack`` ends."""
+    """Report functions of libraries that nodes open from now on, until ``stack`` ends."""
     module = sys.modules[LOADS_LIBRARIES]
     real = getattr(module, "_load_backend_lib", None)
     if real is not None:
