@@ -1,7 +1,8 @@
-"""Events and outputs of a trace, a segment at a time, seen in place.
+"""Events and outputs of a trace, a segment at a time: arrays of records of one size.
 
-A chunk of events is one array of fixed-size records, so reading a segment is: fetch, unpack, check
-the CRC, look at the bytes as a numpy array. Nothing is parsed or copied per event.
+Reading a segment means: fetch, decompress, check the CRC, view the bytes as a numpy array. Nothing
+is parsed or copied per event. Writing copies contiguous fields in one piece: for numpy each field
+is a loop over the array.
 """
 
 from __future__ import annotations
@@ -24,15 +25,11 @@ from rsltrace.trace.format import (
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
-from rsltrace.trace.index import damaged, read_chunk
+from rsltrace.trace.index import damage_error, read_chunk
 from rsltrace.trace.mcap.chunk import ChunkBody, rows_chunk
-from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, Damaged, Span
+from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, Damaged, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventFlag, EventKind, Output, OutputKind
-
-# The chunks of events and of outputs: rows of one size, made as arrays.
-#
-# What stays together is copied in one piece: to numpy a field is a loop over the array.
 
 _SEQUENCE_MASK = 2**32 - 1
 _CHAINED_DTYPE = np.dtype([("chain_hash", "<u8"), ("rest", f"V{EVENT_REST_DTYPE.itemsize}")])
@@ -44,7 +41,7 @@ assert _NUMBERED_DTYPE.itemsize == OUTPUT_DTYPE.itemsize
 
 
 def event_rows(rests: Sequence[bytes], chain_hashes: array[int]) -> npt.NDArray[np.void]:
-    """Return the events as an array of EVENT_DTYPE, shape (n,). ``rests`` are EVENT_REST packed."""
+    """Return the events as an array of EVENT_DTYPE, shape (n,). ``rests`` are packed EVENT_REST."""
     assert len(rests) == len(chain_hashes)
     rows = np.empty(len(rests), dtype=_CHAINED_DTYPE)
     rows["chain_hash"] = chain_hashes
@@ -57,7 +54,7 @@ def output_rows(
 ) -> npt.NDArray[np.void]:
     """Return the outputs of ``events`` as an array of OUTPUT_DTYPE, shape (n,).
 
-    ``contents`` are OUTPUT_CONTENT packed, ``sequences`` those of all outputs but draws.
+    ``contents`` are packed OUTPUT_CONTENT, ``sequences`` those of all outputs except draws.
     """
     packed, numbered = _contents(contents)
     owners = np.repeat(events["index"], events["outputs"])
@@ -80,7 +77,7 @@ def count_numbered(contents: Sequence[bytes]) -> int:
 def _contents(
     contents: Sequence[bytes],
 ) -> tuple[npt.NDArray[np.void], npt.NDArray[np.bool_]]:
-    """Return outputs as an array of OUTPUT_CONTENT_DTYPE, and which of them have a sequence."""
+    """Return outputs as an array of OUTPUT_CONTENT_DTYPE, and which have a sequence."""
     packed = np.frombuffer(b"".join(contents), dtype=OUTPUT_CONTENT_DTYPE)
     return packed, packed["kind"] != OutputKind.DRAW
 
@@ -101,8 +98,8 @@ def outputs_chunk(
 ) -> ChunkBody:
     """Return the chunk of a segment's outputs; a message's time is the stamp of its event.
 
-    ``rows`` are OUTPUT_DTYPE, ``events`` the EVENT_DTYPE rows of the segment they belong to, and
-    ``first_output`` counts the outputs of the run before them.
+    ``rows`` are OUTPUT_DTYPE, ``events`` the segment's EVENT_DTYPE rows; ``first_output`` is the
+    number of outputs before them.
     """
     messages = _messages(rows, OUTPUT_MESSAGE_DTYPE, channel_id)
     numbers = np.arange(first_output, first_output + len(rows), dtype=np.uint64)
@@ -115,7 +112,7 @@ def outputs_chunk(
 def _messages(
     rows: npt.NDArray[np.void], layout: np.dtype[np.void], channel_id: int
 ) -> npt.NDArray[np.void]:
-    """Return messages of ``layout`` around ``rows``; sequence and times are left to the caller."""
+    """Return messages of ``layout`` with ``rows``; the caller sets sequence and times."""
     head = np.zeros(1, dtype=layout)
     head["opcode"] = MESSAGE
     head["length"] = layout.itemsize - RECORD_HEAD.size
@@ -132,10 +129,10 @@ def _messages(
 
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"
-"""The CDR header as numpy gives it: without the zeros at its end."""
+"""The CDR header in numpy, which drops zeros at the end."""
 
 _SEGMENTS_CACHED = 4
-"""For looking up single events: a diff goes back and forth between two or three places."""
+"""For single events: a diff goes back and forth between two or three places."""
 
 
 def events_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
@@ -194,32 +191,32 @@ class SegmentReader:
         self._event_channel = event_channel
         self._output_channel = output_channel
         self._first_events = table["first_event"]
-        # Caches of this object, not of the class: they go away with the trace.
+        # Caches per object, so that they end with the trace.
         self.cached_events = lru_cache(maxsize=_SEGMENTS_CACHED)(self.events)
         self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
 
     def forget(self) -> None:
-        """Drop what is cached."""
+        """Drop the caches."""
         self.cached_events.cache_clear()
         self.cached_outputs.cache_clear()
 
     def segment_of(self, event: int) -> int:
-        """Return the number of the segment that holds ``event`` (which must exist)."""
+        """Return the number of the segment that contains ``event`` (which must exist)."""
         return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1
 
     def events(self, segment: int) -> npt.NDArray[np.void]:
         """Return the events of a segment: EVENT_DTYPE, shape (n,), read-only. Raises TraceError."""
         row = self.table[segment]
-        span = Span(int(row["events_offset"]), int(row["events_length"]))
+        span = RecordSpan(int(row["events_offset"]), int(row["events_length"]))
         try:
-            # What the table says is all the memory there is for it.
+            # The table's counts limit the memory.
             size_max = int(row["events"]) * EVENT_MESSAGE_DTYPE.itemsize
             events = events_in(read_chunk(self._source, span, size_max), self._event_channel)
             if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
                 raise Damaged("it is not the one the index speaks of")
             check_numbered(events, int(row["first_event"]))
         except Damaged as error:
-            raise damaged(self._source, span.offset, "the events chunk", error) from error
+            raise damage_error(self._source, span.offset, "the events chunk", error) from error
         return events
 
     def outputs(self, segment: int) -> npt.NDArray[np.void]:
@@ -227,7 +224,7 @@ class SegmentReader:
         row = self.table[segment]
         if not row["outputs"]:
             return np.zeros(0, dtype=OUTPUT_DTYPE)
-        span = Span(int(row["outputs_offset"]), int(row["outputs_length"]))
+        span = RecordSpan(int(row["outputs_offset"]), int(row["outputs_length"]))
         try:
             size_max = int(row["outputs"]) * OUTPUT_MESSAGE_DTYPE.itemsize
             outputs = outputs_in(read_chunk(self._source, span, size_max), self._output_channel)
@@ -241,15 +238,12 @@ class SegmentReader:
             ):
                 raise Damaged("it is not the one the index speaks of")
         except Damaged as error:
-            raise damaged(self._source, span.offset, "the outputs chunk", error) from error
+            raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs
 
 
 def event_of(row: np.void, name: str = "trace") -> Event:
-    """Return an element of an array of EVENT_DTYPE, from a file of that name, as an Event.
-
-    Raises TraceError.
-    """
+    """Return a row of EVENT_DTYPE, from the file ``name``, as an Event. Raises TraceError."""
     chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
         row.item()
     )
@@ -275,10 +269,7 @@ def event_of(row: np.void, name: str = "trace") -> Event:
 
 
 def output_of(row: np.void, name: str = "trace") -> Output:
-    """Return an element of an array of OUTPUT_DTYPE, from a file of that name, as an Output.
-
-    Raises TraceError.
-    """
+    """Return a row of OUTPUT_DTYPE, from the file ``name``, as an Output. Raises TraceError."""
     event, content_hash, entity, kind, sequence = row.item()
     try:
         return Output(event, entity, OutputKind(kind), content_hash, sequence)

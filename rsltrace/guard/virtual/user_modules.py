@@ -114,7 +114,7 @@ def code_of_script(source: bytes, path: str) -> CodeType:
 
     :raises SyntaxError, ValueError: if it is not Python.
     """
-    if any(type(finder) is _Finder and finder.rewrites for finder in sys.meta_path):
+    if any(type(finder) is _ModuleFinder and finder.rewrites for finder in sys.meta_path):
         return rewritten(source, path)
     code: CodeType = compile(source, path, "exec", dont_inherit=True)
     return code
@@ -139,7 +139,7 @@ class _Loader(importlib.machinery.SourceFileLoader):
             super().exec_module(module)
 
 
-class _Finder:
+class _ModuleFinder:
     """Finds user modules, and those of libraries, which have their own import time."""
 
     def __init__(
@@ -219,7 +219,7 @@ def user_modules(
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
     with ExitStack() as stack:
-        finder = _Finder(packages, on_loaded, rewrites, stack)
+        finder = _ModuleFinder(packages, on_loaded, rewrites, stack)
         sys.meta_path.insert(0, finder)
         stack.callback(sys.meta_path.remove, finder)
         yield

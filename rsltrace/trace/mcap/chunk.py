@@ -1,4 +1,5 @@
-"""The inside of a chunk: decompressed within limits, checked, and cut into messages."""
+"""Chunks of MCAP messages: decompressed within limits and checked when read, built in bulk when
+written."""
 
 from __future__ import annotations
 
@@ -20,39 +21,36 @@ from rsltrace.trace.mcap.records import (
     MESSAGE_HEADER_DTYPE,
     RECORD_HEAD,
     Damaged,
-    Span,
+    RecordSpan,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
 
-# Bodies of MCAP chunks, built in bulk.
-#
-# Writing a message at a time costs several microseconds in Python; a run has 100,000 messages a
-# second. So messages are collected as they come and a whole chunk of them is laid out by numpy:
-# those of one size are one structured array, others are joined with headers that were made as one
-# array. The message indexes of a chunk are made the same way.
+# Building chunks. Writing one message at a time takes several microseconds in Python, and a run has
+# 100,000 messages per second. So messages are collected, and numpy lays out a whole chunk of them
+# with its message indexes: messages of one size as one structured array, others joined with headers
+# from one array.
 
 _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX_ENTRY_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
 
-Waiting = list[Any]
-"""Messages that wait for their chunk: channel id, sequence, stamp in ns and data of the first, then
-of the second, and so on. One flat list holds nothing that the garbage collector has to visit."""
+PendingMessages = list[Any]
+"""Messages for the next chunk: channel id, sequence, stamp in ns and data of each. One flat list
+contains nothing that the garbage collector must visit."""
 
-WAITING_FIELDS = 4
+PENDING_FIELDS = 4
 LARGE_BYTES = 1 << 20
-"""From here on a message's data are left where they are."""
+"""Messages from this size on are not copied."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkBody:
-    """The records of a chunk before compression, and what its indexes say.
+    """The records of a chunk before compression, and the content of its indexes.
 
     ``parts`` are the records in pieces: large messages are not copied behind their headers.
-    ``start_ns`` and ``end_ns`` are the smallest and largest log times. ``indexes`` holds, by
-    ascending channel id, the channel, its number of messages and its MessageIndex record.
-    ``rows`` says that all messages have one size.
+    ``indexes`` holds, by ascending channel id, the channel, its number of messages and its
+    MessageIndex record. ``rows`` is set if all messages have one size.
     """
 
     parts: tuple[bytes, ...]
@@ -63,7 +61,7 @@ class ChunkBody:
 
     @property
     def size(self) -> int:
-        """Bytes of the records."""
+        """The size of the records in bytes."""
         return sum(map(len, self.parts))
 
     @property
@@ -72,25 +70,25 @@ class ChunkBody:
         return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
 
 
-def messages_chunk(waiting: Waiting) -> ChunkBody:
-    """Return the chunk of messages of any size and channel, in the order given (at least one)."""
-    datas: list[bytes] = waiting[3::WAITING_FIELDS]
+def messages_chunk(waiting: PendingMessages) -> ChunkBody:
+    """Return the chunk of messages of any size and channel, in order (at least one)."""
+    datas: list[bytes] = waiting[3::PENDING_FIELDS]
     count = len(datas)
-    channels = np.array(waiting[0::WAITING_FIELDS], dtype="<u2")
-    times = np.array(waiting[2::WAITING_FIELDS], dtype="<u8")
+    channels = np.array(waiting[0::PENDING_FIELDS], dtype="<u2")
+    times = np.array(waiting[2::PENDING_FIELDS], dtype="<u8")
     sizes = np.fromiter(map(len, datas), dtype="<u8", count=count) + np.uint64(_HEADER_BYTES)
     headers = np.empty(count, dtype=MESSAGE_HEADER_DTYPE)
     headers["opcode"] = Opcode.MESSAGE
     headers["length"] = sizes - np.uint64(RECORD_HEAD.size)
     headers["channel_id"] = channels
-    headers["message_sequence"] = waiting[1::WAITING_FIELDS]
+    headers["message_sequence"] = waiting[1::PENDING_FIELDS]
     headers["log_time"] = headers["publish_time"] = times
     pieces = [b""] * (2 * count)
     pieces[0::2] = headers.view(f"V{_HEADER_BYTES}").tolist()
     pieces[1::2] = datas
     offsets = np.cumsum(sizes) - sizes
     indexes = []
-    for channel_id in sorted(set(waiting[0::WAITING_FIELDS])):  # np.unique would load numpy.ma
+    for channel_id in sorted(set(waiting[0::PENDING_FIELDS])):  # np.unique would load numpy.ma
         chosen = channels == channel_id
         indexes.append(_message_index(channel_id, times[chosen], offsets[chosen]))
     parts = _joined(pieces) if int(sizes.max()) >= LARGE_BYTES else (b"".join(pieces),)
@@ -98,7 +96,7 @@ def messages_chunk(waiting: Waiting) -> ChunkBody:
 
 
 def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
-    """Join what lies between large pieces."""
+    """Join the small pieces between large ones."""
     parts: list[bytes] = []
     small: list[bytes] = []
     for piece in pieces:
@@ -111,10 +109,10 @@ def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
 
 
 def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
-    """Return the chunk of messages of one size: an array of them, header and all.
+    """Return the chunk of messages of one size: an array of them with headers.
 
-    Each lies where its number says, so its message index has no entries. The record is there all
-    the same: Foxglove's reader refuses a file with a chunk that has none.
+    The position of a message follows from its number, so the message index has no entries. Its
+    record is needed: Foxglove's reader refuses a chunk without one.
     """
     times = messages["log_time"]
     index = (channel_id, len(messages), _index_record(channel_id, b""))
@@ -145,8 +143,8 @@ _HEAD_BYTES = RECORD_HEAD.size
 _MESSAGE_BYTES_MIN = MESSAGE_HEAD.size
 
 
-class MessageView(NamedTuple):
-    """A message in a chunk: header fields, and where its data lies in the chunk's records."""
+class ChunkMessage(NamedTuple):
+    """A message in a chunk: header fields, and the position of its data in the records."""
 
     channel_id: int
     sequence: int
@@ -156,12 +154,12 @@ class MessageView(NamedTuple):
 
 
 def read_chunk(
-    source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
+    source: ByteSource, span: RecordSpan, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
 ) -> bytes:
     """Return the records of the chunk at ``span``. Raises Damaged.
 
-    What is larger than ``size_max`` is refused before anything is unpacked. MCAP lets a writer
-    leave the CRC out by writing 0, and add fields to the end of a record; ``strict`` does not.
+    Chunks larger than ``size_max`` are refused before decompression. MCAP allows a CRC of 0 (none)
+    and extra fields at the end of a record; ``strict`` does not.
     """
     if span.length < _CHUNK_HEAD.size:
         raise Damaged(f"its length is given as {span.length}")
@@ -201,7 +199,7 @@ def _unzstd(data: memoryview, size: int) -> bytes:
     import zstandard
 
     try:
-        # The frame may claim any size; it must not be believed before memory is taken.
+        # The frame may claim any size, so check it before allocating memory.
         claimed = zstandard.frame_content_size(data)
         if claimed > size:
             raise Damaged(f"the chunk holds {claimed} bytes where {size} are promised")
@@ -221,9 +219,9 @@ def _unlz4(data: memoryview, size: int) -> bytes:
         raise Damaged(f"the chunk cannot be decompressed ({error})") from None
 
 
-def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
-    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none, or if it
-    is of another channel."""
+def message_at(records: bytes, offset: int, of_channel: int) -> ChunkMessage:
+    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none of that
+    channel."""
     if offset + _MESSAGE_BYTES_MIN > len(records):
         raise Damaged(f"no message fits at {offset} of the chunk")
     opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
@@ -232,17 +230,16 @@ def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
         raise Damaged(f"there is no whole message at {offset} of the chunk")
     if channel_id != of_channel:
         raise Damaged(f"the message at {offset} is of another channel than the index says")
-    return MessageView(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
+    return ChunkMessage(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
 
 
 def cut_messages(
     records: bytes, wanted: Mapping[int, int], first_ns: int, *, with_publish_time: bool = False
 ) -> list[tuple[int, int, bytes]]:
-    """Return (log time, number, data) of the wanted messages of a chunk by time, equal times as
-    they stand.
+    """Return (log time, number, data) of the wanted messages of a chunk, by time and then position.
 
-    ``wanted`` maps channel ids to numbers; ``with_publish_time`` puts it in front of the data,
-    8 bytes, little-endian. Raises Damaged when a record is cut off.
+    ``wanted`` maps channel ids to numbers. ``with_publish_time`` puts it before the data (8 bytes,
+    little-endian). Raises Damaged when a record is cut off.
     """
     # The publish time is the last field before the data.
     data_at = _MESSAGE_BYTES_MIN - (PUBLISH_TIME_BYTES if with_publish_time else 0)
@@ -264,7 +261,7 @@ def cut_messages(
                 ordered = False
             previous_ns = stamp_ns
         at = following
-    # What is left can only be records of other kinds, shorter than any message.
+    # The rest can only be other records, shorter than any message.
     if at > end or any(opcode == MESSAGE for opcode, _, _ in records_in(records[at:])):
         raise Damaged("a record runs past the end of its chunk")
     if not ordered:

@@ -1,4 +1,4 @@
-"""The end of an MCAP file, as it is read: what is where in it."""
+"""Read the structure of an MCAP file: records one by one, header, footer and summary."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from rsltrace.trace.mcap.records import (
     RECORD_BYTES_MAX,
     RECORD_HEAD,
     SUMMARY_BYTES_MAX,
-    Channel,
-    ChunkIndex,
-    CutOff,
+    ChunkIndexEntry,
     Damaged,
     Fields,
-    Header,
-    Schema,
-    Span,
-    Statistics,
+    McapChannel,
+    McapHeader,
+    McapSchema,
+    McapStatistics,
+    RecordSpan,
+    TruncatedFile,
     channels_of_chunk_index,
     parse_channel,
     parse_chunk_index,
@@ -34,15 +34,13 @@ from rsltrace.trace.mcap.records import (
 )
 from rsltrace.trace.mcap.source import ByteSource
 
-# Walking a file record by record, where no summary tells what is in it.
-
 _WALK_BLOCK_BYTES = 1 << 20
-_TORN_BYTES = 64 << 10
+_TAIL_BYTES = 64 << 10
 _KNOWN = frozenset(map(int, Opcode))
 
 
-def read_body(source: ByteSource, span: Span, opcode: int) -> bytes:
-    """Return the body of the record at ``span``. Raises Damaged if it is not such a record."""
+def read_body(source: ByteSource, span: RecordSpan, opcode: int) -> bytes:
+    """Return the body of the record at ``span``. Raises Damaged if it is another record."""
     if not RECORD_HEAD.size <= span.length <= RECORD_BYTES_MAX:
         raise Damaged(f"its length is given as {span.length}")
     record = source.read_at(*span)
@@ -52,28 +50,28 @@ def read_body(source: ByteSource, span: Span, opcode: int) -> bytes:
     return record[RECORD_HEAD.size :]
 
 
-def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int, Span]]:
-    """Yield opcode and place of the records between two places of a file.
+def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int, RecordSpan]]:
+    """Yield opcode and span of the records between two offsets.
 
-    Raises Damaged at one that is not whole.
+    Raises Damaged at a record that is not whole.
     """
     at = start
     while at < end:
         if at + RECORD_HEAD.size > end:
             raise Damaged(f"the record at byte {at} is cut off")
         opcode, length = RECORD_HEAD.unpack(source.read_at(at, RECORD_HEAD.size))
-        span = Span(at, length + RECORD_HEAD.size)
+        span = RecordSpan(at, length + RECORD_HEAD.size)
         if span.end > end:
             raise Damaged(f"the record at byte {at} runs past the end of its section")
         yield opcode, span
         at = span.end
 
 
-def whole_records(source: ByteSource) -> Iterator[tuple[int, Span]]:
-    """Yield what ``walk_records`` does of a file without an end, as far as it is whole.
+def whole_records(source: ByteSource) -> Iterator[tuple[int, RecordSpan]]:
+    """Yield the whole records of a file without an end.
 
-    Raises Damaged, telling why, where the rest is not the beginning of one more record: a file
-    that was cut ends in the middle of one, or in zeros, which a crash leaves where data should be.
+    Raises Damaged unless the rest is the beginning of one more record: a truncated file ends inside
+    a record, or in zeros that a crash leaves.
     """
     at = len(MAGIC)
     try:
@@ -84,14 +82,14 @@ def whole_records(source: ByteSource) -> Iterator[tuple[int, Span]]:
             at = span.end
     except Damaged:
         pass  # where it was cut, or is damaged
-    if why := _not_torn(source, at):
+    if why := _damage_at(source, at):
         raise Damaged(why)
 
 
-def _not_torn(source: ByteSource, at: int) -> str:
-    """Say why what is left of a file is no record that was being written, "" if it is one."""
+def _damage_at(source: ByteSource, at: int) -> str:
+    """Return why the rest of a file is not the beginning of a record, "" if it is."""
     rest = source.size - at
-    head = source.read_at(at, min(rest, _TORN_BYTES))
+    head = source.read_at(at, min(rest, _TAIL_BYTES))
     if not any(head):
         return "" if _is_zero(source, at + len(head)) else "there are zeros where a record begins"
     if rest < RECORD_HEAD.size:
@@ -121,12 +119,12 @@ _BEFORE_TEXTS = {
     Opcode.ATTACHMENT: (16, 2),
     Opcode.METADATA: (0, 2),
 }
-"""How many bytes stand before the first text (or map, which has a length, too), and how many of
-these follow each other."""
+"""By opcode: the number of bytes before the first text (or map, which also has a length), and of
+texts in sequence."""
 
 
 def length_by_fields(opcode: int, body: bytes) -> int | None:
-    """Return how long a record's fields say that it is, None where they are cut off, too."""
+    """Return the length of a record as its fields say, None where they are cut off."""
     if opcode not in _BEFORE_TEXTS:
         return None
     fixed, texts = _BEFORE_TEXTS[Opcode(opcode)]
@@ -154,8 +152,8 @@ _SCHEMA, _CHANNEL, _STATISTICS = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Op
 _ATTACHMENT_INDEX, _METADATA_INDEX = int(Opcode.ATTACHMENT_INDEX), int(Opcode.METADATA_INDEX)
 
 
-class Footer(NamedTuple):
-    """Where the footer is, where the summary begins (0: there is none), and its CRC (0: none)."""
+class McapFooter(NamedTuple):
+    """The offset of the footer, of the summary (0: none), and the summary's CRC (0: none)."""
 
     offset: int
     summary_start: int
@@ -163,22 +161,21 @@ class Footer(NamedTuple):
 
 
 @dataclass(slots=True)
-class Summary:
-    """What the records of a file say of it: schemas and channels by id, metadata and attachments
-    by name.
+class McapSummary:
+    """What a file's records say: schemas and channels by id, metadata and attachments by name.
 
-    The indexes of chunks stay as they are until they are asked for: a long run has thousands.
+    Chunk indexes are parsed only when needed: a long run has thousands.
     """
 
     _chunk_indexes: list[bytes] = field(default_factory=list)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    metadata: dict[str, Span] = field(default_factory=dict)
-    attachments: dict[str, Span] = field(default_factory=dict)
-    statistics: Statistics | None = None
+    schemas: dict[int, McapSchema] = field(default_factory=dict)
+    channels: dict[int, McapChannel] = field(default_factory=dict)
+    metadata: dict[str, RecordSpan] = field(default_factory=dict)
+    attachments: dict[str, RecordSpan] = field(default_factory=dict)
+    statistics: McapStatistics | None = None
 
     def add(self, opcode: int, body: bytes) -> None:
-        """Take over a record, unless it is the index of a chunk. Raises Damaged."""
+        """Add a record other than a chunk index. Raises Damaged."""
         if opcode == _SCHEMA:
             schema = parse_schema(body)
             self.schemas.setdefault(schema.id, schema)
@@ -189,14 +186,14 @@ class Summary:
             self.statistics = parse_statistics(body)
         elif opcode in (_ATTACHMENT_INDEX, _METADATA_INDEX):
             entry = Fields(body)
-            span = Span(entry.u64(), entry.u64())
+            span = RecordSpan(entry.u64(), entry.u64())
             if opcode == _ATTACHMENT_INDEX:
                 entry.take(24)  # log time, creation time, size
                 self.attachments[entry.text()] = span
             else:
                 self.metadata[entry.text()] = span
 
-    def chunks(self, channels: frozenset[int] | None = None) -> Iterator[ChunkIndex]:
+    def chunks(self, channels: frozenset[int] | None = None) -> Iterator[ChunkIndexEntry]:
         """Yield the chunks, or those with messages of some channels. Raises Damaged."""
         for body in self._chunk_indexes:
             if channels is None or not channels.isdisjoint(channels_of_chunk_index(body)):
@@ -204,36 +201,36 @@ class Summary:
 
 
 def has_end(source: ByteSource) -> bool:
-    """Return whether the file ends as a finished MCAP file does."""
+    """Return whether the file ends like a finished MCAP file."""
     size = len(MAGIC)
     if source.size < 2 * size + _FOOTER_BYTES:
         return False
     return source.read_at(source.size - size, size) == MAGIC
 
 
-def read_header(source: ByteSource) -> tuple[Header, int]:
+def read_header(source: ByteSource) -> tuple[McapHeader, int]:
     """Return the header and the offset behind it. Raises Damaged."""
     offset = len(MAGIC)
     if source.size < offset + RECORD_HEAD.size:
-        raise CutOff("it is cut off")
+        raise TruncatedFile("it is cut off")
     _, length = RECORD_HEAD.unpack(source.read_at(offset, RECORD_HEAD.size))
-    span = Span(offset, RECORD_HEAD.size + length)
+    span = RecordSpan(offset, RECORD_HEAD.size + length)
     if span.end > source.size:
-        raise CutOff("it is cut off")
+        raise TruncatedFile("it is cut off")
     return parse_header(read_body(source, span, Opcode.HEADER)), span.end
 
 
-def read_footer(source: ByteSource) -> Footer:
+def read_footer(source: ByteSource) -> McapFooter:
     """Return the footer of a file that has an end. Raises Damaged."""
     offset = source.size - len(MAGIC) - _FOOTER_BYTES
-    body = read_body(source, Span(offset, _FOOTER_BYTES), Opcode.FOOTER)
+    body = read_body(source, RecordSpan(offset, _FOOTER_BYTES), Opcode.FOOTER)
     start, _, crc = _FOOTER.unpack(body)
     if start and not len(MAGIC) < start <= offset:
         raise Damaged("the summary would be outside of the file")
-    return Footer(offset, start, crc)
+    return McapFooter(offset, start, crc)
 
 
-def read_summary(source: ByteSource, footer: Footer) -> Summary:
+def read_summary(source: ByteSource, footer: McapFooter) -> McapSummary:
     """Return the summary. Raises Damaged."""
     length = footer.offset - footer.summary_start
     if length > SUMMARY_BYTES_MAX:
@@ -242,7 +239,7 @@ def read_summary(source: ByteSource, footer: Footer) -> Summary:
     if footer.crc and crc32(data) != footer.crc:
         raise Damaged("its CRC does not match")
     chunk_indexes: list[bytes] = []
-    summary = Summary(chunk_indexes)
+    summary = McapSummary(chunk_indexes)
     records = data[:length]
     for opcode, start, end in records_in(records):
         if opcode == _CHUNK_INDEX:
@@ -261,8 +258,8 @@ def data_crc(source: ByteSource, end: int) -> int:
 
 
 def check_data(source: ByteSource, end: int) -> None:
-    """Raise Damaged unless the data section, which ends at ``end``, has the CRC it says it has."""
+    """Raise Damaged unless the data section that ends at ``end`` matches its CRC."""
     at = end - _DATA_END_BYTES
-    body = read_body(source, Span(at, _DATA_END_BYTES), Opcode.DATA_END)
+    body = read_body(source, RecordSpan(at, _DATA_END_BYTES), Opcode.DATA_END)
     if data_crc(source, at) != int.from_bytes(body, "little"):
         raise Damaged("its checksum does not match")

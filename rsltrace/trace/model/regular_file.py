@@ -15,10 +15,8 @@ from pathlib import Path
 
 
 def not_regular(path: Path) -> str:
-    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if it is nothing.
-
-    To be asked before it is opened.
-    """
+    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if nothing is
+    there."""
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
         return ""
@@ -28,7 +26,7 @@ def not_regular(path: Path) -> str:
 
 
 def read_regular(path: Path, size_max: int = -1) -> bytes:
-    """Return what is in a file, at most ``size_max`` bytes of it.
+    """Return the content of a file, at most ``size_max`` bytes.
 
     :raises OSError: if it cannot be read, or is no file; ``strerror`` says what it is.
     """
@@ -42,7 +40,7 @@ def read_regular(path: Path, size_max: int = -1) -> bytes:
 def in_the_way(path: Path) -> str:
     """Return what is at ``path`` if a file must not replace it, "" for a file or nothing.
 
-    Renaming replaces whatever has the name: for root, /dev/null, too.
+    A rename replaces anything: for root even /dev/null.
     """
     try:
         return not_regular(path)
