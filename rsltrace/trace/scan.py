@@ -35,7 +35,7 @@ from rsltrace.trace.mcap.chunk import read_chunk
 from rsltrace.trace.mcap.reader import McapSummary, length_by_fields, read_body, whole_records
 from rsltrace.trace.mcap.records import Damaged, Fields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.segments import check_numbered, events_in, outputs_in
+from rsltrace.trace.segments import check_numbered, events_in, outputs_in, segment_row
 
 
 def scan(source: ByteSource) -> TraceIndex:
@@ -150,23 +150,17 @@ class _Scanner:
 
     def _events(self, span: RecordSpan, records: bytes) -> int:
         events = events_in(records, self._event_channel)
-        row = np.zeros(1, dtype=SEGMENT_DTYPE)[0]
+        first_event = first_output = 0
         if self._rows:
             last = self._rows[-1]
-            row["first_event"] = last["first_event"] + last["events"]
-            row["first_output"] = last["first_output"] + last["outputs"]
-        check_numbered(events, int(row["first_event"]))
+            first_event = int(last["first_event"] + last["events"])
+            first_output = int(last["first_output"] + last["outputs"])
+        check_numbered(events, first_event)
         outputs_span, outputs_count = self._pending_outputs
         if outputs_count != int(events["outputs"].sum(dtype=np.uint64)):
             raise Damaged("its events have other outputs than are in the file")
-        row["events"] = len(events)
-        row["outputs"] = outputs_count
-        row["chain_hash"] = events["chain_hash"][-1]
-        row["start_stamp"] = events["stamp"].min()
-        row["end_stamp"] = events["stamp"].max()
-        row["events_offset"], row["events_length"] = span
-        row["outputs_offset"], row["outputs_length"] = outputs_span
-        self._rows.append(row)
+        firsts = (first_event, first_output)
+        self._rows.append(segment_row(events, outputs_count, firsts, span, outputs_span)[0])
         self._pending_outputs = (RecordSpan(0, 0), 0)
         return len(events)
 

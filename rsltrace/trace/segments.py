@@ -24,6 +24,7 @@ from rsltrace.trace.format import (
     OUTPUT_CONTENT_DTYPE,
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
+    SEGMENT_DTYPE,
 )
 from rsltrace.trace.index import damage_error, read_chunk
 from rsltrace.trace.mcap.chunk import ChunkBody, rows_chunk
@@ -240,6 +241,28 @@ class SegmentReader:
         except Damaged as error:
             raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs
+
+
+def segment_row(
+    events: npt.NDArray[np.void],
+    outputs: int,
+    firsts: tuple[int, int],
+    events_span: tuple[int, int],
+    outputs_span: tuple[int, int],
+) -> npt.NDArray[np.void]:
+    """Return the row of a segment: SEGMENT_DTYPE, shape (1,).
+
+    ``outputs`` is their number, ``firsts`` the numbers of events and outputs before the segment;
+    the spans are (offset, length) of the chunks.
+    """
+    row = np.zeros(1, dtype=SEGMENT_DTYPE)
+    row["first_event"], row["first_output"] = firsts
+    row["events"], row["outputs"] = len(events), outputs
+    row["chain_hash"] = events["chain_hash"][-1]
+    row["start_stamp"], row["end_stamp"] = events["stamp"].min(), events["stamp"].max()
+    row["events_offset"], row["events_length"] = events_span
+    row["outputs_offset"], row["outputs_length"] = outputs_span
+    return row
 
 
 def event_of(row: np.void, name: str = "trace") -> Event:

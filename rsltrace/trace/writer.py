@@ -10,7 +10,6 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -137,12 +136,7 @@ class TraceWriter:
     def __enter__(self) -> TraceWriter:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.abort()
 
     def _progress(self) -> str:
@@ -360,16 +354,8 @@ class TraceWriter:
                 segments.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
             )
         events_at = self._stream.chunk(segments.events_chunk(events, self._event_channel))
-        row = np.zeros(1, dtype=SEGMENT_DTYPE)
-        row["first_event"] = self._events_written
-        row["events"] = len(events)
-        row["first_output"] = self._outputs_written
-        row["outputs"] = len(outputs)
-        row["chain_hash"] = events["chain_hash"][-1]
-        row["start_stamp"] = events["stamp"].min()
-        row["end_stamp"] = events["stamp"].max()
-        row["events_offset"], row["events_length"] = events_at
-        row["outputs_offset"], row["outputs_length"] = outputs_at
+        firsts = (self._events_written, self._outputs_written)
+        row = segments.segment_row(events, len(outputs), firsts, events_at, outputs_at)
         self._segments.append(row.tobytes())
         self._last_chain_hash = self._chain_hashes[-1]
         self._events_written += len(events)

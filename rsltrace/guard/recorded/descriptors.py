@@ -47,6 +47,19 @@ def recording_guard(source: Source, frame: FrameType) -> Guard | None:
     return guard if guard.is_user_call(frame) else None
 
 
+def recording_call(source: Source, call: str, real: Callable[..., Any]) -> Any:
+    """Return the replacement of a function whose answers are recorded as they are."""
+
+    def function(*arguments: Any, **options: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = recording_guard(source, frame)
+        if guard is None:
+            return real(*arguments, **options)
+        return guard.record(source, call, lambda: real(*arguments, **options), frame)
+
+    return function
+
+
 def recorded_descriptor(fd: object) -> tuple[Guard, RecordedDescriptor] | None:
     """Return the guard and its entry of a descriptor, if its answers are recorded."""
     guard = engaged()

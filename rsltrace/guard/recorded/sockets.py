@@ -17,7 +17,7 @@ from typing import Any
 
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import Guard
-from rsltrace.guard.recorded.descriptors import connected_ends, recording_guard
+from rsltrace.guard.recorded.descriptors import connected_ends, recording_call, recording_guard
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Source
@@ -141,33 +141,7 @@ def _accepting(real: Callable[[Any], Any]) -> Any:
     return accept
 
 
-def _resolving(name: str, real: Callable[..., Any]) -> Any:
-    def resolve(*arguments: Any, **options: Any) -> Any:
-        frame = sys._getframe(1)
-        guard = recording_guard(Source.SOCKET, frame)
-        if guard is None:
-            return real(*arguments, **options)
-        return guard.record(
-            Source.SOCKET, f"socket.{name}()", lambda: real(*arguments, **options), frame
-        )
-
-    return resolve
-
-
 # -- TLS ------------------------------------------------------------------------------------------
-
-
-def _of_tls(kind: str, name: str, real: Callable[..., Any]) -> Any:
-    def method(self: Any, *arguments: Any) -> Any:
-        frame = sys._getframe(1)
-        guard = recording_guard(Source.SOCKET, frame)
-        if guard is None:
-            return real(self, *arguments)
-        return guard.record(
-            Source.SOCKET, f"{kind}.{name}()", lambda: real(self, *arguments), frame
-        )
-
-    return method
 
 
 def _reading(real: Callable[..., Any]) -> Any:
@@ -238,7 +212,11 @@ def recorded_sockets() -> Iterator[None]:
     """Record the answers of sockets; in a re-run, return them from the trace."""
     with ExitStack() as stack:
         for name in _RESOLVING:
-            redirect(stack, getattr(_socket, name), partial(_resolving, name))
+            redirect(
+                stack,
+                getattr(_socket, name),
+                partial(recording_call, Source.SOCKET, f"socket.{name}()"),
+            )
         redirect(stack, _socket.socketpair, connected_ends)
         kind: Any = socket.socket
         makers: list[tuple[str, Any]] = [
@@ -254,9 +232,11 @@ def recorded_sockets() -> Iterator[None]:
         tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
         memory = ssl.MemoryBIO
         for name in _TLS:
-            exchange(stack, tls, name, partial(_of_tls, "TLS", name))
+            exchange(stack, tls, name, partial(recording_call, Source.SOCKET, f"TLS.{name}()"))
         exchange(stack, tls, "read", _reading)
         for name in _BUFFERED:
-            exchange(stack, memory, name, partial(_of_tls, "MemoryBIO", name))
+            exchange(
+                stack, memory, name, partial(recording_call, Source.SOCKET, f"MemoryBIO.{name}()")
+            )
         exchange(stack, memory, "pending", _pending)
         yield

@@ -175,40 +175,37 @@ def _formatting(
 
 def _now(real: Any) -> Any:
     def now(cls: type[datetime], tz: Any = None) -> datetime:
-        guard = engaged()
-
-        def virtual(now_ns: int) -> datetime:
-            whole = cls.fromtimestamp(now_ns // _NS, tz)
-            return whole.replace(microsecond=now_ns % _NS // 1000)
-
-        if guard is None:
-            return real.__get__(None, cls)(tz)  # type: ignore[no-any-return]
-        return clock_call(  # type: ignore[no-any-return]
-            guard,
-            caller(),
-            "datetime.now()",
-            virtual,
-            lambda: real.__get__(None, cls)(tz),
-        )
+        return _datetime(cls, real, "now", tz, (tz,), caller())
 
     return now
 
 
 def _utcnow(real: Any) -> Any:
     def utcnow(cls: type[datetime]) -> datetime:
-        guard = engaged()
-
-        def virtual(now_ns: int) -> datetime:
-            whole = cls.fromtimestamp(now_ns // _NS, timezone.utc).replace(tzinfo=None)
-            return whole.replace(microsecond=now_ns % _NS // 1000)
-
-        if guard is None:
-            return real.__get__(None, cls)()  # type: ignore[no-any-return]
-        return clock_call(  # type: ignore[no-any-return]
-            guard, caller(), "datetime.utcnow()", virtual, real.__get__(None, cls)
-        )
+        return _datetime(cls, real, "utcnow", timezone.utc, (), caller()).replace(tzinfo=None)
 
     return utcnow
+
+
+def _datetime(
+    cls: type[datetime],
+    real: Any,
+    name: str,
+    tz: Any,
+    arguments: tuple[Any, ...],
+    frame: FrameType,
+) -> datetime:
+    """Answer a class method of ``datetime`` that was called at ``frame``."""
+    guard, bound = engaged(), real.__get__(None, cls)
+
+    def virtual(now_ns: int) -> datetime:
+        whole = cls.fromtimestamp(now_ns // _NS, tz)
+        return whole.replace(microsecond=now_ns % _NS // 1000)
+
+    if guard is None:
+        return bound(*arguments)  # type: ignore[no-any-return]
+    call = f"datetime.{name}()"
+    return clock_call(guard, frame, call, virtual, lambda: bound(*arguments))  # type: ignore[no-any-return]
 
 
 def numpy_now(function: Any, text: str, *more: Any) -> Any:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from functools import cached_property, partial
 from itertools import takewhile
 from pathlib import Path
-from types import TracebackType
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
@@ -185,12 +184,7 @@ class Bag:
     def __enter__(self) -> Bag:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _select(self, globs: Sequence[str], exclude: Sequence[str]) -> None:
@@ -223,16 +217,12 @@ class Bag:
         self._wanted = [{i: index[key] for i, key in by_id.items()} for by_id in ids]
 
     def _topic(self, stored: StoredTopic) -> BagTopic:
-        names = (stored.name, stored.type_name)
-        offered, type_hash = self._files.topics.get(names, ((), ""))
-        return BagTopic(
-            *names,
-            serialization_format=stored.serialization_format,
-            offered_qos=stored.offered_qos or offered,
-            message_count=stored.message_count,
-            schema_text=stored.schema_text,
-            schema_encoding=stored.schema_encoding,
-            type_hash=stored.type_hash or type_hash,
+        offered, type_hash = self._files.topics.get((stored.name, stored.type_name), ((), ""))
+        topic = BagTopic(*(getattr(stored, field.name) for field in fields(BagTopic)))
+        return replace(
+            topic,
+            offered_qos=topic.offered_qos or offered,
+            type_hash=topic.type_hash or type_hash,
         )
 
     def _read(

@@ -150,18 +150,10 @@ def _duration_ns(value: Any) -> int:
 
 
 @dataclass(frozen=True, slots=True)
-class StoredTopic:
+class StoredTopic(BagTopic):
     """A topic (in MCAP: a channel) of one storage file; ``id`` is unique in the file."""
 
     id: int
-    name: str
-    type_name: str
-    serialization_format: str
-    offered_qos: tuple[BagQos, ...]
-    message_count: int
-    schema_text: str | None
-    schema_encoding: str
-    type_hash: str
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,11 @@ from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NO_FIELD
-from rsltrace.trace.tables.rows import TableSource, TextDictionary, node_names, whole_numbers
+from rsltrace.trace.tables.rows import TextDictionary, node_names, whole_numbers
 from rsltrace.trace.tables.table import TraceTable
+
+if TYPE_CHECKING:
+    from rsltrace.trace.reader import Trace
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20
@@ -37,14 +40,13 @@ class _MessageColumn(NamedTuple):
 
 
 def message_table(
-    trace: TableSource,
+    trace: Trace,
     decoder_of: Callable[[ChannelInfo], Decoder],
     topic: str,
     fields: Sequence[str] | None,
     type_name: str | None,
 ) -> TraceTable:
-    """Return the messages of a topic as a table. Raises TraceError if topic or field are unknown.
-    """
+    """Return the messages of a topic as a table. Raises TraceError if topic or field are unknown."""
     channel = _channel(trace, topic, type_name)
     try:
         decoder = decoder_of(channel)
@@ -70,7 +72,7 @@ def message_table(
 def _batches(
     arrow: Any,
     schema: Any,
-    trace: TableSource,
+    trace: Trace,
     channel: ChannelInfo,
     decoder: Decoder,
     chosen: Sequence[_MessageColumn],
@@ -120,7 +122,7 @@ def _batches(
 class _Senders:
     """By the number of a channel's message: its event and its sender."""
 
-    def __init__(self, trace: TableSource, channel: ChannelInfo) -> None:
+    def __init__(self, trace: Trace, channel: ChannelInfo) -> None:
         sent = {
             (kind.value, entity)
             for entity in trace.entities
@@ -156,7 +158,7 @@ class _Senders:
         return events, owners
 
 
-def _channel(trace: TableSource, topic: str, type_name: str | None) -> ChannelInfo:
+def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
     """Return the channel of a topic and type."""
     found = [channel for channel in trace.channels.values() if channel.topic == topic]
     if not found:
@@ -176,7 +178,7 @@ def _channel(trace: TableSource, topic: str, type_name: str | None) -> ChannelIn
 
 
 def _selected_columns(
-    trace: TableSource, decoder: Decoder, topic: str, fields: Sequence[str] | None
+    trace: Trace, decoder: Decoder, topic: str, fields: Sequence[str] | None
 ) -> list[_MessageColumn]:
     """Return the columns for the requested fields, in order."""
     if isinstance(fields, str):
