@@ -10,7 +10,8 @@ import struct
 
 import numpy as np
 
-from rsltrace.trace.mcap.records import MESSAGE_HEADER_DTYPE, McapHeader
+from rsltrace.trace.mcap.chunk_builder import MESSAGE_HEADER_DTYPE
+from rsltrace.trace.mcap.records import McapHeader
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1

@@ -27,7 +27,7 @@ from rsltrace.trace.format import (
     SEGMENT_DTYPE,
 )
 from rsltrace.trace.index import damage_error, read_chunk
-from rsltrace.trace.mcap.chunk import ChunkBody, rows_chunk
+from rsltrace.trace.mcap.chunk_builder import ChunkBody, rows_chunk
 from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, Damaged, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventFlag, EventKind, Output, OutputKind

@@ -55,7 +55,7 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.index import metadata_checksum
 from rsltrace.trace.mcap.buffered_writer import BufferedWriter
-from rsltrace.trace.mcap.chunk import PendingMessages, messages_chunk
+from rsltrace.trace.mcap.chunk_builder import PendingMessages, messages_chunk
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
 from rsltrace.trace.model.entity import Entity

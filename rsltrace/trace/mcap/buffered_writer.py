@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rsltrace.trace.mcap.chunk import ChunkBody
+from rsltrace.trace.mcap.chunk_builder import ChunkBody
 from rsltrace.trace.mcap.writer import McapWriter
 
 

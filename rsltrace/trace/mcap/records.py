@@ -10,24 +10,7 @@ import struct
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import numpy as np
 from mcap.opcode import Opcode
-
-# The header of an MCAP message for numpy; the same as ``MESSAGE_HEAD``.
-
-MESSAGE_HEADER_DTYPE = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel_id", "<u2"),
-        ("message_sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
-"""``message_sequence`` is MCAP's ``sequence``: messages have a field of that name, too, and share
-one layout with it."""
-
 
 # Limits on what is read from a file or a server. Anybody may have written it. The limits hold for
 # traces and bags, are far above real ones, and bound memory and time. ``docs/trace-format.md``

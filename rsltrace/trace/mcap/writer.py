@@ -34,7 +34,7 @@ from mcap.records import (
 
 from rsltrace.errors import OutputError
 from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
-from rsltrace.trace.mcap.chunk import ChunkBody
+from rsltrace.trace.mcap.chunk_builder import ChunkBody
 from rsltrace.trace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
 from rsltrace.trace.mcap.sink import Sink
 

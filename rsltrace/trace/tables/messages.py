@@ -46,7 +46,7 @@ def message_table(
     fields: Sequence[str] | None,
     type_name: str | None,
 ) -> TraceTable:
-    """Return the messages of a topic as a table. Raises TraceError if topic or field are unknown."""
+    """Return the messages of a topic as a table. Raises TraceError for unknown ones."""
     channel = _channel(trace, topic, type_name)
     try:
         decoder = decoder_of(channel)
