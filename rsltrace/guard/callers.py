@@ -50,7 +50,7 @@ def _kind_of(file: str) -> int:
     if file.startswith(_HERE) or any(
         f"{installed}{name}{os.sep}" in file for installed in INSTALLED for name in _MIDDLEWARE
     ):
-        return OURS  # rclpy, too: what it looks at is not the user's doing
+        return OURS  # rclpy, too: its calls are not the user's
     if is_library(file):
         return _LIBRARY
     if is_installed(file):

@@ -16,6 +16,7 @@ from functools import partial
 from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
+from rsltrace.guard.addresses import reported_hashes
 from rsltrace.guard.call_reports import reported_calls
 from rsltrace.guard.callers import is_never_user_code, module_of
 from rsltrace.guard.frames import caller, replace_special_method
@@ -28,7 +29,6 @@ from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import virtual_clocks
-from rsltrace.guard.virtual.object_hashes import reported_hashes
 from rsltrace.guard.virtual.processors import virtual_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
@@ -234,7 +234,7 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         if is_never_user_code(frame):
             return real()
         mode = guard.mode(Source.PID, frame)
-        shown = module_of(frame) == _LOGGING  # which notes it in every record, whoever logs
+        shown = module_of(frame) == _LOGGING  # which puts it into every record
         if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
             if not shown:
                 guard.count_call(Source.PID, _CALL, frame)

@@ -33,7 +33,7 @@ _GENERIC = (types.GenericAlias, types.UnionType)
 _FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}
 """Types of running code, and the attribute with their variables."""
 _BUILT_IN = (types.BuiltinMethodType, types.MethodWrapperType)
-_address = object.__hash__  # as id(), but no audit hook is told of it
+_address = object.__hash__  # like id(), without an audit event
 
 
 class ObjectNumbers:

@@ -99,7 +99,7 @@ def _start_again(changes: Mapping[str, str | None]) -> None:
     environment = {**os.environ, **changes}
     kept = {name: value for name, value in environment.items() if value is not None}
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # closed by whoever started us
+        if stream is not None:  # closed by the parent process
             stream.flush()
     try:
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], kept)

@@ -137,8 +137,8 @@ class RecordedAnswers:
         if kept:
             return kept.popleft()
         raise GuardError(
-            f"{self._trace} has no further answer to {call} of {node or 'the run'}: this run asks "
-            "more often than the recorded one did, so its code, job or data have changed; compare "
+            f"{self._trace} has no further answer to {call} of {node or 'the run'}: this run calls "
+            "it more often than the recorded one, so code, job or data have changed; compare "
             "the two with rsltrace diff"
         )
 

@@ -223,6 +223,6 @@ _kept: list[_MethodDef] = []
 
 def _unknown_layout() -> SetupError:
     return SetupError(
-        f"Python {sys.version.split()[0]} ({sys.implementation.name}) keeps its functions in a way "
+        f"Python {sys.version.split()[0]} ({sys.implementation.name}) has a layout of functions "
         "that the guard does not know; write 'guard: false' in the job to record without it"
     )

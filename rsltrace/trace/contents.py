@@ -111,7 +111,7 @@ class _ChannelContents:
     hashes: array[int] = field(default_factory=lambda: array("Q"))
     as_logs: array[int] = field(default_factory=lambda: array("Q"))
     stamps: array[int] = field(default_factory=lambda: array("Q"))
-    told: int = 0
+    referenced: int = 0
     """The number of them that outputs refer to."""
 
 
@@ -140,11 +140,11 @@ def check_contents(trace: Trace) -> None:
     if not trace.complete:
         return  # what events that were never written had to do with may be there
     for channel_id, found in messages.items():
-        if found.told != len(found.hashes):
+        if found.referenced != len(found.hashes):
             raise _changed_error(
                 trace,
                 f"{len(found.hashes)} messages on {trace.channels[channel_id].topic} are there, "
-                f"and its events speak of {found.told}",
+                f"and its events refer to {found.referenced}",
             )
     if extra := trace.entities.keys() - entities - {0}:
         raise _changed_error(trace, f"no event has made its entity {min(extra)}")
@@ -201,7 +201,7 @@ def _check_messages(
             f"message {int(numbers[at])} on {channel.topic} is not the one that event "
             f"{int(outputs['event'][at])} sent",
         )
-    found.told += len(numbers)
+    found.referenced += len(numbers)
 
 
 def _topic_of(output: Output, sender: Entity) -> tuple[str, str]:

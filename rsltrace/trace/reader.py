@@ -94,29 +94,29 @@ def check_records(source: ByteSource, index: TraceIndex) -> None:
 
     A checksum may cover bytes that are no MCAP file, and sequential readers see no summary.
     """
-    told = McapSummary()
+    summary = McapSummary()
     try:
         for opcode, span in walk_records(source, len(MAGIC), index.summary_start):
             if opcode in _DEFINITIONS:
-                _add_unique(told, opcode, read_body(source, span, opcode))
+                _add_unique(summary, opcode, read_body(source, span, opcode))
     except Damaged as error:
         raise damage_error(source, 0, "the data section", error) from error
     found = TraceIndex(complete=True, header=index.header)
-    found.take(told)
+    found.take(summary)
     if found.channels != index.channels:
         raise damage_error(
             source, index.summary_start, "the summary", "its channels are not those before it"
         )
 
 
-def _add_unique(told: McapSummary, opcode: int, body: bytes) -> None:
+def _add_unique(summary: McapSummary, opcode: int, body: bytes) -> None:
     """Add a channel or schema. Raises Damaged if its id has another definition."""
     if opcode == Opcode.SCHEMA:
         schema = parse_schema(body)
-        is_only = told.schemas.setdefault(schema.id, schema) == schema
+        is_only = summary.schemas.setdefault(schema.id, schema) == schema
     else:
         channel = parse_channel(body)
-        is_only = told.channels.setdefault(channel.id, channel) == channel
+        is_only = summary.channels.setdefault(channel.id, channel) == channel
     if not is_only:
         raise Damaged("a channel or schema is defined twice, in two ways")
 

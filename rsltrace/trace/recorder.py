@@ -43,17 +43,17 @@ class Recorder:
         """The digest of the run so far: the chain hash of the last event."""
         return f"{self.chain_hash:016x}"
 
-    def tell(self, told: Sequence[Callable[[int, int, int], None]]) -> None:
+    def tell(self, observers: Sequence[Callable[[int, int, int], None]]) -> None:
         """Call each observer with kind, entity and content hash of every output from now on."""
         add_output = self.writer.add_output
-        if not told:
+        if not observers:
             self.add_output = add_output
             return
 
         def tell(packed: bytes) -> None:
             add_output(packed)
             content_hash, entity, kind = OUTPUT_CONTENT.unpack(packed)
-            for one in told:
+            for one in observers:
                 one(kind, entity, content_hash)
 
         self.add_output = tell

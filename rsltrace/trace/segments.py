@@ -214,7 +214,7 @@ class SegmentReader:
             size_max = int(row["events"]) * EVENT_MESSAGE_DTYPE.itemsize
             events = events_in(read_chunk(self._source, span, size_max), self._event_channel)
             if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
-                raise Damaged("it is not the one the index speaks of")
+                raise Damaged("it is not the chunk of the index")
             check_numbered(events, int(row["first_event"]))
         except Damaged as error:
             raise damage_error(self._source, span.offset, "the events chunk", error) from error
@@ -237,7 +237,7 @@ class SegmentReader:
                 or owners[-1] >= first + int(row["events"])
                 or (owners[1:] < owners[:-1]).any()
             ):
-                raise Damaged("it is not the one the index speaks of")
+                raise Damaged("it is not the chunk of the index")
         except Damaged as error:
             raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs

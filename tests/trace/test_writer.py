@@ -57,7 +57,9 @@ def test_force_replaces_a_longer_file(tmp_path: Path) -> None:
 def test_force_replaces_nothing_but_traces(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "job.yaml"
     path.write_bytes(content)
-    with pytest.raises(OutputError, match=r"job\.yaml: what is there is no trace \(it is not MCAP"):
+    with pytest.raises(
+        OutputError, match=r"job\.yaml: the existing file is not a trace \(not MCAP"
+    ):
         TraceWriter(path, force=True)
     assert path.read_bytes() == content
 

@@ -124,4 +124,4 @@ def show_original(name: str, stack: ExitStack) -> None:
     try:
         _READERS[name](name, stack)
     except (AttributeError, KeyError):
-        pass  # a version that does it otherwise
+        pass  # another version

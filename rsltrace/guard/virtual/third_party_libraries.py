@@ -18,12 +18,12 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.frames import caller, exchange
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
-from rsltrace.guard.virtual.object_hashes import hash_method
 from rsltrace.guard.virtual.set_order import in_set_order
 from rsltrace.guard.virtual.user_modules import rewrite
 
@@ -112,7 +112,7 @@ def plain_in_graphs() -> None:
     """Let torch's compiler, which is loaded, see plain Python where modules call the guard."""
     substitute = getattr(sys.modules[COMPILES], "substitute_in_graph", None)
     if substitute is None or substitute in _known:
-        return  # a torch that does it otherwise; or it is told already, and for good
+        return  # another version of torch, or done already
     _known.append(substitute)
     for function, meant in _PLAIN_FUNCTIONS.items():
         substitute(function)(meant)
@@ -131,7 +131,7 @@ def rewritten_in_pytest(stack: ExitStack) -> None:
     module: Any = sys.modules[REWRITES]
     names = ("rewrite_asserts", "_read_pyc", "_write_pyc")
     if not all(hasattr(module, name) for name in names):
-        return  # a pytest that does it otherwise
+        return  # another version of pytest
     real = module.rewrite_asserts
 
     def rewrite_asserts(tree: ast.Module, source: bytes, path: Any = None, *more: Any) -> None:
@@ -307,7 +307,7 @@ class _TbbThreads:
             if not is_user_file(file) or not _has_traces(file):
                 _without.add(file)
                 return
-        self._report(os.path.basename(file), "its functions are hidden, so its threads stay many")
+        self._report(os.path.basename(file), "its functions are hidden, so it keeps its threads")
 
     def _finds(self, file: str, handle: int | None) -> bool:
         with suppress(OSError):  # a file that is gone, or that is not for opening: the linker's own

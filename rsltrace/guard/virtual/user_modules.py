@@ -16,11 +16,11 @@ from functools import partial
 from types import CodeType, ModuleType
 from typing import Any
 
+from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
 from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
-from rsltrace.guard.virtual.object_hashes import hash_method
 from rsltrace.guard.virtual.original_code import keep_source
 from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
 

@@ -255,7 +255,7 @@ def _check_replaceable(path: Path) -> None:
         return  # creating it says what is wrong
     if not MAGIC.startswith(begin):
         raise OutputError(
-            f"cannot write the trace {path}: what is there is no trace (it is not MCAP); "
+            f"cannot write the trace {path}: the existing file is not a trace (not MCAP); "
             "remove it yourself, or choose another place with -o"
         )
     if not free:

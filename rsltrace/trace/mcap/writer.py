@@ -261,7 +261,7 @@ class McapWriter:
         channel_id = len(self._summary.channels) + 1
         if channel_id > CHANNELS_MAX:
             raise OutputError(
-                f"{self._sink.path}: {topic} is one topic too many: a trace has room for "
+                f"{self._sink.path}: {topic} is one topic too many: a trace can hold "
                 f"{CHANNELS_MAX}; leave topics out (record: in the job)"
             )
         schema_id = self._schema_ids.get((type_name, schema_text))

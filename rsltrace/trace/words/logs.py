@@ -49,7 +49,7 @@ def silent_topics(entities: Iterable[Entity]) -> str:
         topic, listeners = silent[0]
         verb = "listen" if len(listeners) > 1 else "listens"
         return f"nobody publishes {printable(topic)}, which {_and(list(listeners))} {verb} to"
-    return f"nobody publishes what is listened to: {_names_text(silent, 'topics')}"
+    return f"topics without a publisher: {_names_text(silent, 'topics')}"
 
 
 def without_server(entities: Iterable[Entity]) -> str:
@@ -77,14 +77,14 @@ def without_server(entities: Iterable[Entity]) -> str:
         name, clients = missing[0]
         verb = "are clients" if len(clients) > 1 else "is a client"
         return f"nobody serves {printable(name)}, of which {_and(list(clients))} {verb}"
-    return f"nobody serves what there are clients of: {_names_text(missing, 'services')}"
+    return f"services without a server: {_names_text(missing, 'services')}"
 
 
 def _names_text(found: list[tuple[str, dict[str, None]]], what: str) -> str:
     """Return ``/a (for /x), /b (for /y) and 2 more topics``."""
-    told = [f"{printable(name)} (for {_and(list(whom))})" for name, whom in found[:_NAMED_MAX]]
+    texts = [f"{printable(name)} (for {_and(list(whom))})" for name, whom in found[:_NAMED_MAX]]
     more = len(found) - _NAMED_MAX
-    return f"{', '.join(told)}{f' and {more} more {what}' if more > 0 else ''}"
+    return f"{', '.join(texts)}{f' and {more} more {what}' if more > 0 else ''}"
 
 
 def _and(names: list[str]) -> str:
