@@ -307,7 +307,7 @@ class _TbbThreads:
             if not is_user_file(file) or not _has_traces(file):
                 _without.add(file)
                 return
-        self._report(os.path.basename(file), "its functions are hidden, so it keeps its threads")
+        self._report(os.path.basename(file), "its functions are hidden, so its threads stay many")
 
     def _finds(self, file: str, handle: int | None) -> bool:
         with suppress(OSError):  # a file that is gone, or that is not for opening: the linker's own

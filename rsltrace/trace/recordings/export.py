@@ -45,8 +45,8 @@ def check_bag_folder(folder: Path, *, force: bool) -> None:
         raise OutputError(f"cannot write the bag {folder}: it exists; use {force_it} to replace it")
     if not folder.is_dir() or (any(folder.iterdir()) and not (folder / NAME).is_file()):
         raise OutputError(
-            f"cannot write the bag {folder}: the existing folder is not a bag (no {NAME} in it), so "
-            "--force does not replace it; choose another name"
+            f"cannot write the bag {folder}: the existing folder is not a bag (no {NAME} in it), "
+            "so --force does not replace it; choose another name"
         )
 
 
