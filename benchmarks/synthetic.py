@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rsltrace.trace import chunks
+from rsltrace.trace import segments
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import (
     CDR_HEADER,
@@ -43,7 +43,7 @@ class BulkWriter(TraceWriter):
         """Write the next events (EVENT_DTYPE) with their outputs (OUTPUT_DTYPE)."""
         stream = self._stream
         outputs_at = stream.chunk(
-            chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
+            segments.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
         )
         row = np.zeros(1, dtype=SEGMENT_DTYPE)
         row["first_event"], row["events"] = self._events_written, len(events)
@@ -51,7 +51,7 @@ class BulkWriter(TraceWriter):
         row["chain_hash"] = self._last_chain_hash = int(events["chain_hash"][-1])
         row["start_stamp"], row["end_stamp"] = events["stamp"].min(), events["stamp"].max()
         row["outputs_offset"], row["outputs_length"] = outputs_at
-        at = stream.chunk(chunks.events_chunk(events, self._event_channel))
+        at = stream.chunk(segments.events_chunk(events, self._event_channel))
         row["events_offset"], row["events_length"] = at
         self._segments.append(row.tobytes())
         self._events_written += len(events)

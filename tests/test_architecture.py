@@ -108,9 +108,9 @@ def test_one_place_writes_to_the_terminal() -> None:
 def test_files_that_the_guard_knows_by_their_path_are_there() -> None:
     from rsltrace.guard import callers
 
-    for file in (callers._CALLS_BACK, callers._THREADS, *callers._STANDS_IN):
+    for file in (callers._CALLS_BACK, callers._THREADS, *callers._REPLACEMENTS):
         assert Path(file).is_file()
-    assert Path(callers._DOOR).is_dir()
+    assert Path(callers._ADAPTER).is_dir()
 
 
 def parsed() -> dict[str, ast.Module]:

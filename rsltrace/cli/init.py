@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.output.text_file import undone, write_text
+from rsltrace.cli.output.text_file import write_text
 from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
 from rsltrace.terminal import tell
@@ -69,12 +69,7 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     has_schema = schema.exists()
     if not has_schema:
         write_text(schema, schema_text() + "\n")
-    try:
-        with job.open("x", encoding="utf-8") as file, undone(job):
-            file.write(text)
-            file.flush()
-    except OSError as error:
-        raise OutputError(f"{job} cannot be written: {error.strerror or error}") from error
+    write_text(job, text)
     from rsltrace.job import load_job
 
     if sources:

@@ -1,5 +1,5 @@
-"""Sources of nondeterminism: made deterministic where possible, found and reported where not.
+"""The guard: makes calls in nodes deterministic where it can, and reports or records the others.
 
-Knows neither ROS nor files of ours: a run gives it a ``Context`` to ask for time, node and event,
-and a function that takes findings.
+It knows neither ROS nor trace files. A run gives it a ``SimulationContext``, which knows time, node
+and event, and a function that takes findings.
 """

@@ -1,10 +1,13 @@
-"""Addresses of objects, where a program can see them: in hashes and in texts."""
+"""Addresses of objects where a program can see them: in hashes and in texts."""
 
 from __future__ import annotations
 
 import os
 import re
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import (
     BuiltinMethodType,
     FrameType,
@@ -13,68 +16,122 @@ from types import (
     MethodWrapperType,
     UnionType,
 )
+from typing import Any
 from weakref import ReferenceType, WeakSet
 
-from rsltrace.guard.frames import code_of
+from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import Source
 
+# Hashes made of object addresses: reported when code asks for one.
+#
+# Sets and dictionaries ask for them, too, but show none.
+
+_of_object = object.__hash__
+
+
+def _report_hash(obj: object, value: int, frame: FrameType) -> int:
+    """Report a hash that code asked for, if it contains addresses."""
+    guard = engaged()
+    if guard is not None and has_address_hash(obj):
+        if code_of(frame).co_name == "__hash__":
+            note_address_hash(frame)  # matters when a set of such objects is iterated
+        elif guard.is_user(frame):
+            kind = type(obj).__qualname__
+            guard.report_user_call(Source.ADDRESS, f"hash() of {kind}", value, frame)
+    return value
+
+
+def _hashing(real: Callable[[Any], int]) -> Any:
+    def hash_of(obj: Any, /) -> int:
+        return _report_hash(obj, real(obj), caller())
+
+    return hash_of
+
+
+def _objects_hash(obj: Any, /) -> int:
+    return _report_hash(obj, _of_object(obj), caller())
+
+
+def _bound_hash(real: Callable[[], int], /) -> int:
+    return _report_hash(real.__self__, real(), caller())  # type: ignore[attr-defined]
+
+
+def hash_method(owner: Any) -> Any:
+    """Return ``owner.__hash__``, or a function that does the same and reports it."""
+    real = owner.__hash__
+    if real is _of_object:
+        return _objects_hash
+    return partial(_bound_hash, real) if type(real) is MethodWrapperType else real
+
+
+@contextmanager
+def reported_hashes() -> Iterator[None]:
+    """Report the results of the built-in ``hash``."""
+    with ExitStack() as stack:
+        redirect(stack, hash, _hashing)
+        yield
+
+
 _ADDRESS = re.compile(r"\S* at 0x(?!52[0-9a-f]{10}\b)[0-9a-f]{6,}")
-"""An address in a text; not what the guard shows in place of one."""
+"""An address in a text; the numbers that the guard shows instead begin with 0x52."""
 _ALIKE = object.__hash__
 _SEEDED = os.environ.get("PYTHONHASHSEED", "random") == "random"
 _OF_PARTS = (tuple.__hash__, frozenset.__hash__)
-"""What makes a hash of those of its elements; types that are derived have them, too."""
+"""Hash methods that combine the hashes of the elements; subclasses inherit them."""
 _POINTING = frozenset((BuiltinMethodType, GenericAlias, MethodType, MethodWrapperType, UnionType))
-"""Types that make hashes of addresses in a way of their own."""
+"""Types whose own hash methods use addresses."""
 _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
-"""What a method that makes a hash of an address has among its names."""
+"""Names in the code of a method that makes a hash of an address."""
 
 
-def is_by_address(thing: object) -> bool:
+def has_address_hash(obj: object) -> bool:
     """Return whether an object's hash differs from process to process."""
-    kind = type(thing)
+    kind = type(obj)
     if kind in (int, float, bool, complex):
         return False
     if kind in (str, bytes):
         return _SEEDED
-    if thing is None:
+    if obj is None:
         return sys.version_info < (3, 12)
     method = getattr(kind, "__hash__", None)
     if method in _OF_PARTS:
-        return any(map(is_by_address, thing))  # type: ignore[call-overload]
-    if isinstance(thing, ReferenceType):
-        return is_by_address(thing())
+        return any(map(has_address_hash, obj))  # type: ignore[call-overload]
+    if isinstance(obj, ReferenceType):
+        return has_address_hash(obj())
     if method is _ALIKE or kind in _POINTING or kind in _by_address:
         return True
     return not _TAKING.isdisjoint(getattr(getattr(method, "__code__", None), "co_names", ()))
 
 
-def hashed_by_address(frame: FrameType) -> None:
-    """Remember of the ``__hash__`` method that runs in ``frame`` that addresses are in its hash."""
+def note_address_hash(frame: FrameType) -> None:
+    """Remember that the ``__hash__`` method which runs in ``frame`` uses addresses."""
     names = code_of(frame).co_varnames
     if names and code_of(frame).co_argcount:
         _by_address.add(type(frame.f_locals.get(names[0])))
 
 
 _by_address: WeakSet[type] = WeakSet()
-"""Types whose hashes are made of those of objects that are hashed by address."""
+"""Types whose hashes include those of objects that are hashed by address."""
 
 
 def text_with_address(text: str) -> None:
-    """Report a text for others to see in which an object's address stands."""
+    """Report a text for others to read that contains an object's address."""
     guard = engaged()
     if guard is not None:
         match = _ADDRESS.search(text)
         if match is not None:
-            report_here(guard, Source.ADDRESS, "an address in a log record", match.group())
+            report_from_middleware(
+                guard, Source.ADDRESS, "an address in a log record", match.group()
+            )
 
 
-def report_here(guard: Guard, source: Source, call: str, value: str) -> None:
-    """Report something that user code did through our own middleware."""
+def report_from_middleware(guard: Guard, source: Source, call: str, value: str) -> None:
+    """Report something that user code did through rsltrace's middleware."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:
         if guard.is_user(frame):
-            guard.watched(source, call, value, frame)
+            guard.report_user_call(source, call, value, frame)
             return
         frame = frame.f_back

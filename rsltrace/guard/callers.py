@@ -1,4 +1,4 @@
-"""Whose call is it? The user's code is told from libraries, Python's own modules and ourselves."""
+"""Who makes a call: the user's code, a library, Python's own modules, or rsltrace."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ _MIDDLEWARE = ("rclpy", "rpyutils", "ament_index_python", "rosidl_parser", "rosi
 _LINES_MAX = 6
 
 USER, OURS, STANDARD, _PACKAGE, _LIBRARY, _IMPORT = range(6)
-"""Whose a file is: the user's (a ``_PACKAGE`` is installed), Python's, a library's, rclpy's or
-ours, or a part of importing."""
+"""Who owns a source file: the user, rclpy or rsltrace (``OURS``), Python (``STANDARD``), the user
+as an installed package, a library, or the import system."""
 
-_DOOR = os.path.join(_HERE, "adapters", "rclpy")
+_ADAPTER = os.path.join(_HERE, "adapters", "rclpy")
 _CALLS_BACK = os.path.join(_HERE, "simulation", "middleware", "events", "dispatcher.py")
-"""The one of our files that calls callbacks; rclpy's own do, too."""
-_THREADS = os.path.join(_DOOR, "stacks", "threads.py")
-_STANDS_IN = (
-    os.path.join(_DOOR, "stacks", "asyncio_loops.py"),
-    os.path.join(_DOOR, "terminals", "calls.py"),
+"""The only file of rsltrace that calls callbacks; rclpy's own files do, too."""
+_THREADS = os.path.join(_ADAPTER, "stacks", "threads.py")
+_REPLACEMENTS = (
+    os.path.join(_ADAPTER, "stacks", "asyncio_loops.py"),
+    os.path.join(_ADAPTER, "terminals", "calls.py"),
 )
-"""Parts of asyncio, os and select, as far as it matters who called whom."""
+"""Replacements of parts of asyncio, os and select: their callers count."""
 
 
-class _Kinds(dict[str, int]):
-    """Whose files are, by name."""
+class _FileKinds(dict[str, int]):
+    """The owners of source files, by file name."""
 
     def __missing__(self, file: str) -> int:
-        """Find out and remember it."""
+        """Determine the owner and remember it."""
         kind = self[file] = _kind_of(file)
         return kind
 
@@ -45,12 +45,12 @@ class _Kinds(dict[str, int]):
 def _kind_of(file: str) -> int:
     if file.startswith("<frozen importlib"):
         return _IMPORT
-    if file.startswith(_GUARD) or file in _STANDS_IN:
+    if file.startswith(_GUARD) or file in _REPLACEMENTS:
         return STANDARD  # a redirected function: its caller counts
     if file.startswith(_HERE) or any(
         f"{installed}{name}{os.sep}" in file for installed in INSTALLED for name in _MIDDLEWARE
     ):
-        return OURS  # rclpy, too: what it looks at is not the user's doing
+        return OURS  # rclpy, too: its calls are not the user's
     if is_library(file):
         return _LIBRARY
     if is_installed(file):
@@ -58,45 +58,45 @@ def _kind_of(file: str) -> int:
     return STANDARD if file.startswith(("<frozen", *_PYTHON)) else USER
 
 
-KINDS = _Kinds()
-"""Whose each source file is; calls that are made often look here themselves."""
+KINDS = _FileKinds()
+"""The owner of each source file; hot paths look here directly."""
 
 
 def is_installed(file: str) -> bool:
-    """Whether a file lies among what is installed, be it a library's or the user's."""
+    """Return whether a file is of an installed package, a library's or the user's."""
     return any(part in file for part in INSTALLED)
 
 
-def _calls_back(file: str) -> bool:
+def _is_dispatcher(file: str) -> bool:
     if file.startswith(_HERE):
         return file == _CALLS_BACK
     return f"{os.sep}rclpy{os.sep}" in file
 
 
 def is_own(module: str) -> bool:
-    """Return whether a module is rsltrace's, which may lie in a folder of user code."""
+    """Return whether a module is rsltrace's; it may lie in a folder of user code."""
     return module.partition(".")[0] in ("rsltrace", "rsltrace_viewer")
 
 
 def is_user_file(file: str) -> bool:
-    """Return whether a source file is neither Python's nor a library's nor ours."""
+    """Return whether a source file is the user's."""
     return KINDS[file] in (USER, _PACKAGE)
 
 
 def is_telling(file: str) -> bool:
-    """Return whether a source file is of the user's code or of what that uses: neither Python's,
-    nor rclpy's, nor ours."""
+    """Return whether a source file is the user's or a library's, not Python's, rclpy's or
+    rsltrace's."""
     return KINDS[file] in (USER, _PACKAGE, _LIBRARY)
 
 
-def is_of_python(frame: FrameType) -> bool:
-    """Return whether a frame is one of Python's own modules (or of the guard)."""
+def is_python_frame(frame: FrameType) -> bool:
+    """Return whether a frame is of Python's own modules, or of the guard."""
     return KINDS[code_of(frame).co_filename] == STANDARD
 
 
-def is_nobodys(frame: FrameType | None) -> bool:
-    """Return whether it is seen at once that ``user_frame`` is None: rclpy, rsltrace or an import
-    asks, by way of Python's own modules at most."""
+def is_never_user_code(frame: FrameType | None) -> bool:
+    """Return whether ``user_frame`` is certainly None, as far as a quick look tells: rclpy,
+    rsltrace or an import calls, directly or through Python's own modules."""
     while frame is not None:
         file = code_of(frame).co_filename
         kind = KINDS[file]
@@ -107,12 +107,12 @@ def is_nobodys(frame: FrameType | None) -> bool:
 
 
 def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
-    """Return the innermost frame of user code that led to ``frame``, or None if none did.
+    """Return the innermost frame of user code that led to ``frame``, or None.
 
-    User code is what is neither Python's nor a library's, or in ``packages`` (where nodes are), and
-    a callback in a library. What an installed package does while it is imported is not the user's
-    doing, nor is what rsltrace and rclpy do for themselves. A thread is the doing of whoever
-    started it, even if it runs nothing but Python's own code.
+    User code is any file that is neither Python's nor a library's, any module in ``packages``
+    (where nodes are), and a callback in a library. What an installed package does while it is
+    imported does not count, nor what rsltrace and rclpy do for themselves. A thread counts as the
+    work of the code that started it, even if it runs only Python's own code.
     """
     installed = library = standard = None
     while frame is not None:
@@ -123,8 +123,8 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
         if kind == OURS:
             if file == _THREADS:
                 return installed or library or standard
-            return installed or (library and (library if _calls_back(file) else None))
-        if packages and (_tops.get(file) or _top_of(frame, file)) in packages:
+            return installed or (library and (library if _is_dispatcher(file) else None))
+        if packages and (_packages_by_file.get(file) or _package_of(frame, file)) in packages:
             return installed or frame
         if kind == _LIBRARY:
             library = frame
@@ -139,7 +139,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
 
 
 def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
-    """Return whether something that is installed is being imported, rather than user code run."""
+    """Return whether an installed package is being imported, rather than user code run."""
     while frame is not None:
         kind = KINDS[code_of(frame).co_filename]
         if kind in (USER, OURS):
@@ -155,18 +155,17 @@ def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
 def is_in(frame: FrameType, packages: frozenset[str]) -> bool:
     """Return whether a frame's module is in one of the packages."""
     file = code_of(frame).co_filename
-    top = _tops.get(file)
-    return (_top_of(frame, file) if top is None else top) in packages
+    top = _packages_by_file.get(file)
+    return (_package_of(frame, file) if top is None else top) in packages
 
 
-_tops: dict[str, str] = {}
-"""The packages that files belong to."""
+_packages_by_file: dict[str, str] = {}
 
 
-def _top_of(frame: FrameType, file: str) -> str:
+def _package_of(frame: FrameType, file: str) -> str:
     top = module_of(frame).partition(".")[0]
     if top != "__main__":  # a program in this run, perhaps a module in the next
-        _tops[file] = top
+        _packages_by_file[file] = top
     return top
 
 
@@ -175,7 +174,7 @@ def module_of(frame: FrameType) -> str:
     return str(frame.f_globals.get("__name__", ""))
 
 
-def stack_of(frame: FrameType | None, packages: frozenset[str]) -> str:
+def user_stack(frame: FrameType | None, packages: frozenset[str]) -> str:
     """Return the lines of user code from ``frame`` outwards, without paths of this machine."""
     lines: list[str] = []
     while frame is not None and len(lines) < _LINES_MAX:

@@ -1,4 +1,4 @@
-"""What the guard asks of the simulation, whose code it does not know."""
+"""What the guard asks of the simulation, and what it keeps for one run: pace and random streams."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from typing import Any, Protocol
 from rsltrace.guard.redirect import copy_of
 from rsltrace.trace.model.finding import Policy
 
-# How fast simulated time passes while somebody waits for what is outside: as fast as real time.
+# Simulated time passes as fast as real time while code waits for something outside of the run.
 
 STEP_NS = 1_000_000
 _IN_A_ROW_MAX = 20
 _LAG_NS_MAX = 100_000_000
-"""A run that is slow catches up; but one that computed for minutes has not waited for minutes."""
+"""A slow run catches up, but minutes of computing do not count as minutes of waiting."""
 
 _real_ns = copy_of(time.monotonic_ns)  # type: ignore[arg-type]
 
 
 class RealTimePace:
-    """Tells how far simulated time has got ahead of real time since somebody began to wait."""
+    """How far simulated time is ahead of real time since code began to wait."""
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
@@ -29,7 +29,7 @@ class RealTimePace:
         """How many waits in a row ended at once, because the answer was there already."""
 
     def is_greedy(self) -> bool:
-        """Count one more such answer; return whether it is time to let others go on."""
+        """Count one more answer that was there at once; return whether others should run now."""
         self.in_a_row += 1
         if self.in_a_row < _IN_A_ROW_MAX:
             return False
@@ -37,7 +37,7 @@ class RealTimePace:
         return True
 
     def ahead_s(self, now_ns: int) -> float:
-        """Return how many seconds to wait for real before simulated time may go on."""
+        """Return how many real seconds to wait before simulated time may go on."""
         real_ns: int = _real_ns()
         if self._offset_ns is None:
             self._offset_ns = now_ns - real_ns
@@ -50,15 +50,14 @@ class RealTimePace:
         return max(ahead_ns, 0) / 1e9
 
 
-# Random generators by name: each node draws from its own, so one more node changes nothing.
+# Each node draws from its own random generators, so adding a node does not change the others.
 
 
 class RandomStreams:
-    """The generators of one run, by name: made when first used, seeded by the job's seed."""
+    """The random generators of one run, by node; made when first used from the job's seed."""
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
-        """The job's."""
         self._random: dict[str, Random] = {}
         self._entropy: dict[str, Random] = {}
         self._numpy: dict[str, Any] = {}
@@ -77,7 +76,7 @@ class RandomStreams:
         return f"{self.seed} {entropy}" if entropy else str(self.seed)
 
     def random(self, name: str) -> Random:
-        """Return the stand-in for the generator behind ``random``'s functions."""
+        """Return the generator behind ``random``'s functions for a node."""
         found = self._random.get(name)
         if found is None:
             found = self._random[name] = Random(f"random {self._seed_of(name)} {name}")
@@ -91,7 +90,7 @@ class RandomStreams:
         return found.randbytes(size)
 
     def numpy(self, name: str) -> Any:
-        """Return the stand-in for the generator behind ``numpy.random``'s functions."""
+        """Return the generator behind ``numpy.random``'s functions for a node."""
         found = self._numpy.get(name)
         if found is None:
             import numpy as np
@@ -101,41 +100,41 @@ class RandomStreams:
         return found
 
 
-class Context(Protocol):
+class SimulationContext(Protocol):
     """What a guard asks of the simulation."""
 
     direct: tuple[Any, Any] | None
-    """Where all clocks show simulated time: what has that (``now_ns``) and the index of the event
-    under way (``events``), and what has the node whose code runs (``node``, if any, and its
-    ``key``). Looking there oneself takes a fraction of asking ``look`` or ``node``."""
+    """The objects that hold simulated time and the index of the current event (``now_ns``,
+    ``events``) and the running node (``node``, with ``key``); None where a node's clocks differ.
+    Reading them is much cheaper than ``look`` and ``node``."""
 
     def now_ns(self) -> int:
         """Return simulated time."""
 
     def look(self) -> tuple[int, str, int]:
-        """Return the index of the event under way, the node and simulated time."""
+        """Return the index of the current event, the node and simulated time."""
 
     def node(self) -> str:
         """Return the node whose code runs, or an empty text."""
 
     def process(self) -> int:
-        """Return which of the run's processes that is: 0 has the nodes that the job constructs,
-        the mains count from 1 in the order of the job."""
+        """Return the number of the running process: 0 for nodes that the job constructs, then the
+        mains from 1, in the order of the job."""
 
     def policy(self) -> Policy | None:
         """Return the policy of that node, or None for the job's."""
 
     def place(self) -> tuple[int, int]:
-        """Return the index of the event under way and the entity that runs."""
+        """Return the index of the current event and the entity that runs."""
 
     def pass_time(self, for_ns: int) -> None:
-        """Let simulated time pass, if whoever runs can wait."""
+        """Let simulated time pass, if the running code can wait."""
 
     def is_aside(self) -> bool:
-        """Return whether others can go on while whoever runs waits for what is outside."""
+        """Return whether others can run while the running code waits for something outside."""
 
     def can_step(self) -> bool:
-        """Return whether whoever runs can wait in simulated time at all."""
+        """Return whether the running code can wait in simulated time at all."""
 
     def step(self, for_ns: int) -> None:
-        """Let simulated time pass while whoever runs waits for what is outside."""
+        """Let simulated time pass while the running code waits for something outside."""

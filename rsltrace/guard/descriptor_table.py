@@ -1,7 +1,7 @@
-"""Which sockets and file descriptors lead outside of the run, by a number that a re-run has, too.
+"""Numbers for sockets and file descriptors that lead outside of the run, the same in each re-run.
 
-The operating system's numbers differ from run to run. Those here are given in the order in which a
-run first uses its sockets and descriptors.
+The operating system's numbers differ from run to run. These are given in the order in which a run
+first uses its sockets and descriptors.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _Identity = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Descriptor:
-    """An open file descriptor whose answers are recorded. Of a folder, only what ``fstat`` says."""
+class RecordedDescriptor:
+    """An open file descriptor whose answers are recorded; of a folder only ``fstat``."""
 
     number: int
     source: Source
@@ -30,26 +30,26 @@ class Descriptor:
 
 
 class DescriptorTable:
-    """What one run has open. One that was closed behind our back is noticed by its inode."""
+    """The open descriptors of one run. A reused number is noticed by its inode."""
 
     def __init__(self) -> None:
         self.processes: set[int] = set()
-        """Processes that were started, or (in a re-run) were in the recorded one."""
-        self._open: dict[int, Descriptor] = {}
+        """Processes that the run started; in a re-run, those of the recorded run."""
+        self._open: dict[int, RecordedDescriptor] = {}
         self._far_ends: dict[int, tuple[_Identity, int]] = {}
         self._numbers: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
         self._last = 0
 
-    def add(self, fd: int, source: Source, *, is_folder: bool = False) -> Descriptor:
-        """Take note of a descriptor whose answers are to be recorded."""
+    def add(self, fd: int, source: Source, *, is_folder: bool = False) -> RecordedDescriptor:
+        """Register a descriptor whose answers are to be recorded."""
         found = self.find(fd)
         if found is None:
-            found = Descriptor(self._next(), source, _identity(fd), is_folder)
+            found = RecordedDescriptor(self._next(), source, _identity(fd), is_folder)
             self._open[fd] = found
         return found
 
-    def find(self, fd: object) -> Descriptor | None:
-        """Return what is known of a descriptor (or of something that has one)."""
+    def find(self, fd: object) -> RecordedDescriptor | None:
+        """Return the entry of a descriptor, or of an object that has one."""
         if not self._open:
             return None
         number = number_of(fd)
@@ -62,18 +62,18 @@ class DescriptorTable:
         return found
 
     def drop(self, fd: int) -> None:
-        """Forget a descriptor that is closed."""
+        """Forget a closed descriptor."""
         self._open.pop(fd, None)
         self._far_ends.pop(fd, None)
 
     def join(self, one: int, other: int) -> None:
-        """Take note of two ends of one pipe or of a pair of sockets."""
+        """Register two ends of one pipe or socket pair."""
         for fd, far in ((one, other), (other, one)):
             self._open.pop(fd, None)
             self._far_ends[fd] = (_identity(fd), far)
 
     def far_end(self, fd: int) -> int | None:
-        """Return the other end, if this is one end of a pipe or pair that the run has made."""
+        """Return the other end of a pipe or pair that the run made."""
         found = self._far_ends.get(fd)
         if found is None or _identity(fd) != found[0]:
             return None
@@ -85,7 +85,7 @@ class DescriptorTable:
         return far is None or self._far_ends.get(far, (None, 0))[0] != _identity(far)
 
     def inner_pairs(self) -> list[tuple[int, int]]:
-        """Return the pipes and pairs of sockets that the run has both ends of, each once."""
+        """Return the pipes and socket pairs with both ends in this process, each once."""
         pairs = ((fd, self.far_end(fd)) for fd in list(self._far_ends) if not self.leads_out(fd))
         return [
             (fd, far)
@@ -94,7 +94,7 @@ class DescriptorTable:
         ]
 
     def is_outside(self, fd: object) -> bool:
-        """Return whether a descriptor leads to somebody who is not part of the run."""
+        """Return whether a descriptor leads to something that is not part of the run."""
         if self.find(fd) is not None:
             return True
         number = number_of(fd)
@@ -104,11 +104,11 @@ class DescriptorTable:
             return False
         return is_socket and self.far_end(number) is None
 
-    def number(self, thing: Any) -> int:
-        """Return the number of an object that has no descriptor, or that may change it."""
-        found = self._numbers.get(thing)
+    def number(self, obj: Any) -> int:
+        """Return the number of an object without descriptor, or whose descriptor may change."""
+        found = self._numbers.get(obj)
         if found is None:
-            found = self._numbers[thing] = self._next()
+            found = self._numbers[obj] = self._next()
         return found
 
     def _next(self) -> int:
@@ -117,7 +117,7 @@ class DescriptorTable:
 
 
 def number_of(fd: object) -> int:
-    """Return the descriptor's number of whatever has one, or -1."""
+    """Return the number of a descriptor or of an object that has one, or -1."""
     if isinstance(fd, int):
         return fd
     try:

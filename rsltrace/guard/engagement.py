@@ -1,4 +1,4 @@
-"""Which guard is in charge of the calling thread, if any."""
+"""Which guard is engaged in the calling thread."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _engaged: list[Any] = []
 
 
 def engaged() -> Any:
-    """Return the guard in charge of the calling thread (and of no child process), or None."""
+    """Return the guard engaged in the calling thread (never in a child process), or None."""
     if _engaged:
         guard = _engaged[-1]
         if guard.thread == thread_id():
@@ -21,7 +21,7 @@ def engaged() -> Any:
 
 
 class engage:  # noqa: N801  (used like a function)
-    """Put ``guard`` in charge of what this thread does within (None: nobody)."""
+    """Engage ``guard`` in this thread for the block (None: no guard)."""
 
     __slots__ = ("_before", "_guard")
 

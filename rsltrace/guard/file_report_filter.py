@@ -1,4 +1,4 @@
-"""Which questions about files are news: not about what is installed, nor by who reads code."""
+"""Which file accesses are reported: not of installed files, nor by code that reads sources."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ _INSTALLED = (
     "/dev/tty",
     *TARGETS,
 )
-READERS_OF_CODE = {"linecache", "tokenize", "inspect", "traceback", "zipimport", "pkgutil"}
+SOURCE_READERS = {"linecache", "tokenize", "inspect", "traceback", "zipimport", "pkgutil"}
 _COMPILED = "/__pycache__/"
 _BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
-"""By way of which others ask the file system."""
+"""Modules through which others access the file system."""
 
-NOT_NEWS = frozenset(("logging", "threading", *READERS_OF_CODE))
-"""Modules that look at such things for records of their own."""
+UNREPORTED_MODULES = frozenset(("logging", "threading", *SOURCE_READERS))
+"""Modules that access files and the machine for their own records."""
 
 
-def asking_module(frame: FrameType) -> str | None:
-    """Return the name of the module that asks the file system, be it by way of ``os.path``."""
+def calling_module(frame: FrameType) -> str | None:
+    """Return the name of the module that accesses the file system, skipping ``os.path``."""
     name = frame.f_globals.get("__name__")
     while name in _BETWEEN and frame.f_back is not None:
         frame = frame.f_back
@@ -38,15 +38,15 @@ def asking_module(frame: FrameType) -> str | None:
     return name
 
 
-def is_resolving(frame: FrameType) -> bool:
-    """Return whether a path's links are followed: of a folder on the way nothing else counts."""
+def is_following_links(frame: FrameType) -> bool:
+    """Return whether a path's links are being followed; folders on the way do not count."""
     is_of_python = frame.f_globals.get("__name__") == "posixpath"
     return is_of_python and code_of(frame).co_name in ("realpath", "_joinrealpath")
 
 
-def is_installed(path: object) -> bool:
-    """Return whether a file is part of what is installed, whose versions a trace knows, or is made
-    of source code and kept beside it."""
+def is_installed_path(path: object) -> bool:
+    """Return whether a file is installed (the trace has its version) or compiled from source beside
+    it."""
     if not isinstance(path, (str, bytes, os.PathLike)):
         return False
     name = os.fsdecode(path)

@@ -1,8 +1,8 @@
-"""Who calls, asked without an audit event: those that Python makes of it cost more than the answer.
+"""Find the calling frame without raising Python's audit events.
 
 Once a process has an audit hook, ``sys._getframe`` and ``frame.f_code`` take 0.2 microseconds each.
-A generator's frame has its caller behind it whenever it runs, and CPython's own
-``PyFrame_GetCode`` asks nobody.
+The frame of a generator has its caller behind it, and CPython's ``PyFrame_GetCode`` raises no
+event.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from typing import Any
 
 from rsltrace.guard.redirect import method_of
 
-# Exchanging members of types of extension modules, which Python itself refuses.
+# Replace members of types of extension modules, which Python itself refuses.
 
 _WORDS_BEFORE = {"__repr__": 11, "__iter__": 27, "__init__": 37, "vectorcall": 50}
-"""Where a type of CPython keeps the functions that it calls itself, at least since 3.9; checked."""
+"""The offsets of a CPython type's slots, in words, at least since 3.9; checked."""
 _WORD = ctypes.sizeof(ctypes.c_void_p)
 
 
@@ -48,32 +48,36 @@ _BY_NAME = {
     for name in ("__repr__", "__iter__", "__init__")
     if _slot(object, name).value == _slot(_HasNone, name).value != _slot(_HasAll, name).value
 }
-"""What a type has there that looks for the method by its name."""
+"""What a slot holds if the type looks the method up by name."""
 
 
 def exchange(stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]) -> None:
-    """Exchange a member, if the type has it, for what ``make`` makes of it until ``stack`` ends."""
+    """Replace a member, if the type has it, by ``make(member)`` until ``stack`` ends."""
     real = kind.__dict__.get(name)
     if real is not None:
-        put_member(kind, name, make(real))
-        stack.callback(put_member, kind, name, real)
+        set_member(kind, name, make(real))
+        stack.callback(set_member, kind, name, real)
 
 
-def put_member(kind: type, name: str, value: object) -> None:
+def set_member(kind: type, name: str, value: object) -> None:
     """Set a member of a built-in type."""
     (members,) = gc.get_referents(kind.__dict__)
     members[name] = value
     ctypes.pythonapi.PyType_Modified(ctypes.py_object(kind))
 
 
-def exchange_special(stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]) -> None:
-    """Exchange in the same way a method that Python calls without looking for it by name: the type,
-    and all that have it from there, are told to look."""
+def replace_special_method(
+    stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]
+) -> None:
+    """Replace a method that Python calls without a lookup by name.
+
+    The type and all subclasses that inherit it are changed to look it up.
+    """
     slot, by_name = _slot(kind, name).value, _BY_NAME.get(name)
     if by_name is None or slot == by_name:
         return
     exchange(stack, kind, name, make)
-    for one in _all_below(kind):
+    for one in _subclasses_of(kind):
         if _slot(one, name).value == slot:
             _set_slot(stack, one, name, by_name)
     if name == "__init__" and _slot(_HasNone, "vectorcall").value is None:
@@ -86,8 +90,8 @@ def _set_slot(stack: ExitStack, kind: type, name: str, value: int | None) -> Non
     slot.value = value
 
 
-def _all_below(kind: type) -> set[type]:
-    """Return a type with all that are derived from it."""
+def _subclasses_of(kind: type) -> set[type]:
+    """Return a type with all its subclasses."""
     found, waiting = {kind}, [kind]
     while waiting:
         new: set[type] = set(type.__subclasses__(waiting.pop())) - found
@@ -103,22 +107,22 @@ def _callers() -> Iterator[Any]:
 
 
 next_caller = _callers().__next__
-"""Return the frame that called who calls this: half of what ``caller`` takes. To be called as an
-attribute of this module, and if it raises ``INTERRUPTED``, ``lost_caller`` instead."""
+"""Return the frame that called the caller, in half the time of ``caller``. Call it as an attribute
+of this module; if it raises ``INTERRUPTED``, call ``lost_caller`` instead."""
 
 INTERRUPTED = (ValueError, StopIteration)
-"""A signal came while another call was there, or its handler has raised."""
+"""A signal arrived during another call, or its handler raised."""
 
 
 def lost_caller() -> FrameType:
-    """Return what ``next_caller`` should have."""
+    """Return the frame that ``next_caller`` failed to return."""
     global next_caller
     next_caller = _callers().__next__
     return sys._getframe(2)
 
 
 def caller() -> FrameType:
-    """Return the frame that called who calls this, as ``sys._getframe(1)`` there would."""
+    """Return the frame that called the caller, as ``sys._getframe(1)`` would there."""
     try:
         return next_caller().f_back  # type: ignore[no-any-return]
     except INTERRUPTED:
@@ -129,6 +133,3 @@ code_of: Callable[[FrameType], CodeType] = method_of(
     FrameType, "code_of", ctypes.pythonapi.PyFrame_GetCode
 )
 """Return a frame's code."""
-
-
-__all__ = ["INTERRUPTED", "caller", "code_of", "lost_caller", "next_caller"]

@@ -1,8 +1,7 @@
-"""The guard of one run: who is calling, what the job says about it, what was seen.
+"""The guard of one run: who calls, what the job says about the call, and what is reported.
 
-Replaced functions ask ``engaged()`` for the guard that is in charge of the calling thread. There is
-one only while a simulation is at work; everywhere else the replaced functions do what they always
-did.
+Replaced functions call ``engaged()`` for the guard of the calling thread. There is one only while a
+simulation runs; otherwise the replaced functions do what they always did.
 """
 
 from __future__ import annotations
@@ -24,21 +23,21 @@ from rsltrace.guard.callers import (
     in_import,
     is_in,
     module_of,
-    stack_of,
     user_frame,
+    user_stack,
 )
-from rsltrace.guard.context import Context, RandomStreams, RealTimePace
+from rsltrace.guard.context import RandomStreams, RealTimePace, SimulationContext
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.libraries import present_import
-from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
+from rsltrace.guard.object_numbers import ObjectNumbers, TextNumbers
 from rsltrace.guard.recorded_answers import (
     AHEAD_NS_MAX,
     LOOK_NS,
-    Clock,
-    Draw,
+    ClockFunction,
+    RandomFunction,
     RecordedAnswers,
-    Shown,
+    ShownTime,
     decoded,
     encoded_answer,
     finding_value,
@@ -50,9 +49,9 @@ _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
 _guards: WeakKeyDictionary[Guard, None] = WeakKeyDictionary()  # no set: a run puts those in order
 
 FINDINGS_PER_EVENT = 100
-"""An event that looks at the address of a million objects is one problem, not a million."""
+"""An event that reads the address of a million objects is one problem, not a million."""
 
-# Python takes longer to find a member of an Enum than all else that is asked of it.
+# Local names: the lookup of an Enum member takes longer than the rest of the call.
 _ALLOW, _ERROR, _RANDOM = Mode.ALLOW, Mode.ERROR, Source.RANDOM
 _EACH = (Mode.ERROR, Mode.RECORD)
 _ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
@@ -61,24 +60,24 @@ _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
 
 
-def _forked() -> None:
+def _disengage_in_child() -> None:
     for guard in _guards:
         guard.thread = 0  # in charge of no thread of a child
 
 
-os.register_at_fork(after_in_child=_forked)
+os.register_at_fork(after_in_child=_disengage_in_child)
 
 
-def at_least(mode: Mode) -> Mode:
-    """Return what is done where the run can make no answer and record none: it is reported."""
+def reporting_mode(mode: Mode) -> Mode:
+    """Return the mode of a call that can neither be answered nor recorded: at least a warning."""
     return mode if mode in _ALWAYS else Mode.WARN
 
 
 class Guard:
-    """State of one run. ``on_finding`` takes what is worth a line in the trace.
+    """The state of one run. ``on_finding`` takes what the trace keeps.
 
-    ``modes`` says what is done about each source if that is the same for all code (``one_policy``,
-    and no module is exempt), which spares most calls a question.
+    ``modes`` says what is done about each source, if that is the same for all code (``one_policy``,
+    and no module is exempt). Most calls then need no lookup.
     """
 
     __slots__ = (
@@ -98,11 +97,11 @@ class Guard:
         "_running",
         "_shown",
         "answers",
+        "answers_clocks",
+        "answers_random",
         "context",
         "descriptors",
         "kinds",
-        "makes_chance",
-        "makes_clocks",
         "modes",
         "numbers",
         "on_finding",
@@ -116,7 +115,7 @@ class Guard:
 
     def __init__(
         self,
-        context: Context,
+        context: SimulationContext,
         *,
         policy: Policy,
         seed: int = 0,
@@ -131,21 +130,21 @@ class Guard:
         self._loop, self._running = context.direct or (None, None)
         self.packages = packages
         self.kinds: dict[str, int] = {}
-        """Whose the modules are that read clocks and draw, by ``__file__`` (see ``whose``)."""
+        """The owners of modules that read clocks and draw, by ``__file__`` (see ``file_kind``)."""
         self.on_finding = on_finding
         self._found: dict[tuple[Source, Mode, str, str], int] = {}
         self._answered: dict[Source, dict[str, dict[str, int]]] = {source: {} for source in Source}
-        self._draws: dict[str, dict[str, Draw]] = {}
+        self._draws: dict[str, dict[str, RandomFunction]] = {}
         self.streams = RandomStreams(seed)
         self.answers = RecordedAnswers()
         self.descriptors = DescriptorTable()
         self.pace = RealTimePace()
         self.numbers = ObjectNumbers()
-        self.shown = ShownNumbers()
+        self.shown = TextNumbers()
         self._policy = policy
         self.modes = policy.modes if one_policy and not any(policy.allowed.values()) else None
-        self.makes_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
-        self.makes_chance = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
+        self.answers_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
+        self.answers_random = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
         self.thread = engagement.thread_id()
         self.process = _process_id()
         _guards[self] = None
@@ -154,17 +153,16 @@ class Guard:
         self._reads = 0
         self._reads_event = -1
         self._passes = 0
-        self._clocks: dict[str, dict[str, Clock]] = {}
-        self._shown: dict[str, Shown] = {}
+        self._clocks: dict[str, dict[str, ClockFunction]] = {}
+        self._shown: dict[str, ShownTime] = {}
 
-    def goes_on_in(self, process: int) -> None:
-        """Take note that the present process is a copy, made by the kernel's own ``fork``, which
-        is in charge from now on."""
+    def continue_in(self, process: int) -> None:
+        """Note that this process continues the run as a copy, made by the kernel's ``fork``."""
         self.process = process
 
     @property
     def counts(self) -> dict[tuple[Source, Mode, str, str], int]:
-        """How often each call was met: by source, mode, node and call."""
+        """How often each call was made: by source, mode, node and call."""
         counts: dict[tuple[Source, Mode, str, str], int] = dict(self._found)
         for call, clocks in self._clocks.items():
             for node, clock in clocks.items():
@@ -194,14 +192,14 @@ class Guard:
         return policy.modes.get(source) or DEFAULT_MODES[source]
 
     def is_virtual(self, source: Source) -> bool:
-        """Return whether the run makes the answers of a source, unless a node says otherwise."""
+        """Return whether the run answers calls of a source, unless a node says otherwise."""
         return self._policy.modes.get(source, DEFAULT_MODES[source]) is Mode.VIRTUAL
 
     def stream(self, frame: FrameType) -> str:
-        """Return the name of the random stream of whoever runs: the node's, or its module's.
+        """Return the name of the random stream for the running code: the node's or its module's.
 
-        A library that is imported has a stream of its own, even if a node imports it: it may be
-        loaded already.
+        A library has a stream of its own while it is imported, even by a node: it may be loaded
+        already.
         """
         node = self.context.node()
         is_users = KINDS[code_of(frame).co_filename] == USER
@@ -209,9 +207,8 @@ class Guard:
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 
-    def known_draw(self, call: str, kind: int) -> Callable[..., Any] | None:
-        """Count a draw of the user's or rclpy's code; return what draws for the node that runs, or
-        None if none runs or it is its first."""
+    def known_random_function(self, call: str, kind: int) -> Callable[..., Any] | None:
+        """Count a draw and return the running node's function, None for its first draw."""
         try:
             draw = self._draws[call][self._running.node.key]
         except (KeyError, AttributeError):
@@ -220,21 +217,21 @@ class Guard:
             draw.count += 1
         return draw.function
 
-    def draw(
+    def random_function(
         self, call: str, virtual: Callable[[Guard, str], Callable[..., Any]], frame: FrameType
     ) -> Callable[..., Any]:
-        """Count a draw that the run makes; return what draws from the stream of whoever runs."""
+        """Count a draw and return the function that draws from the stream of the running code."""
         node = self.context.node()
         kind = KINDS[code_of(frame).co_filename]
         if node and (kind <= OURS or user_frame(frame, self.packages) is not None):
             try:
                 draw = self._draws[call][node]
             except KeyError:
-                draw = self._draws.setdefault(call, {})[node] = Draw(virtual(self, node))
+                draw = self._draws.setdefault(call, {})[node] = RandomFunction(virtual(self, node))
             if kind != OURS:
                 draw.count += 1
             return draw.function
-        self.count(_RANDOM, call, frame)
+        self.count_call(_RANDOM, call, frame)
         return virtual(self, self.stream(frame))
 
     def is_user(self, frame: FrameType) -> bool:
@@ -242,21 +239,21 @@ class Guard:
         is_users = KINDS[code_of(frame).co_filename] == USER
         return is_users or user_frame(frame, self.packages) is frame
 
-    def is_for_user(self, frame: FrameType) -> bool:
-        """Return whether user code has led to a frame."""
+    def is_user_call(self, frame: FrameType) -> bool:
+        """Return whether user code led to a frame."""
         kind = KINDS[code_of(frame).co_filename]
         return kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None)
 
-    def user_of(self, frame: FrameType) -> FrameType | None:
-        """Return the frame of user code that has led to a frame, if any has."""
+    def user_frame_of(self, frame: FrameType) -> FrameType | None:
+        """Return the frame of user code that led to a frame, if any."""
         kind = KINDS[code_of(frame).co_filename]
         if kind <= OURS:
             return frame if kind == USER else None
         return user_frame(frame, self.packages)
 
-    def count(self, source: Source, call: str, frame: FrameType) -> None:
-        """Count a call of user code that the run answers itself."""
-        if self.user_of(frame) is not None:
+    def count_call(self, source: Source, call: str, frame: FrameType) -> None:
+        """Count a call of user code that the run answers."""
+        if self.user_frame_of(frame) is not None:
             running = self._running
             present = running.node if running is not None else None
             node = present.key if present is not None else self.context.node()
@@ -265,37 +262,40 @@ class Guard:
             except KeyError:
                 self._answered[source].setdefault(call, {})[node] = 1
 
-    def answered(
-        self, source: Source, call: str, told: Callable[[], str], frame: FrameType
+    def note_answer(
+        self, source: Source, call: str, describe: Callable[[], str], frame: FrameType
     ) -> None:
-        """Let the trace keep what user code was told from outside, in an order that the run makes:
-        no finding, but what two runs may differ in."""
-        user = user_frame(frame, self.packages) if self.is_for_user(frame) else None
+        """Keep in the trace what user code received from outside, in an order that the run makes.
+
+        It is no finding, but two runs may differ in it.
+        """
+        user = user_frame(frame, self.packages) if self.is_user_call(frame) else None
         event, entity = self.context.place()
         if user is None or not self._has_room(event):
             return
-        node, stack = self.context.node(), stack_of(user, self.packages)
-        self.on_finding(Finding(event, entity, node, source, Mode.VIRTUAL, call, told(), stack))
+        node, stack = self.context.node(), user_stack(user, self.packages)
+        self.on_finding(Finding(event, entity, node, source, Mode.VIRTUAL, call, describe(), stack))
 
     def _has_room(self, event: int) -> bool:
-        """Count one more of an event, and return whether the trace has room for it."""
+        """Count one more finding of an event; return whether the trace takes it."""
         if event != self._event:
             self._event, self._in_event = event, 0
         self._in_event += 1
         return self._in_event <= FINDINGS_PER_EVENT
 
-    def found(
+    def report(
         self,
         source: Source,
         mode: Mode,
         call: str,
         value: object,
         frame: FrameType,
-        told: Callable[[Any], str] | None = None,
+        describe: Callable[[Any], str] | None = None,
         user: FrameType | None = None,
     ) -> None:
-        """Report a call; ``frame`` is where it was made, ``told`` makes a text of its answer.
-        ``user`` is the frame of user code that led to it, for those who know.
+        """Report a call made at ``frame``; ``describe`` makes a text of its answer.
+
+        ``user`` is the frame of user code that led to it, if the caller knows it.
 
         :raises GuardError: if the job says that it is an error.
         """
@@ -305,9 +305,9 @@ class Guard:
         event, entity = self.context.place()
         if self._has_room(event) or mode in _EACH:
             user = user or user_frame(frame, self.packages)
-            stack = stack_of(user or frame, self.packages)
-            if told is not None:
-                text = told(value)
+            stack = user_stack(user or frame, self.packages)
+            if describe is not None:
+                text = describe(value)
             else:
                 text = value if isinstance(value, str) else repr(value)
             self.on_finding(Finding(event, entity, node, source, mode, call, text, stack))
@@ -318,62 +318,64 @@ class Guard:
                     f"{ADVICE[source]}"
                 )
 
-    def recorded(
-        self, source: Source, call: str, real: Callable[[], Any], frame: FrameType, of: int = 0
+    def record(
+        self, source: Source, call: str, real: Callable[[], Any], frame: FrameType, number: int = 0
     ) -> Any:
-        """Return the answer to a call from outside; the trace keeps it for a re-run.
+        """Return the answer to a call from outside, and keep it in the trace for a re-run.
 
-        ``of`` is the number of the socket or descriptor asked, if it has one.
+        ``number`` is that of the socket or descriptor that is asked, if it has one.
 
-        :raises OSError: if that is what was answered.
+        :raises OSError: if that is the answer.
         """
         if self.answers.replays:
-            text = self.answers.next_answer(self.context.node(), call, of).text
-            assert text is not None or of
+            text = self.answers.next_answer(self.context.node(), call, number).text
+            assert text is not None or number
             text = text or "null"
         else:
             with engage(None):
                 text = encoded_answer(real)
-        self.found(source, Mode.RECORD, call, finding_value(of, 0, text) if of else text, frame)
+        self.report(
+            source, Mode.RECORD, call, finding_value(number, 0, text) if number else text, frame
+        )
         return decoded(text)
 
-    def watched(
+    def report_user_call(
         self,
         source: Source,
         call: str,
         value: object,
         frame: FrameType,
-        told: Callable[[Any], str] | None = None,
+        describe: Callable[[Any], str] | None = None,
     ) -> None:
-        """Report a call that cannot be virtual, if user code made it and the job wants to know."""
-        if not self.is_for_user(frame):
+        """Report a call that the run cannot answer, if user code made it and the job does not allow
+        it."""
+        if not self.is_user_call(frame):
             return
         mode = self.mode(source, frame)
         if mode is _ALLOW:
             return
-        self.found(source, at_least(mode), call, value, frame, told)
+        self.report(source, reporting_mode(mode), call, value, frame, describe)
 
-    def whose(self, names: dict[str, Any], frame: FrameType) -> int:
-        """Return whose the code of a frame is, be it in a package of the nodes; remember it of its
-        module, whose ``names`` these are."""
+    def file_kind(self, names: dict[str, Any], frame: FrameType) -> int:
+        """Return who owns the code of a frame, and remember it for its module with globals
+        ``names``."""
         file = code_of(frame).co_filename
         kind = KINDS[file]
         if kind > STANDARD and self.packages and is_in(frame, self.packages):
             kind = USER
-        # What a decorator has made of a text is of no file, and a program may be a module, too.
+        # Code compiled from a text has no file, and a program may be imported as a module, too.
         if names.get("__file__") == file and names.get("__name__") != "__main__":
             self.kinds[file] = kind
         return kind
 
     def clock_ns(self, call: str, kind: int, names: dict[str, Any], frame: Any = None) -> int:
-        """Return what a clock of the node (of the module, where no node runs) shows: now.
+        """Return what a clock of the running node (or of the module, without a node) shows now.
 
-        Real clocks never show the same twice, and code that measures durations (to divide by them,
-        say) relies on it. So whoever looks again at one instant sees a little more each time;
-        not so Python's own modules, which wait by what they see. Whoever looks until time has
-        passed makes it pass. A library that is being imported has a clock of its own.
-        ``kind`` says whose the code is that asks, with ``names`` in its module; ``frame`` is its
-        frame, if it is neither the user's nor rclpy's.
+        A real clock never shows the same time twice, and code divides by durations. So each further
+        read at one instant shows a little more; not for Python's own modules, which wait by it.
+        Code that reads until time has passed makes it pass. A library that is being imported has
+        its own clock. ``kind`` is the owner of the calling code, ``names`` its globals; ``frame``
+        is needed unless the user or rclpy owns it.
         """
         look, running = self._look, self._running
         present = running.node if running is not None else None
@@ -407,12 +409,12 @@ class Guard:
             shown.ahead_ns += LOOK_NS
         return now_ns + shown.ahead_ns
 
-    def _shown_by(self, who: str) -> Shown:
-        shown = self._shown[who] = self._shown.get(who) or Shown()
+    def _shown_by(self, who: str) -> ShownTime:
+        shown = self._shown[who] = self._shown.get(who) or ShownTime()
         return shown
 
-    def _new_clock(self, call: str, node: str) -> Clock:
-        clock = Clock(self._shown_by(node))
+    def _new_clock(self, call: str, node: str) -> ClockFunction:
+        clock = ClockFunction(self._shown_by(node))
         self._clocks.setdefault(call, {})[node] = clock
         return clock
 

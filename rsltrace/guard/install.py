@@ -1,4 +1,4 @@
-"""Putting all replacements in place for the time of a run, and taking them back."""
+"""Install all replacements for the time of a run, and remove them afterwards."""
 
 from __future__ import annotations
 
@@ -16,10 +16,12 @@ from functools import partial
 from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
-from rsltrace.guard.callers import is_nobodys, module_of
-from rsltrace.guard.frames import caller, exchange_special
+from rsltrace.guard.addresses import reported_hashes
+from rsltrace.guard.call_reports import reported_calls
+from rsltrace.guard.callers import is_never_user_code, module_of
+from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.process_ids import meant_id, meant_path, virtual_id
+from rsltrace.guard.process_ids import meant_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
 from rsltrace.guard.recorded.polls import recorded_polls
@@ -27,39 +29,37 @@ from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import virtual_clocks
-from rsltrace.guard.virtual.object_hashes import watched_hashes
-from rsltrace.guard.virtual.processors import same_processors
+from rsltrace.guard.virtual.processors import virtual_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
-from rsltrace.guard.watched.functions import watched_calls
 from rsltrace.trace.model.finding import Mode, Source
 
-# Directory listings in the order of their names: a file system gives them in any order.
+# Directory listings are sorted by name: a file system returns them in any order.
 
 _NAMES_MAX = 20
-"""Names of a listing that the trace keeps."""
+"""The number of names of a listing that the trace keeps."""
 
 
-class SortedScan:
-    """What ``os.scandir`` returns, in the order of names."""
+class SortedDirectory:
+    """The result of ``os.scandir``, sorted by name."""
 
     def __init__(self, entries: list[Any]) -> None:
         self._entries = iter(entries)
 
-    def __iter__(self) -> SortedScan:
+    def __iter__(self) -> SortedDirectory:
         return self
 
     def __next__(self) -> Any:
         return next(self._entries)
 
-    def __enter__(self) -> SortedScan:
+    def __enter__(self) -> SortedDirectory:
         return self
 
     def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
-        """Give nothing more."""
+        """Return no more entries."""
         self._entries = iter(())
 
 
@@ -68,10 +68,10 @@ def _sorted_names(value: list[Any]) -> tuple[list[Any], list[Any]]:
     return names, names
 
 
-def _sorted_scan(value: Any) -> tuple[SortedScan, list[Any]]:
+def _sorted_scan(value: Any) -> tuple[SortedDirectory, list[Any]]:
     with value:
         entries = sorted(value, key=lambda entry: os.fsencode(entry.name))
-    return SortedScan(entries), [entry.name for entry in entries]
+    return SortedDirectory(entries), [entry.name for entry in entries]
 
 
 def _call(name: str, arguments: tuple[Any, ...]) -> str:
@@ -79,8 +79,8 @@ def _call(name: str, arguments: tuple[Any, ...]) -> str:
     return f"os.{name}({os.fspath(path) if isinstance(path, os.PathLike) else path!r})"
 
 
-def _told(names: list[Any]) -> str:
-    """Return how many names there are, and which: two runs may have found others."""
+def _names_text(names: list[Any]) -> str:
+    """Describe a listing: how many names, and which; two runs may have found others."""
     texts = [os.fsdecode(name) for name in names]
     if not texts:
         return "no names"
@@ -97,7 +97,7 @@ def _listing(
     call = f"os.{name}()"
 
     def listed(*arguments: Any, **options: Any) -> Any:
-        value = real(*map(meant_path, arguments), **options)
+        value = real(*map(real_path, arguments), **options)
         guard = engaged()
         if guard is None:
             return value
@@ -105,12 +105,14 @@ def _listing(
         mode = guard.mode(Source.DIRECTORY, frame)
         if mode is Mode.VIRTUAL:
             arranged, names = arrange(value)
-            guard.count(Source.DIRECTORY, call, frame)
-            guard.answered(Source.DIRECTORY, _call(name, arguments), partial(_told, names), frame)
+            guard.count_call(Source.DIRECTORY, call, frame)
+            guard.note_answer(
+                Source.DIRECTORY, _call(name, arguments), partial(_names_text, names), frame
+            )
             return arranged
         if mode is not Mode.ALLOW:
             shown = repr(value[:10]) if isinstance(value, list) else ""
-            guard.watched(Source.DIRECTORY, call, shown, frame)
+            guard.report_user_call(Source.DIRECTORY, call, shown, frame)
         return value
 
     return listed
@@ -118,7 +120,8 @@ def _listing(
 
 @contextmanager
 def sorted_listings() -> Iterator[None]:
-    """Sort what ``os.listdir`` and ``os.scandir`` give, and so glob, pathlib and ``os.walk``."""
+    """Sort the results of ``os.listdir`` and ``os.scandir``, and so of glob, pathlib and
+    ``os.walk``."""
     with ExitStack() as stack:
         for name, arrange in (
             ("listdir", _sorted_names),
@@ -128,30 +131,28 @@ def sorted_listings() -> Iterator[None]:
         yield
 
 
-# What Python's own modules remember for a whole process: forgotten for the time of a run.
-#
-# ``tempfile`` finds its folder once and has one sequence of names, ``platform`` asks the machine
-# once. A second run in the same process would get other names and miss what the first was told of;
-# so each run begins as in a process of its own, each node has names of its own and is told itself
-# what it asks, and afterwards everything is as it was.
+# Python's own modules cache answers for a whole process: ``tempfile`` its folder and sequence of
+# names, ``platform`` the machine. A second run in the same process would get other names and miss
+# findings. So each run begins with empty caches, each node has its own names and asks itself, and
+# afterwards the old caches return.
 
 _tempfile: Any = tempfile
 _platform: Any = platform
-_ASKED_ONCE: dict[str, tuple[str, Callable[[], object]]] = {
+_PLATFORM_CACHES: dict[str, tuple[str, Callable[[], object]]] = {
     "uname": ("_uname_cache", lambda: None),
     "platform": ("_platform_cache", dict),
     "freedesktop_os_release": ("_os_release_cache", lambda: None),
 }
-"""Functions of ``platform``, where each keeps its answer, and what is there before the first."""
+"""Functions of ``platform``, the name of each one's cache, and its initial value."""
 
 
-class _Names:
-    """Stands in for ``tempfile``'s sequence of random names: each node has its own."""
+class _FileNameSequence:
+    """Replaces ``tempfile``'s sequence of random names: each node has its own."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
 
-    def __iter__(self) -> _Names:
+    def __iter__(self) -> _FileNameSequence:
         return self
 
     def __next__(self) -> str:
@@ -167,8 +168,8 @@ class _Names:
         return str(next(names[stream]))
 
 
-def _unseen(real: Callable[..., str]) -> Callable[..., str]:
-    """Where files go is asked by one node for all: neither its chance nor its finding."""
+def _unreported(real: Callable[..., str]) -> Callable[..., str]:
+    """One node finds the folder for all: neither its random stream nor its findings show it."""
 
     def default_folder(*arguments: Any) -> str:
         with engage(None):
@@ -177,8 +178,8 @@ def _unseen(real: Callable[..., str]) -> Callable[..., str]:
     return default_folder
 
 
-def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
-    """Ask the machine again each time: whoever asked before may have been a library."""
+def _uncached(real: Any, cache: str, empty: Callable[[], object]) -> Any:
+    """Ask the machine again each time: a library may have asked before."""
 
     def ask(*arguments: Any, **options: Any) -> Any:
         setattr(_platform, cache, empty())
@@ -189,37 +190,39 @@ def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
 
 @contextmanager
 def fresh_module_caches() -> Iterator[None]:
-    """Let nothing be remembered from before, and put it back afterwards."""
+    """Start with empty caches of Python's modules, and restore them afterwards."""
     with ExitStack() as stack:
-        for name, (cache, empty) in _ASKED_ONCE.items():
+        for name, (cache, empty) in _PLATFORM_CACHES.items():
             if hasattr(platform, cache):
                 replace_attribute(stack, platform, cache, empty())
                 replace_attribute(
-                    stack, platform, name, _asking(getattr(platform, name), cache, empty)
+                    stack, platform, name, _uncached(getattr(platform, name), cache, empty)
                 )
         find = _tempfile._get_default_tempdir
         chosen = tempfile.tempdir
         if chosen is not None and chosen == find():
             chosen = None  # nobody has chosen it
         replace_attribute(stack, tempfile, "tempdir", chosen)
-        replace_attribute(stack, tempfile, "_get_default_tempdir", _unseen(find))
-        replace_attribute(stack, tempfile, "_name_sequence", _Names(_tempfile._name_sequence))
+        replace_attribute(stack, tempfile, "_get_default_tempdir", _unreported(find))
+        replace_attribute(
+            stack, tempfile, "_name_sequence", _FileNameSequence(_tempfile._name_sequence)
+        )
         yield
 
 
-# ``os.getpid`` in user code: names, seeds and files made of it are the same in every run.
+# ``os.getpid`` in user code: names, seeds and files made from it are the same in every run.
 
 _CALL = "os.getpid()"
 _LOGGING = "logging"
-_TAKE_IDS = (
+_ID_FUNCTIONS = (
     *("getpgid", "getsid", "getpriority", "setpriority", "pidfd_open"),
     *("sched_getparam", "sched_setparam", "sched_getscheduler", "sched_setscheduler"),
     "sched_rr_get_interval",
 )
-"""Functions of ``os`` that are given the id of a process; ``os.kill`` is the door's."""
+"""Functions of ``os`` that take a process id; adapters replace ``os.kill``."""
 
-_TAKE_PATHS = ("readlink", "access")
-"""Functions of ``os`` that are given a path and that nobody else redirects."""
+_PATH_FUNCTIONS = ("readlink", "access")
+"""Functions of ``os`` that take a path and that nothing else redirects."""
 
 
 def _getpid(real: Callable[[], int]) -> Callable[[], int]:
@@ -228,26 +231,26 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         if guard is None:
             return real()
         frame = caller()
-        if is_nobodys(frame):
+        if is_never_user_code(frame):
             return real()
         mode = guard.mode(Source.PID, frame)
-        shown = module_of(frame) == _LOGGING  # which notes it in every record, whoever logs
+        shown = module_of(frame) == _LOGGING  # which puts it into every record
         if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
             if not shown:
-                guard.count(Source.PID, _CALL, frame)
+                guard.count_call(Source.PID, _CALL, frame)
             return virtual_id(guard)
         if shown:
             return real()
-        if mode is Mode.RECORD and guard.is_for_user(frame):
-            return int(guard.recorded(Source.PID, _CALL, real, frame))
+        if mode is Mode.RECORD and guard.is_user_call(frame):
+            return int(guard.record(Source.PID, _CALL, real, frame))
         value = real()
-        guard.watched(Source.PID, _CALL, value, frame)
+        guard.report_user_call(Source.PID, _CALL, value, frame)
         return value
 
     return getpid
 
 
-def _taking(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[..., Any]:
+def _translating(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any, **options: Any) -> Any:
         options = {name: meant(value) for name, value in options.items()}
         return real(*map(meant, arguments), **options)
@@ -257,23 +260,21 @@ def _taking(meant: Callable[[Any], Any], real: Callable[..., Any]) -> Callable[.
 
 @contextmanager
 def own_process_ids() -> Iterator[None]:
-    """Give each main a process id of its own, and take it back where one is asked for."""
+    """Give each main its own process id, and accept it where a real one is expected."""
     with ExitStack() as stack:
         redirect(stack, os.getpid, _getpid)
-        for name in _TAKE_IDS:
+        for name in _ID_FUNCTIONS:
             if hasattr(os, name):
-                redirect(stack, getattr(os, name), partial(_taking, meant_id))
-        redirect(stack, resource.prlimit, partial(_taking, meant_id))
-        for name in _TAKE_PATHS:
-            redirect(stack, getattr(os, name), partial(_taking, meant_path))
+                redirect(stack, getattr(os, name), partial(_translating, meant_id))
+        redirect(stack, resource.prlimit, partial(_translating, meant_id))
+        for name in _PATH_FUNCTIONS:
+            redirect(stack, getattr(os, name), partial(_translating, real_path))
         yield
 
 
-# Texts of objects that have none of their own: a number of the run's in place of the address.
-#
-# ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. ``object.__repr__`` and
-# those of functions, generators and coroutines are exchanged for the time of a run; every type
-# that takes its text from them is told to look for it by name.
+# ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. For the time of a run
+# ``__repr__`` of objects, functions, generators and coroutines shows a number instead of the
+# address; every type that inherits one of these looks it up by name.
 
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
@@ -289,21 +290,21 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
             return text
         with engage(None):
             address = f"0x{id(self):x}"
-            return text.replace(address, _shown(guard, self) or address)
+            return text.replace(address, _address_text(guard, self) or address)
 
-    # Neither a function nor new: numba's jitclass looks for what a class adds to ``object``.
+    # numba's jitclass rejects a class that adds a function to ``object``.
     vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
     method: Callable[[Any], str] = _as_method(__repr__)
     return method
 
 
-def _shown(guard: Guard, thing: Any) -> str | None:
-    """Return what stands for the address of an object: the node's number for it, in hexadecimal.
+def _address_text(guard: Guard, obj: Any) -> str | None:
+    """Return what replaces an object's address: the node's number for it, in hexadecimal.
 
-    Addresses do not begin like that. None for an object that cannot be recognised later.
+    Real addresses do not begin like that. None for an object that cannot be recognized later.
     """
     node = guard.context.node()
-    number = guard.shown.number(node, thing)
+    number = guard.shown.number(node, obj)
     if number is None:
         return None
     return f"0x52{zlib.crc32(node.encode('utf-8', 'replace')) & 0xFFFF:04x}{number * 16:06x}"
@@ -311,10 +312,10 @@ def _shown(guard: Guard, thing: Any) -> str | None:
 
 @contextmanager
 def numbered_texts() -> Iterator[None]:
-    """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
+    """Replace the methods that make texts with addresses."""
     with ExitStack() as stack:
         for kind in (object, *_SHOWN_ALIKE):
-            exchange_special(stack, kind, "__repr__", _numbered)
+            replace_special_method(stack, kind, "__repr__", _numbered)
         yield
 
 
@@ -324,11 +325,11 @@ _REPLACEMENTS = (
     virtual_randomness,
     sorted_listings,
     numbered_texts,
-    watched_hashes,
+    reported_hashes,
     ordered_sets,
     own_process_ids,
-    watched_calls,
-    same_processors,
+    reported_calls,
+    virtual_processors,
     recorded_files,
     recorded_descriptors,
     recorded_sockets,
@@ -336,23 +337,23 @@ _REPLACEMENTS = (
     recorded_processes,
 )
 
-_users = 0
+_user_count = 0
 _stack = ExitStack()
 
 
 @contextmanager
 def installed() -> Iterator[None]:
-    """Redirect the sources; the last one to leave takes everything back."""
-    global _users, _stack
-    if _users == 0:
+    """Install the replacements; the last run to leave removes them."""
+    global _user_count, _stack
+    if _user_count == 0:
         with ExitStack() as stack:
             for replacement in _REPLACEMENTS:
                 stack.enter_context(replacement())
             _stack = stack.pop_all()
-    _users += 1
+    _user_count += 1
     try:
         yield
     finally:
-        _users -= 1
-        if _users == 0:
+        _user_count -= 1
+        if _user_count == 0:
             _stack.close()

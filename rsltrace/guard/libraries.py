@@ -1,11 +1,11 @@
-"""Which installed packages are libraries, and which are the user's own, installed or not.
+"""Which installed packages are libraries, and which are the user's own.
 
-Where a package lies does not tell: a colcon workspace and pip put the user's packages into a
-``site-packages`` folder, among all others. How it came there does: a library comes as a wheel, of
-which pip keeps a list (``RECORD``). The user's come from a folder of sources (``direct_url.json``),
-from colcon, which leaves no such list, or as a wheel of a package of ROS (``package.xml``) that is
-not ROS's own. Installed is what lies in such a folder, or in one of the import path that holds what
-pip writes of its packages (``pip install --target``).
+The folder does not tell: colcon and pip install the user's packages into a ``site-packages``
+folder, too. The installation does. A library comes as a wheel, with a list of its files
+(``RECORD``). The user's packages come from a source folder (``direct_url.json``), from colcon (no
+list), or as a wheel of a ROS package (``package.xml``) that is not ROS's own. Packages are
+installed in such a folder, or in a folder of the import path with pip's records (``pip install
+--target``).
 """
 
 from __future__ import annotations
@@ -21,19 +21,17 @@ from functools import lru_cache
 
 from rsltrace.guard.engagement import engage
 
-# What an installed package does while it is imported is no part of the run.
-#
-# It may find a cache that the run before had to build: with a thread for a warning, a program that
-# is asked, a file that is waited for. So its clocks and numbers are its own, and it waits in real
-# time.
+# What an installed package does while it is imported is no part of the run. It may find a cache
+# that the run before had to build, with a thread, a program or a wait. So an import has its own
+# clocks and numbers, and waits in real time.
 
 _LOOK_NS = 1_000
 
 
 class LibraryImport:
-    """One import of a package, with all that it imports itself.
+    """One import of a package, with its own imports.
 
-    ``passed_ns`` is how much time it has seen pass; ``at_end`` is called when it is over.
+    ``passed_ns`` is the time that it has seen pass; ``at_end`` is called when it is over.
     """
 
     def __init__(self) -> None:
@@ -41,7 +39,7 @@ class LibraryImport:
         self.at_end: list[Callable[[], None]] = []
 
     def look(self) -> int:
-        """Let the time pass that looking at a clock takes; return all that has passed."""
+        """Let time pass as one read of a clock does; return the time passed so far."""
         self.passed_ns += _LOOK_NS
         return self.passed_ns
 
@@ -55,7 +53,7 @@ present_import = _present.get
 
 @contextmanager
 def importing(*, library: bool) -> Iterator[None]:
-    """Import a module of a library, or one of user code that may be imported by a library."""
+    """Import a module of a library, or one of user code, which a library may import."""
     outer = _present.get()
     if library and outer is not None:
         yield
@@ -74,7 +72,7 @@ _SITES = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
 
 
 def _targets() -> Iterator[str]:
-    """Give the folders of the import path that pip installed packages into, by their records."""
+    """Yield the folders of the import path that pip installed packages into."""
     for folder in sys.path:
         path = os.path.join(folder, "")
         with suppress(OSError):
@@ -87,11 +85,11 @@ def _targets() -> Iterator[str]:
 
 
 TARGETS = tuple(_targets())
-"""Such folders as the process began with: ``PYTHONPATH``, mostly."""
+"""Such folders when the process started, mostly from ``PYTHONPATH``."""
 INSTALLED = (*_SITES, *TARGETS)
-"""A path that has one of these in it is of an installed package, be it a library's or not."""
+"""A path that contains one of these belongs to an installed package."""
 _OTHERS = (f"{os.sep}opt{os.sep}ros{os.sep}", "/usr/lib/python3/dist-packages/")
-"""Folders of the system's package manager, which installs no packages of the user's."""
+"""Folders of the system's package manager, which installs no packages of the user."""
 _INTERFACES = frozenset(("msg", "srv", "action"))
 _DISTRIBUTION = ".dist-info"
 _PACKAGE_OF_ROS = re.compile(rb"share/ament_index/resource_index/packages/([^,/\n]+)")
@@ -107,11 +105,11 @@ _BUILT_FROM_SOURCES = frozenset(
     tf2_geometry_msgs tf2_kdl tf2_py tf2_ros tf2_sensor_msgs tf_transformations urdf_parser_py
     """.split()
 )
-"""Of ROS itself: who builds it from its sources has it in a workspace like packages of his own."""
+"""ROS's own packages: if built from source, they lie in a workspace like the user's."""
 
 
 def is_library(file: str) -> bool:
-    """Return whether a source file is of an installed library (or of generated interfaces)."""
+    """Return whether a source file is of an installed library or of generated interfaces."""
     for installed in INSTALLED:
         place = file.rfind(installed)
         if place >= 0:
@@ -127,7 +125,7 @@ def is_library(file: str) -> bool:
 
 @lru_cache(maxsize=4096)
 def _is_library(folder: str, name: str) -> bool:
-    """Return whether what lies by that name in a folder is a library."""
+    """Return whether the package of that name in a folder is a library."""
     if name in _BUILT_FROM_SOURCES:
         return True
     with engage(None):
@@ -138,8 +136,10 @@ def _is_library(folder: str, name: str) -> bool:
 
 
 def _owners(folder: str, name: str) -> list[tuple[str, bytes]]:
-    """Return the distributions that have installed what lies by a name in a folder, each with its
-    list of files. Those of the same name are looked at first, then those of one like it."""
+    """Return the distributions that installed a name into a folder, with their lists of files.
+
+    Distributions of the same or a similar name are tried first.
+    """
     every = _distributions(folder)
     alike = name.lower().lstrip("_")
     named = [every[one] for one in (alike, f"ros_{alike}") if one in every]
@@ -153,7 +153,7 @@ def _owners(folder: str, name: str) -> list[tuple[str, bytes]]:
 
 @lru_cache(maxsize=64)
 def _distributions(folder: str) -> dict[str, str]:
-    """Return where a folder has what pip writes of its distributions, by their names."""
+    """Return the distributions in a folder by name, with pip's folder for each."""
     with suppress(OSError):
         names = [name for name in os.listdir(folder) if name.endswith(_DISTRIBUTION)]
         return {_name_of(name): os.path.join(folder, name) for name in names}
@@ -179,7 +179,7 @@ def _content(path: str, name: str) -> bytes:
 
 
 def _is_from_folder(path: str) -> bool:
-    """Whether a distribution was installed from a folder of sources. (conda says so of all.)"""
+    """Whether a distribution was installed from a source folder. (conda says so of all.)"""
     if _content(path, "INSTALLER").strip() == b"conda":
         return False
     with suppress(ValueError):
@@ -188,11 +188,8 @@ def _is_from_folder(path: str) -> bool:
 
 
 def _is_of_workspace(path: str, record: bytes) -> bool:
-    """Whether a distribution is a package of ROS; ROS's own are named ``ros-PACKAGE``."""
+    """Whether a distribution is a ROS package; ROS's own are named ``ros-PACKAGE``."""
     own = _name_of(os.path.basename(path)).removeprefix("ros_")
     packages = {os.fsdecode(found) for found in _PACKAGE_OF_ROS.findall(record)}
     is_own = packages == {own} and _name_of(os.path.basename(path)) != own
     return bool(packages) and not is_own
-
-
-__all__ = ["INSTALLED", "TARGETS", "LibraryImport", "importing", "is_library", "present_import"]

@@ -1,8 +1,8 @@
-"""An order for objects that have none: numbers, given when a set with them is gone through.
+"""Numbers that put objects in an order of their own when a program iterates over a set of them.
 
-Where an object lies in memory decides its place in a set. Those that are met for the first time
-together are told apart by what they hold (names, numbers, positions), and get a number each that
-they keep, whatever becomes of them. Objects that hold the same cannot be told apart.
+An object's address decides its position in a set. New objects are distinguished by their contents
+(names, numbers, positions) and get numbers in that order, which they keep. Objects with equal
+contents cannot be distinguished.
 """
 
 from __future__ import annotations
@@ -25,132 +25,132 @@ from rsltrace.guard.state.hashing import attributes_of
 
 _DEPTH_MAX = 4
 _PARTS_MAX = 500
-"""What is looked at of one object; what differs only beyond that cannot be told apart."""
+"""How much of an object is read to distinguish it."""
 _CHARACTERS_MAX = 1000
 _ARRAY_BYTES_MAX = 1 << 16
 _PLAIN = (str, bytes, int, float, bool, complex, type(None))
 _GENERIC = (types.GenericAlias, types.UnionType)
 _FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}
-"""What is under way, and where it keeps its variables."""
+"""Types of running code, and the attribute with their variables."""
 _BUILT_IN = (types.BuiltinMethodType, types.MethodWrapperType)
-_address = object.__hash__  # as id(), but no audit hook is told of it
+_address = object.__hash__  # like id(), without an audit event
 
 
 class ObjectNumbers:
-    """Numbers of the objects of one run, kept for as long as an object lives."""
+    """Numbers of the objects of one run, kept while an object lives."""
 
     def __init__(self) -> None:
         self._kept: dict[int, tuple[weakref.ref[Any], int]] = {}
         self._next = itertools.count().__next__
 
-    def in_order(self, things: Iterable[Any]) -> list[Any] | None:
-        """Return things in an order that does not depend on addresses; None if there is none."""
+    def in_order(self, objects: Iterable[Any]) -> list[Any] | None:
+        """Return objects in an order that does not depend on addresses; None if there is none."""
         known: list[tuple[int, Any]] = []
         new: dict[str, Any] = {}
-        for thing in things:
-            number = self._number(thing)
+        for obj in objects:
+            number = self._number(obj)
             if number is not None:
-                known.append((number, thing))
+                known.append((number, obj))
                 continue
-            text = self._text_of(thing)
+            text = self._text_of(obj)
             if text in new:
                 return None
-            new[text] = thing
+            new[text] = obj
         known.sort(key=lambda pair: pair[0])
         first = [new[text] for text in sorted(new)]
-        for thing in first:
-            self._keep(thing)
-        return [thing for _, thing in known] + first
+        for obj in first:
+            self._keep(obj)
+        return [obj for _, obj in known] + first
 
-    def _number(self, thing: Any) -> int | None:
-        kept = self._kept.get(_address(thing))
-        if kept is None and isinstance(thing, weakref.ref):
-            thing = thing()
-            kept = self._kept.get(_address(thing))
-        return kept[1] if kept is not None and kept[0]() is thing else None
+    def _number(self, obj: Any) -> int | None:
+        kept = self._kept.get(_address(obj))
+        if kept is None and isinstance(obj, weakref.ref):
+            obj = obj()
+            kept = self._kept.get(_address(obj))
+        return kept[1] if kept is not None and kept[0]() is obj else None
 
-    def _keep(self, thing: Any) -> None:
-        thing = _meant(thing)
-        if isinstance(thing, (*_PLAIN, types.MethodType)):
+    def _keep(self, obj: Any) -> None:
+        obj = _referent(obj)
+        if isinstance(obj, (*_PLAIN, types.MethodType)):
             return
-        key, kept = _address(thing), self._kept
+        key, kept = _address(obj), self._kept
 
         def forget(gone: weakref.ref[Any]) -> None:
             if key in kept and kept[key][0] is gone:
                 del kept[key]
 
         try:
-            kept[key] = weakref.ref(thing, forget), self._next()
+            kept[key] = weakref.ref(obj, forget), self._next()
         except TypeError:
             pass  # it takes no weak reference, so it is looked at each time
 
-    def _text_of(self, thing: Any, depth: int = 0) -> str:
+    def _text_of(self, obj: Any, depth: int = 0) -> str:
         parts: list[str] = []
-        self._describe(thing, parts, depth)
+        self._describe(obj, parts, depth)
         return ",".join(parts)
 
-    def _describe(self, thing: Any, parts: list[str], depth: int) -> None:
-        """Write down what tells an object apart, without asking its own code."""
-        thing = _meant(thing)
-        kind = type(thing)
+    def _describe(self, obj: Any, parts: list[str], depth: int) -> None:
+        """Append what distinguishes an object, without running its own code."""
+        obj = _referent(obj)
+        kind = type(obj)
         if len(parts) >= _PARTS_MAX:
             return
         if kind in _PLAIN:
-            start = thing[:_CHARACTERS_MAX] if kind in (str, bytes) else thing
+            start = obj[:_CHARACTERS_MAX] if kind in (str, bytes) else obj
             parts.append(f"{kind.__name__} {start!r}")
-            if start is not thing:
-                parts.append(str(len(thing)))
+            if start is not obj:
+                parts.append(str(len(obj)))
         elif kind is types.MethodType:
-            parts.append(f"method {thing.__func__.__qualname__}")
-            self._describe(thing.__self__, parts, depth + 1)
+            parts.append(f"method {obj.__func__.__qualname__}")
+            self._describe(obj.__self__, parts, depth + 1)
         elif kind in _GENERIC:
             parts.append(kind.__name__)
-            self._describe([getattr(thing, "__origin__", None), thing.__args__], parts, depth + 1)
+            self._describe([getattr(obj, "__origin__", None), obj.__args__], parts, depth + 1)
         elif kind in _FRAMES:
-            frame = getattr(thing, _FRAMES[kind])
+            frame = getattr(obj, _FRAMES[kind])
             held = {} if frame is None else dict(frame.f_locals)
-            self._describe([thing.__qualname__, held], parts, depth + 1)
+            self._describe([obj.__qualname__, held], parts, depth + 1)
         elif _is_task(kind):
-            padded = re.sub(r"[0-9]+", lambda number: number[0].zfill(12), thing.get_name())
+            padded = re.sub(r"[0-9]+", lambda number: number[0].zfill(12), obj.get_name())
             parts.append(f"task {padded}")  # they are counted when they are made
-        elif kind in _BUILT_IN and not isinstance(thing.__self__, types.ModuleType):
-            parts.append(f"{kind.__name__} {thing.__name__}")
-            self._describe(thing.__self__, parts, depth + 1)
-        elif isinstance(thing, (type, types.FunctionType, types.BuiltinFunctionType)):
-            line = thing.__code__.co_firstlineno if isinstance(thing, types.FunctionType) else 0
-            parts.append(f"{kind.__name__} {thing.__module__}.{thing.__qualname__} {line}")
-            if isinstance(thing, types.FunctionType) and depth < _DEPTH_MAX:
-                self._describe(_bound_in(thing), parts, depth + 1)
-        elif isinstance(thing, (types.ModuleType, enum.Enum)):
-            name = thing.__name__ if isinstance(thing, types.ModuleType) else thing.name
+        elif kind in _BUILT_IN and not isinstance(obj.__self__, types.ModuleType):
+            parts.append(f"{kind.__name__} {obj.__name__}")
+            self._describe(obj.__self__, parts, depth + 1)
+        elif isinstance(obj, (type, types.FunctionType, types.BuiltinFunctionType)):
+            line = obj.__code__.co_firstlineno if isinstance(obj, types.FunctionType) else 0
+            parts.append(f"{kind.__name__} {obj.__module__}.{obj.__qualname__} {line}")
+            if isinstance(obj, types.FunctionType) and depth < _DEPTH_MAX:
+                self._describe(_bound_in(obj), parts, depth + 1)
+        elif isinstance(obj, (types.ModuleType, enum.Enum)):
+            name = obj.__name__ if isinstance(obj, types.ModuleType) else obj.name
             parts.append(f"{kind.__name__} {name}")
-        elif isinstance(thing, np.ndarray):
-            data = thing.tobytes().hex() if _has_plain_data(thing) else ""
-            parts.append(f"{thing.dtype.str}{thing.shape}{data}")
-        elif self._number(thing) is not None and depth:
-            parts.append(f"object {self._number(thing)}")
+        elif isinstance(obj, np.ndarray):
+            data = obj.tobytes().hex() if _has_plain_data(obj) else ""
+            parts.append(f"{obj.dtype.str}{obj.shape}{data}")
+        elif self._number(obj) is not None and depth:
+            parts.append(f"object {self._number(obj)}")
         else:
-            self._describe_object(thing, parts, depth)
+            self._describe_object(obj, parts, depth)
 
-    def _describe_object(self, thing: Any, parts: list[str], depth: int) -> None:
-        kind = type(thing)
+    def _describe_object(self, obj: Any, parts: list[str], depth: int) -> None:
+        kind = type(obj)
         parts.append(f"{kind.__module__}.{kind.__qualname__}")
         if depth >= _DEPTH_MAX:
             return
         if kind is partial:
-            thing, kind = [thing.func, thing.args, thing.keywords], list
-        if isinstance(thing, (set, frozenset)):
-            parts.append(str(len(thing)))
-            parts.extend(sorted(self._text_of(one, depth + 1) for one in thing))
+            obj, kind = [obj.func, obj.args, obj.keywords], list
+        if isinstance(obj, (set, frozenset)):
+            parts.append(str(len(obj)))
+            parts.extend(sorted(self._text_of(one, depth + 1) for one in obj))
             return
-        if isinstance(thing, (list, tuple)):
-            parts.append(str(len(thing)))
-            held: Iterable[tuple[Any, Any]] = enumerate(thing)
-        elif isinstance(thing, Mapping) and kind in (dict, types.MappingProxyType):
-            parts.append(str(len(thing)))
-            held = thing.items()
+        if isinstance(obj, (list, tuple)):
+            parts.append(str(len(obj)))
+            held: Iterable[tuple[Any, Any]] = enumerate(obj)
+        elif isinstance(obj, Mapping) and kind in (dict, types.MappingProxyType):
+            parts.append(str(len(obj)))
+            held = obj.items()
         else:
-            held = attributes_of(thing).items()
+            held = attributes_of(obj).items()
         for name, value in held:
             if len(parts) >= _PARTS_MAX:
                 return
@@ -159,19 +159,21 @@ class ObjectNumbers:
             self._describe(value, parts, depth + 1)
 
 
-class ShownNumbers:
-    """Numbers of the objects that were shown in a text, by the node that first did."""
+class TextNumbers:
+    """Numbers of objects shown in a text, counted per node."""
 
     def __init__(self) -> None:
         self._kept: dict[int, tuple[Callable[[], Any], int]] = {}
         self._last: Counter[str] = Counter()
 
-    def number(self, node: str, thing: Any) -> int | None:
-        """Return an object's number, the next of the node if it has none; None for those that
-        cannot be recognised, since they take no weak reference."""
-        key, kept = _address(thing), self._kept
+    def number(self, node: str, obj: Any) -> int | None:
+        """Return an object's number, the node's next one if it is new.
+
+        None for objects without weak references: they cannot be recognized again.
+        """
+        key, kept = _address(obj), self._kept
         found = kept.get(key)
-        if found is not None and found[0]() is thing:
+        if found is not None and found[0]() is obj:
             return found[1]
         self._last[node] += 1
         number = self._last[node]
@@ -181,17 +183,17 @@ class ShownNumbers:
                 del kept[key]
 
         try:
-            kept[key] = weakref.ref(thing, forget), number
+            kept[key] = weakref.ref(obj, forget), number
         except TypeError:
-            if type(thing) is not object:  # of these, most are kept anyway, as marks
+            if type(obj) is not object:  # of these, most are kept anyway, as marks
                 return None
-            kept[key] = (lambda: thing), number
+            kept[key] = (lambda: obj), number
         return number
 
 
-def _meant(thing: Any) -> Any:
-    """Return what a weak reference refers to, whose hash it has; another object is itself."""
-    return thing() if isinstance(thing, weakref.ref) else thing
+def _referent(obj: Any) -> Any:
+    """Return the object of a weak reference, which has its hash; others are returned unchanged."""
+    return obj() if isinstance(obj, weakref.ref) else obj
 
 
 def _is_task(kind: type) -> bool:
@@ -200,7 +202,7 @@ def _is_task(kind: type) -> bool:
 
 
 def _bound_in(function: types.FunctionType) -> list[Any]:
-    """Return what tells functions of one line apart: default values, variables around them."""
+    """Return what distinguishes functions of one line: default values and closures."""
     held = []
     for cell in function.__closure__ or ():
         with suppress(ValueError):  # it is empty
@@ -210,6 +212,3 @@ def _bound_in(function: types.FunctionType) -> list[Any]:
 
 def _has_plain_data(array: np.ndarray[Any, Any]) -> bool:
     return not array.dtype.hasobject and array.nbytes <= _ARRAY_BYTES_MAX
-
-
-__all__ = ["ObjectNumbers", "ShownNumbers"]

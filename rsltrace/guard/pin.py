@@ -1,9 +1,8 @@
-"""Pinning the process: what can only be set before Python starts, and what libraries read once.
+"""Pin the process: set what must be set before Python starts, and what libraries read once.
 
-``pin`` starts the same command once more in the same process, with a fixed hash seed, without
-address-space randomisation (where the kernel allows it), in UTC, in the C.UTF-8 locale, with one
-thread for each numerical library and one order of the folders of libraries. It costs what starting
-Python costs. ``unpin`` goes back.
+``pin`` starts the same command again in this process: with a fixed hash seed, without address-space
+randomization (where the kernel allows it), in UTC and C.UTF-8, with one thread per numerical
+library and sorted library folders. It costs one start of Python. ``unpin`` goes back.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from importlib import import_module
 from types import ModuleType
 
 _MARK = "RSLTRACE_PINNED"
-"""Environment variable through which the second start learns what was there before the first."""
+"""The environment variable with the settings before the pinned start."""
 
 HASH_SEED = "PYTHONHASHSEED"
 PLACE = {"TZ": "UTC", "LC_ALL": "C.UTF-8"}
@@ -37,7 +36,7 @@ PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BY_WHEELS = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
-"""Set by ROS's wheels once they have started Python again with their folders."""
+"""ROS's wheels set this once they have started Python again with their folders."""
 
 _DUPLICATES = "KMP_DUPLICATE_LIB_OK"
 
@@ -48,17 +47,17 @@ _RUNS_NODES = frozenset(("record", "replay", "debug", "analyze"))
 _NOTHING_TO_PIN = frozenset(("--no-pin", "--help", "-h"))
 
 _before = ""
-"""What this process was told by the one that pinned it."""
+"""The settings before this process was pinned, as JSON."""
 
 
 def pin_recording(words: Sequence[str]) -> None:
-    """Pin the process if a command line (without the program's name) is one that runs nodes."""
+    """Pin the process if a command line (without the program's name) runs nodes."""
     if _RUNS_NODES.intersection(words[:1]) and not _NOTHING_TO_PIN.intersection(words):
         pin()
 
 
 def pin() -> None:
-    """Start the present command again, pinned; return if it is, or if that is not possible."""
+    """Start this command again, pinned; return if it is pinned already or cannot be."""
     global _before
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
@@ -70,15 +69,15 @@ def pin() -> None:
 
 
 def pinned_variables() -> dict[str, str]:
-    """Return the environment variables of a pinned process, and of those that a run starts."""
+    """Return the environment variables of a pinned process and of the processes of a run."""
     return {**PINNED, **_libraries()}
 
 
 def _libraries() -> dict[str, str]:
-    """Return where libraries are looked for, in one order.
+    """Return the library folders, sorted.
 
-    ROS's wheels put their folders there in the order of a set, another one at each start, and have
-    copies of one library in several: which is loaded, and where, would differ from run to run.
+    ROS's wheels list their folders in the order of a set, which differs at each start. Several hold
+    copies of one library: which one is loaded, and where, would differ from run to run.
     """
     folders = os.environ.get(_LIBRARIES, "")
     if _BY_WHEELS not in os.environ or not folders:
@@ -87,7 +86,7 @@ def _libraries() -> dict[str, str]:
 
 
 def unpin() -> None:
-    """Start the present command again as it was before ``pin``; return if it was not pinned."""
+    """Start this command again as it was before ``pin``; return if it was not pinned."""
     if _before in ("", _UNPINNED):
         return
     before = json.loads(_before)
@@ -100,7 +99,7 @@ def _start_again(changes: Mapping[str, str | None]) -> None:
     environment = {**os.environ, **changes}
     kept = {name: value for name, value in environment.items() if value is not None}
     for stream in (sys.stdout, sys.stderr):
-        if stream is not None:  # closed by whoever started us
+        if stream is not None:  # closed by the parent process
             stream.flush()
     try:
         os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], kept)
@@ -109,7 +108,7 @@ def _start_again(changes: Mapping[str, str | None]) -> None:
 
 
 def fix_addresses(fixed: bool) -> bool:
-    """Let programs started from here have fixed addresses, or random ones; whether that changed."""
+    """Give programs started from here fixed or random addresses; return whether that changed."""
     now = _personality(_ASK)
     if now < 0 or bool(now & _ADDR_NO_RANDOMIZE) is fixed:
         return False
@@ -118,13 +117,13 @@ def fix_addresses(fixed: bool) -> bool:
 
 
 def has_fixed_addresses() -> bool:
-    """Return whether this process has the addresses that every other such process has."""
+    """Return whether this process has the fixed addresses of a pinned process."""
     now = _personality(_ASK)
     return now >= 0 and bool(now & _ADDR_NO_RANDOMIZE)
 
 
 def _personality(value: int) -> int:
-    """Do the system call of that name; -1 where there is none, or where it is forbidden."""
+    """Call ``personality``; -1 where the system has none or forbids it."""
     try:
         return int(ctypes.CDLL(None).personality(ctypes.c_ulong(value)))
     except (OSError, AttributeError):
@@ -132,8 +131,10 @@ def _personality(value: int) -> int:
 
 
 def thread_pools() -> ModuleType:
-    """Return threadpoolctl. What it sets for OpenMP is not for the processes that a run starts:
-    those of the first run would have one variable more than those of the next."""
+    """Return threadpoolctl, without the OpenMP variable that its import sets.
+
+    Processes of the first run would otherwise have one variable more than those of the next.
+    """
     before = os.environ.get(_DUPLICATES)
     found = import_module("threadpoolctl")
     if before is None:
@@ -143,7 +144,7 @@ def thread_pools() -> ModuleType:
 
 @contextmanager
 def kept_variables(names: Iterable[str]) -> Iterator[None]:
-    """Give variables of the environment back what they were before the ``with`` block."""
+    """Restore variables of the environment after the block."""
     before = {name: os.environ.get(name) for name in names}
     try:
         yield
@@ -157,7 +158,7 @@ def kept_variables(names: Iterable[str]) -> Iterator[None]:
 
 @contextmanager
 def pinned_place() -> Iterator[None]:
-    """Pin what can be pinned from within: time zone, locale and numerical threads."""
+    """Pin time zone, locale and numerical threads from within the process."""
     before = {name: os.environ.get(name) for name in PLACE}
     if before == PLACE and all(os.environ.get(name) == "1" for name in THREADS):
         yield

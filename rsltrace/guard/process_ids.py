@@ -1,7 +1,7 @@
-"""Process ids of the run: each main has one of its own, the same in every run.
+"""Process ids of the run: each main has its own, the same in every run.
 
-They are none that Linux gives (2**22 at most), so whoever is told one can take nobody else for it.
-Where the code that got one gives it back, the process of the run is meant.
+They are larger than any id of Linux (2**22), so they name no other process. Where user code passes
+one to the system, the real process is meant.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from typing import Any
 from rsltrace.guard.guard import Guard, engaged
 
 FIRST = 5_000_000
-"""That of the nodes which the job constructs; mains follow in the order of the job."""
+"""The id of the nodes that the job constructs; the ids of mains follow in the order of the job."""
 
 _PROC = "/proc/"
 _OF_PROCESS = re.compile(r"/proc/(\d+)(?=/|$)")
 
 
 def virtual_id(guard: Guard) -> int:
-    """Return the process id of whoever runs."""
+    """Return the process id that the running code sees."""
     return FIRST + guard.context.process()
 
 
 def meant_id(pid: Any) -> Any:
-    """Return the real process id if ``pid`` is what whoever runs takes for its own."""
+    """Return the real process id if ``pid`` is the one that the running code sees as its own."""
     if isinstance(pid, int) and pid >= FIRST:
         guard = engaged()
         if guard is not None and pid == virtual_id(guard):
@@ -34,7 +34,7 @@ def meant_id(pid: Any) -> Any:
     return pid
 
 
-def meant_path(path: Any) -> Any:
+def real_path(path: Any) -> Any:
     """Return a path below ``/proc`` with the real process id in it."""
     if type(path) is str and path[:6] != _PROC:
         return path
@@ -44,6 +44,3 @@ def meant_path(path: Any) -> Any:
         if match is not None:
             return f"{_PROC}{meant_id(int(match[1]))}{text[match.end() :]}"
     return path
-
-
-__all__ = ["FIRST", "meant_id", "meant_path", "virtual_id"]

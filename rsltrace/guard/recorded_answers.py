@@ -1,7 +1,7 @@
-"""Values that came from outside of a run: kept in the trace, and given again in a re-run.
+"""Answers from outside of a run: kept in the trace, and returned again in a re-run.
 
-They are written as JSON: a trace can come from anywhere, and reading one must never run code. What
-went wrong outside (no such file, connection refused) is a value, too.
+They are JSON, because a trace may come from anywhere and reading one must never run code. An error
+(no such file, connection refused) is an answer, too.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from typing import Any
 from rsltrace.errors import GuardError
 from rsltrace.trace.model.finding import Finding, Mode
 
-# What nodes were told by clocks and by chance, as far as counts and next answers need it.
+# Clocks and random functions, as far as counts and further answers need them.
 
 LOOK_NS = 1_000
-"""What looking at a clock again takes: ``time.time()`` of this century cannot show much less."""
+"""The time that one more read of a clock takes: ``time.time()`` cannot show much less."""
 AHEAD_NS_MAX = 1_000_000
 
 
-class Draw:
-    """What draws for a node that calls one function, and how often user code did."""
+class RandomFunction:
+    """A function that draws for one node, and how often user code called it."""
 
     __slots__ = ("count", "function")
 
@@ -36,9 +36,8 @@ class Draw:
         self.function = function
 
 
-class Shown:
-    """How far what the clocks of a node showed last was ahead of simulated time, which was
-    ``now_ns``."""
+class ShownTime:
+    """The simulated time that a node's clocks showed last, and how far they were ahead of it."""
 
     __slots__ = ("ahead_ns", "now_ns")
 
@@ -46,7 +45,7 @@ class Shown:
         self.now_ns, self.ahead_ns = -1 << 63, 0
 
     def see(self, now_ns: int) -> None:
-        """Take note of the time, which may have been there before, or jumped backwards."""
+        """Note a new time, which may equal the last one or lie before it."""
         ahead_ns = self.now_ns + self.ahead_ns - now_ns
         if ahead_ns < 0 or now_ns < self.now_ns:
             ahead_ns = 0
@@ -55,12 +54,12 @@ class Shown:
         self.now_ns, self.ahead_ns = now_ns, ahead_ns
 
 
-class Clock:
-    """One clock function of a node: how often user code looked, and what all of its clocks show."""
+class ClockFunction:
+    """One clock function of a node: how often user code called it, and the node's shown time."""
 
     __slots__ = ("looks", "shown")
 
-    def __init__(self, shown: Shown) -> None:
+    def __init__(self, shown: ShownTime) -> None:
         self.looks = 0
         self.shown = shown
 
@@ -99,7 +98,7 @@ _TLS_DETAILS = ("reason", "library", "verify_code", "verify_message")
 
 @dataclass(frozen=True, slots=True)
 class RecordedAnswer:
-    """What an earlier run has of one call: the answer, and how many steps it took to come.
+    """An answer of an earlier run, and how many steps of simulated time it took.
 
     ``text`` is None if the run ended before the answer came.
     """
@@ -109,52 +108,52 @@ class RecordedAnswer:
 
 
 class RecordedAnswers:
-    """Answers of recorded sources: the real ones, or (in a re-run) those of an earlier run."""
+    """Answers from outside: the real ones or, in a re-run, those of an earlier run."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, str, int], deque[RecordedAnswer]] | None = None
         self._trace = ""
 
     def replay(self, findings: Iterable[Finding], trace: str) -> None:
-        """Give the recorded answers of an earlier run, to each node in its order."""
+        """Use the recorded answers of an earlier run, for each node in order."""
         self._kept, self._trace = {}, trace
         for finding in findings:
             if finding.mode is Mode.RECORD:
-                of, kept = _parsed(finding.value)
-                self._kept.setdefault((finding.node, finding.call, of), deque()).append(kept)
+                number, kept = _parsed(finding.value)
+                self._kept.setdefault((finding.node, finding.call, number), deque()).append(kept)
 
     @property
     def replays(self) -> bool:
         """Whether the answers are those of an earlier run."""
         return self._kept is not None
 
-    def next_answer(self, node: str, call: str, of: int = 0) -> RecordedAnswer:
-        """Return the earlier run's next answer to a call, to that object's if it has a number.
+    def next_answer(self, node: str, call: str, number: int = 0) -> RecordedAnswer:
+        """Return the earlier run's next answer to a call (to that object's, if it has a number).
 
-        :raises GuardError: if there is no further one.
+        :raises GuardError: if there is none.
         """
         assert self._kept is not None
-        kept = self._kept.get((node, call, of)) or self._kept.get((node, call, 0))
+        kept = self._kept.get((node, call, number)) or self._kept.get((node, call, 0))
         if kept:
             return kept.popleft()
         raise GuardError(
-            f"{self._trace} has no further answer to {call} of {node or 'the run'}: this run asks "
-            "more often than the recorded one did, so its code, job or data have changed; compare "
+            f"{self._trace} has no further answer to {call} of {node or 'the run'}: this run calls "
+            "it more often than the recorded one, so code, job or data have changed; compare "
             "the two with rsltrace diff"
         )
 
 
 def encoded_answer(real: Callable[[], Any]) -> str:
-    """Return what a real call answers as text; an error of the operating system is an answer."""
+    """Return the answer of a real call as text; an operating system error is an answer."""
     try:
         return encoded(real())
     except OSError as error:
         return _error_text(error)
 
 
-def finding_value(of: int, steps: int, text: str | None) -> str:
-    """Return a value for the trace that says whose answer it is and how long it took to come."""
-    fields: dict[str, Any] = {"of": of}
+def finding_value(number: int, steps: int, text: str | None) -> str:
+    """Return a value for the trace: the object's number, the steps waited and the answer."""
+    fields: dict[str, Any] = {"of": number}
     if steps:
         fields["waited"] = steps
     if text is not None:
@@ -188,7 +187,7 @@ def encoded(value: Any) -> str:
 
 
 def decoded(text: str) -> Any:
-    """Return the value of ``encoded``; raise the error that it stands for.
+    """Return the value of ``encoded``, or raise the error that it stands for.
 
     :raises GuardError: if it is neither.
     """

@@ -1,12 +1,12 @@
-"""Making a built-in function call a Python function, wherever somebody has already bound it.
+"""Make a built-in function call a Python function, wherever it is bound already.
 
-``time.time = ours`` misses ``from time import time``, default arguments and tables of functions
-that were made before. All of them hold the same function object, so the object itself is turned:
-its method definition becomes one that calls our function (CPython's ``PyObject_Vectorcall`` has
-just the signature that a built-in with keywords needs). Nothing is compiled, a call costs what a
-call of a Python function costs, exceptions pass, and ``restore`` puts three pointers back.
+``time.time = other`` misses ``from time import time``, default arguments and tables of functions.
+All of these hold the same function object, so the object itself is changed: its method definition
+becomes one that calls the other function. (CPython's ``PyObject_Vectorcall`` has exactly the
+signature of a built-in with keywords.) Nothing is compiled, the call costs as much as a call of a
+Python function, and ``restore`` puts three pointers back.
 
-The layout is CPython's and has not changed since 3.8; it is checked before anything is written.
+CPython has had this layout since 3.8; it is checked before anything is written.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import wraps
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
@@ -68,7 +69,7 @@ class _Method(ctypes.Structure):
 
 
 def _vectorcall(address: int | None, flags: int) -> int:
-    """Return how Python calls built-in functions with the flags of ours."""
+    """Return how Python calls built-in functions with these flags."""
     definition = _MethodDef(b"", address, flags, None)
     function = _new_function(ctypes.addressof(definition), id(None), None)
     return int(_Function.from_address(id(function)).vectorcall)
@@ -81,7 +82,8 @@ _VECTORCALLS = {
 
 
 class Redirected:
-    """A built-in function that calls something else until ``restore``. ``real`` is what it was."""
+    """A built-in function that calls ``target`` until ``restore``. ``real`` does what it did
+    before."""
 
     def __init__(self, function: BuiltinFunctionType, target: Callable[..., Any]) -> None:
         self._turn(function, _callable(target), _CALL, _FASTCALL_KEYWORDS)
@@ -101,18 +103,16 @@ class Redirected:
         place.vectorcall = _VECTORCALLS[flags]
 
     def restore(self) -> None:
-        """Let the function be what it was."""
+        """Undo the redirection."""
         place = _Function.from_address(id(self._function))
         place.definition, place.owner, place.vectorcall = self._saved
         _count_down(id(self._target))
 
 
-class RedirectedRead(Redirected):
-    """A built-in function without arguments; ``target`` is called with the names of the module
-    that calls it.
+class RedirectedReader(Redirected):
+    """A built-in function without arguments; ``target`` gets the globals of the calling module.
 
-    Those are to be had in C, for a fraction of what a frame costs: nothing of Python's runs before
-    ``target``.
+    C code fetches them, which costs a fraction of a frame: no Python code runs before ``target``.
     """
 
     def __init__(
@@ -121,14 +121,14 @@ class RedirectedRead(Redirected):
         self._turn(function, map(target, iter(globals, None)), _NEXT, _NO_ARGUMENTS)
 
 
-def takes_nothing(function: BuiltinFunctionType) -> bool:
-    """Return whether a built-in function has no arguments, and so may be a ``RedirectedRead``."""
+def has_no_arguments(function: BuiltinFunctionType) -> bool:
+    """Return whether a built-in function takes no arguments, so ``RedirectedReader`` fits."""
     definition = _Function.from_address(id(function)).definition
     return bool(_MethodDef.from_address(definition).flags == _NO_ARGUMENTS)
 
 
 def _callable(target: Callable[..., Any]) -> Callable[..., Any]:
-    """Return what can be called through ``_CALL``: on Python 3.10 only functions can."""
+    """Return a callable for ``_CALL``: on Python 3.10 only functions work."""
     if _EXPORTED or isinstance(target, FunctionType):
         return target
 
@@ -153,21 +153,21 @@ class RedirectedMethod:
         place.function = id(target)
 
     def restore(self) -> None:
-        """Let the method be what it was."""
+        """Undo the redirection."""
         _Method.from_address(id(self._method)).function = self._saved
         _count_down(id(self._target))
 
 
 def redirect(stack: ExitStack, function: Any, make: Callable[[Any], Callable[..., Any]]) -> None:
-    """Redirect a built-in function to what ``make`` makes of a copy of it, until ``stack`` ends."""
+    """Redirect a built-in function to ``make(copy of it)`` until ``stack`` ends."""
     stack.callback(Redirected(function, make(copy_of(function))).restore)
 
 
-def redirect_read(
+def redirect_reader(
     stack: ExitStack, function: Any, make: Callable[[Any], Callable[[dict[str, Any]], Any]]
 ) -> None:
-    """Redirect in the same way one that takes no arguments; ``RedirectedRead`` says to what."""
-    stack.callback(RedirectedRead(function, make(copy_of(function))).restore)
+    """Redirect a built-in function without arguments; see ``RedirectedReader``."""
+    stack.callback(RedirectedReader(function, make(copy_of(function))).restore)
 
 
 def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) -> None:
@@ -176,10 +176,24 @@ def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) ->
     setattr(owner, name, value)
 
 
+def redirect_function(
+    stack: ExitStack, module: Any, name: str, make: Callable[[Any], Callable[..., Any]]
+) -> None:
+    """Redirect a function of C or Python, if the module has it, wherever it is bound."""
+    function = getattr(module, name, None)
+    if isinstance(function, BuiltinFunctionType):
+        redirect(stack, function, make)
+    elif function is not None:
+        replacement = wraps(function)(make(function))
+        for owner in list(sys.modules.values()):
+            if getattr(owner, "__dict__", {}).get(name) is function:
+                replace_attribute(stack, owner, name, replacement)
+
+
 def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
     """Return a second function object that does what ``function`` does now.
 
-    Of one that is redirected that is what it calls: its definition will go.
+    Of a redirected function this is its target, because its definition will be gone.
     """
     place = _Function.from_address(id(function))
     definition = place.definition
@@ -196,7 +210,7 @@ def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
 
 
 def method_of(kind: type, name: str, function: Any) -> Callable[..., Any]:
-    """Return a function of CPython's that takes an object of ``kind`` as one of Python."""
+    """Return a C function of CPython that takes an object of ``kind``, as a Python function."""
     address = ctypes.cast(function, ctypes.c_void_p).value
     definition = _MethodDef(name.encode(), address, _NO_ARGUMENTS, None)
     _kept.append(definition)
@@ -209,6 +223,6 @@ _kept: list[_MethodDef] = []
 
 def _unknown_layout() -> SetupError:
     return SetupError(
-        f"Python {sys.version.split()[0]} ({sys.implementation.name}) keeps its functions in a way "
+        f"Python {sys.version.split()[0]} ({sys.implementation.name}) has a layout of functions "
         "that the guard does not know; write 'guard: false' in the job to record without it"
     )

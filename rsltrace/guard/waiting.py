@@ -1,8 +1,8 @@
-"""Waiting for what is outside of the run, in threads and event loops: others go on meanwhile.
+"""Waiting for something outside of the run, while other threads and event loops go on.
 
-Simulated time then passes as fast as real time does, in steps of a millisecond. The trace keeps how
-many steps it took, and a re-run takes as many without waiting for anything. A program that answers
-or ends soon takes no simulated time at all: how long it takes is another matter in each run.
+Simulated time passes as fast as real time, in steps of a millisecond. The trace keeps the number of
+steps, and a re-run takes as many without waiting. A program that answers or ends soon takes no
+simulated time: its duration differs in each run.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.context import STEP_NS, Context
+from rsltrace.guard.context import STEP_NS, SimulationContext
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import present_import
@@ -23,15 +23,15 @@ from rsltrace.trace.model.finding import Mode, Source
 from rsltrace.trace.model.texts import patience_ns
 
 NOT_YET: Any = object()
-"""What somebody who looks for an answer returns if there is none."""
+"""The result of an attempt that found no answer."""
 
 Attempt = Callable[[float], Any]
-"""Waits in real time, at most the given seconds, and returns the answer or ``NOT_YET``."""
+"""Waits in real time, at most the given seconds; returns the answer or ``NOT_YET``."""
 
 _PROGRAM_S = 5.0
-"""How long simulated time stands still, in real seconds, for a program that was started."""
+"""How many real seconds simulated time stands still for a started program."""
 _OF_A_PROGRAM = ("_communicate", "_try_wait")
-"""Where ``subprocess`` waits for the output of a program, and for its end."""
+"""The functions of ``subprocess`` that wait for a program's output and end."""
 
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
 _sleep = copy_of(time.sleep)  # type: ignore[arg-type]
@@ -45,28 +45,30 @@ def wait_recorded(
     look: Attempt,
     frame: FrameType,
     *,
-    of: int,
+    number: int,
     timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
-    """Return the answer to a call that waits for it, or None if it does not come in time.
+    """Return the answer to a call that waits for it, or None after the timeout.
 
-    ``step`` lets simulated time pass; if it returns True, somebody else ends the wait.
+    ``step`` lets simulated time pass; if it returns True, the wait ends.
 
-    :raises OSError: if that is what was answered.
+    :raises OSError: if that is the answer.
     """
     context = guard.context
     step = step or context.step
     deadline_ns = _deadline_ns(context, timeout_s)
-    steps, first_s = 0, at_first_s(frame, timeout_s)
-    kept = guard.answers.next_answer(context.node(), call, of) if guard.answers.replays else None
+    steps, first_s = 0, initial_wait_s(frame, timeout_s)
+    kept = (
+        guard.answers.next_answer(context.node(), call, number) if guard.answers.replays else None
+    )
     text: str | None = None
     try:
         while True:
             if kept is None:
                 with engage(None):
                     seconds = guard.pace.ahead_s(context.now_ns()) if steps else first_s
-                    text = _looked(look, seconds)
+                    text = _attempt_text(look, seconds)
                 if text is not None:
                     break
             elif steps >= kept.steps and kept.text is not None:
@@ -84,8 +86,9 @@ def wait_recorded(
                 text = "null"
                 break
     finally:
-        # None: the run ends before the answer has come, and a re-run will wait as long for it.
-        guard.found(source, Mode.RECORD, call, finding_value(of, steps, text), frame)
+        # the run ends: None: the run ends before the answer comes, and a re-run waits as long for
+        # it.
+        guard.report(source, Mode.RECORD, call, finding_value(number, steps, text), frame)
     return decoded(text)
 
 
@@ -96,19 +99,19 @@ def wait_unrecorded(
     timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
-    """Wait in the same way for what is not recorded; return it, or None if it comes too late.
+    """Wait in the same way for an answer that is not recorded; None after the timeout.
 
-    A thread that blocked for real would keep all others from going on, even those it waits for.
+    A thread that blocked for real would stop all others, even those that it waits for.
     """
     context, steps = guard.context, 0
     step = step or context.step
-    first_s = at_first_s(frame, timeout_s)
+    first_s = initial_wait_s(frame, timeout_s)
     deadline_ns = _deadline_ns(context, timeout_s)
     while True:
         with engage(None):
             found = look(guard.pace.ahead_s(context.now_ns()) if steps else first_s)
         if found is not NOT_YET:
-            # Who always finds something may look at what another thread is to fetch.
+            # Code that always finds an answer may wait for what another thread should fetch.
             if steps == 0 and not first_s and guard.pace.is_greedy():
                 context.step(STEP_NS)
             return found
@@ -123,15 +126,15 @@ def wait_unrecorded(
         steps += 1
 
 
-def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
+def _deadline_ns(context: SimulationContext, timeout_s: float | None) -> int | None:
     return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
 
 
-def at_first_s(frame: FrameType, timeout_s: float | None) -> float:
-    """Return how long simulated time stands still for whoever waits, in real seconds.
+def initial_wait_s(frame: FrameType, timeout_s: float | None) -> float:
+    """Return how many real seconds simulated time stands still for the waiting code.
 
-    It does for a program of ``subprocess``, but not for one that can still be told something: it
-    may wait for the run. Until a program has begun that does not matter.
+    Not 0 for programs of ``subprocess`` without an open stdin: those with one may wait for the run.
+    Until a program has started, that does not matter.
     """
     if frame.f_globals.get("__name__") != "subprocess":
         return 0.0
@@ -144,9 +147,9 @@ def at_first_s(frame: FrameType, timeout_s: float | None) -> float:
 
 
 def waiting_guard(frame: FrameType) -> Guard | None:
-    """Return the guard if whoever calls from ``frame`` is to wait like that.
+    """Return the guard if the code at ``frame`` should wait like that, or None.
 
-    Threads are, and multiprocessing anywhere: it has threads of its own that must go on.
+    Threads do, and multiprocessing everywhere: it has threads of its own that must go on.
     """
     guard = engaged()
     if guard is None or present_import() is not None or not guard.context.can_step():
@@ -157,7 +160,7 @@ def waiting_guard(frame: FrameType) -> Guard | None:
     return None
 
 
-def _looked(look: Attempt, seconds: float) -> str | None:
+def _attempt_text(look: Attempt, seconds: float) -> str | None:
     found: list[Any] = []
 
     def real() -> Any:
@@ -168,8 +171,8 @@ def _looked(look: Attempt, seconds: float) -> str | None:
     return None if found and found[0] is NOT_YET else text
 
 
-def when_readable(fd: int, real: Callable[[], Any]) -> Attempt:
-    """Return a look that does ``real`` as soon as there is something to read."""
+def wait_readable(fd: int, real: Callable[[], Any]) -> Attempt:
+    """Return an attempt that calls ``real`` as soon as there is something to read."""
 
     def look(seconds: float) -> Any:
         waiting = _poll()
@@ -179,8 +182,8 @@ def when_readable(fd: int, real: Callable[[], Any]) -> Attempt:
     return look
 
 
-def polled(real: Callable[[], Any]) -> Attempt:
-    """Return a look at something that nobody can wait for: ``real`` returns it, or ``NOT_YET``."""
+def poll_until(real: Callable[[], Any]) -> Attempt:
+    """Return an attempt for what cannot be waited for: ``real`` returns it, or ``NOT_YET``."""
 
     def look(seconds: float) -> Any:
         until_s = _monotonic() + seconds

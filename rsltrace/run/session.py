@@ -198,7 +198,7 @@ class Session:
         self.world.stacks.runners.process = pid
         guard = self._guarded.guard
         if guard is not None:
-            guard.goes_on_in(pid)
+            guard.continue_in(pid)
             for one, other in pairs:
                 guard.descriptors.join(one, other)
 

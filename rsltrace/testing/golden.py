@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
 
 from rsltrace.errors import OutputError, RsltraceError, TraceError
-from rsltrace.trace.model.regular_file import in_the_way
+from rsltrace.trace.model.regular_file import in_the_way, replacement_of
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
@@ -127,15 +126,11 @@ def _write(run: Path, golden: Path) -> bool:
         pass  # missing, damaged or of an older format: what the update is for
     if kind := in_the_way(golden):
         raise OutputError(f"the golden trace {golden} cannot be written: it is {kind}")
-    # Beside the target first: an interrupted copy must not leave half a golden trace.
-    part = golden.with_name(golden.name + ".part")
     try:
         golden.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(run, part)
-        part.replace(golden)
+        with replacement_of(golden) as work:
+            shutil.copyfile(run, work)
     except OSError as error:
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
         reason = error.strerror or error
         raise OutputError(f"the golden trace {golden} cannot be written: {reason}") from error
     return True

@@ -1,5 +1,1 @@
-"""The trace file: what is in it (``format``), how it is written, how it is read. No ROS needed.
-
-``writer.TraceWriter`` and ``reader.Trace`` are the two things the rest of rsltrace uses;
-``docs/trace-format.md`` describes the file for everybody else.
-"""
+"""The trace: its format, reader and writer, bags, and the words for its events."""

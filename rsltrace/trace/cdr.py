@@ -1,7 +1,7 @@
-"""The rsltrace messages that hold strings, as CDR.
+"""rsltrace's own messages with strings, as CDR.
 
-Events and outputs are fixed-size and packed by ``struct``; the others are few and small, and
-writing them needs four rules of CDR, not a code generator.
+Events and outputs have a fixed size and are packed by ``struct``; the others are few and small, and
+need four rules of CDR, not a code generator.
 """
 
 from __future__ import annotations
@@ -18,14 +18,13 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import CodeLine
 from rsltrace.trace.model.finding import Finding, Mode, Source
 
-# Texts of 16-bit characters (``wstring``), which rosbags does not read.
-#
-# In CDR, as ROS 2 writes it, one is a sequence of numbers of 32 bits, a UTF-16 unit in each. So a
-# schema is read with a message of such a sequence in its place, which becomes a text once decoded.
+# Strings of 16-bit characters (``wstring``), which rosbags does not read. In CDR, as ROS 2 writes
+# it, each is a sequence of 32-bit numbers, one per UTF-16 unit. So a schema is read with a message
+# of such a sequence instead, which becomes a string once decoded.
 
-_STAND_IN = "rsltrace_wide/Text"
-STAND_IN_TYPE = "rsltrace_wide/msg/Text"
-_DEFINITION = f"\n{'=' * 80}\nMSG: {_STAND_IN}\nuint32[] units\n"
+_WIDE_TEXT = "rsltrace_wide/Text"
+WIDE_TEXT_TYPE = "rsltrace_wide/msg/Text"
+_DEFINITION = f"\n{'=' * 80}\nMSG: {_WIDE_TEXT}\nuint32[] units\n"
 _FIELD = re.compile(
     r"^([ \t]*)wstring(?:<=\d+)?(\[[^\]\n]*\])?([ \t]+[A-Za-z]\w*)[ \t]*"
     r"(?:(=.*)|[\"'].*|#.*)?$",
@@ -33,8 +32,8 @@ _FIELD = re.compile(
 )
 
 
-def without_wide_texts(schema: str) -> str:
-    """Return a schema in which all wide texts are of another type; itself if it has none."""
+def replace_wide_texts(schema: str) -> str:
+    """Return a schema with another type for all wide strings; the same object if it has none."""
     if "wstring" not in schema:
         return schema
     replaced, count = _FIELD.subn(_replaced, schema)
@@ -45,19 +44,19 @@ def _replaced(field: re.Match[str]) -> str:
     indent, array, name, constant = field.groups()
     if constant:
         return f"{indent}string{name}{constant}"
-    return f"{indent}{_STAND_IN}{array or ''}{name}"
+    return f"{indent}{_WIDE_TEXT}{array or ''}{name}"
 
 
-def with_wide_texts(value: Any) -> Any:
-    """Return a decoded message with texts where its schema has wide texts.
+def restore_wide_texts(value: Any) -> Any:
+    """Return a decoded message with strings where its schema has wide strings.
 
-    Raises ValueError for what is no UTF-16.
+    Raises ValueError for invalid UTF-16.
     """
     if isinstance(value, list):
-        return [with_wide_texts(item) for item in value]
+        return [restore_wide_texts(item) for item in value]
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return value
-    if getattr(value, "__msgtype__", "") == STAND_IN_TYPE:
+    if getattr(value, "__msgtype__", "") == WIDE_TEXT_TYPE:
         units: Any = getattr(value, "units")  # noqa: B009 (of a class made at run time)
         if len(units) and units.max() > 0xFFFF:
             raise ValueError("a character of a wide text is larger than 16 bits")
@@ -65,7 +64,7 @@ def with_wide_texts(value: Any) -> Any:
     for field in dataclasses.fields(value):
         inner = getattr(value, field.name)
         if isinstance(inner, list) or dataclasses.is_dataclass(inner):
-            setattr(value, field.name, with_wide_texts(inner))
+            setattr(value, field.name, restore_wide_texts(inner))
     return value
 
 
@@ -80,13 +79,13 @@ _KINDS = frozenset(map(int, EntityKind))
 def pack_entity(entity: Entity) -> bytes:
     """Return an ``rsltrace_msgs/msg/Entity``. Its ``created_ns`` is the time of the message."""
     head = CDR_HEADER + _ENTITY_HEAD.pack(entity.id, entity.node, entity.kind)
-    # Sorted keys: equal details give equal bytes however the recorder came by them.
+    # Sorted keys: equal details give equal bytes.
     detail = json.dumps(entity.detail, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
     return _append_strings(head, entity.name, entity.type, detail)
 
 
 def unpack_entity(data: bytes, created_ns: int) -> Entity:
-    """Return the entity of one message. Raises TraceError when the bytes are not one."""
+    """Return the entity of a message. Raises TraceError for invalid bytes."""
     try:
         _check_header(data)
         entity_id, node, kind = _ENTITY_HEAD.unpack_from(data, 4)
@@ -109,12 +108,12 @@ def _json(text: str) -> object:
 
 
 def pack_detail(event: int, output: int, text: str) -> bytes:
-    """Return an ``rsltrace_msgs/msg/Detail``: the text that belongs to one output of one event."""
+    """Return an ``rsltrace_msgs/msg/Detail``: the text of one output of one event."""
     return _append_strings(CDR_HEADER + _DETAIL_HEAD.pack(event, output), text)
 
 
 def unpack_detail(data: bytes) -> tuple[int, int, str]:
-    """Return (event, output, text). Raises TraceError when the bytes are not a detail."""
+    """Return (event, output, text). Raises TraceError for invalid bytes."""
     try:
         _check_header(data)
         event, output = _DETAIL_HEAD.unpack_from(data, 4)
@@ -132,7 +131,7 @@ def pack_finding(finding: Finding) -> bytes:
 
 
 def unpack_finding(data: bytes) -> Finding:
-    """Return the finding of one message. Raises TraceError when the bytes are not one."""
+    """Return the finding of a message. Raises TraceError for invalid bytes."""
     try:
         _check_header(data)
         event, entity = _DETAIL_HEAD.unpack_from(data, 4)
@@ -149,7 +148,7 @@ def pack_code_line(line: CodeLine) -> bytes:
 
 
 def unpack_code_line(data: bytes) -> CodeLine:
-    """Return the place of one message. Raises TraceError when the bytes are not one."""
+    """Return the code line of a message. Raises TraceError for invalid bytes."""
     try:
         _check_header(data)
         head = _LINE_HEAD.unpack_from(data, 4)
@@ -159,9 +158,9 @@ def unpack_code_line(data: bytes) -> CodeLine:
 
 
 def log_content(data: bytes, stamp_ns: int | None = None) -> bytes:
-    """Return what is hashed of an ``rcl_interfaces/msg/Log``: severity, name and message.
+    """Return the hashed content of an ``rcl_interfaces/msg/Log``: severity, name and message.
 
-    Of bytes that are none, or not one of time ``stamp_ns``, something else.
+    Empty for other bytes, or if its time is not ``stamp_ns``.
     """
     try:
         _check_header(data)
@@ -178,7 +177,7 @@ def _append_strings(head: bytes, *texts: str) -> bytes:
     data = bytearray(head)
     for text in texts:
         data += bytes(-(len(data) - 4) % 4)  # a string's length is aligned to 4, after the header
-        # A name may hold what is not valid Unicode (surrogates from os.fsdecode): keep it readable.
+        # A name may contain invalid Unicode (surrogates from os.fsdecode): keep it readable.
         encoded = text.encode("utf-8", "backslashreplace") + b"\0"
         data += _LENGTH.pack(len(encoded)) + encoded
     return bytes(data)

@@ -1,15 +1,14 @@
-"""The hashes that make a run comparable: one chain over all events, one fold over their outputs.
+"""The hashes that make runs comparable: a chain over all events, a fold over their outputs.
 
     chain_0 = H(rest_0, seed 0)          chain_i = H(rest_i, seed chain_{i-1})
 
-where ``rest_i`` is event i as packed by ``EVENT_REST`` (everything but the chain hash itself) and
-H is XXH3-64. A chain hash thus stands for the whole run up to its event, and two traces agree up
-to event i exactly when their chain hashes agree at i. An event's output hash folds its outputs:
+where ``rest_i`` is event i as packed by ``EVENT_REST`` (without the chain hash) and H is XXH3-64. A
+chain hash covers the run up to its event: two traces agree up to event i exactly when their chain
+hashes agree at i. An event's output hash folds its outputs:
 
     h = 0, then for each output in order: h = H(packed[OUTPUT_HASHED], seed h)
 
-XXH3 is fast and well distributed, not cryptographic: it finds differences, it does not stop
-somebody who wants two runs to collide.
+XXH3 is not cryptographic: it finds differences, but cannot stop somebody who wants runs to collide.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_HASHED
 from rsltrace.trace.model.entity import Entity
 
 hash64 = xxhash.xxh3_64_intdigest
-"""``hash64(data: bytes, seed: int = 0) -> int``: XXH3-64 as an unsigned integer. The library's
-function itself and not a wrapper of it, since the loop calls this several times per event."""
+"""``hash64(data: bytes, seed: int = 0) -> int``: XXH3-64. The library's own function without a
+wrapper, since the loop calls it several times per event."""
 
 
 def digest_text(chain_hash: int) -> str:
-    """Return a run's digest as people see it: its last chain hash (0: no events) in hex."""
+    """Return a run's digest: its last chain hash (0: no events) in hex."""
     return f"{chain_hash:016x}"
 
 
@@ -40,7 +39,7 @@ def identity_hash(entity: Entity) -> int:
 
 
 def output_hash(packed_outputs: Iterable[bytes]) -> int:
-    """Return the output hash of an event from its outputs as packed by ``OUTPUT``, in order."""
+    """Return the output hash of an event from its outputs, packed by ``OUTPUT``, in order."""
     folded = 0
     for packed in packed_outputs:
         folded = hash64(packed[OUTPUT_HASHED], folded)
@@ -50,9 +49,8 @@ def output_hash(packed_outputs: Iterable[bytes]) -> int:
 def verify_chain(events: npt.NDArray[np.void], previous: int = 0) -> int | None:
     """Check the chain hashes of consecutive events.
 
-    ``events`` has the fields of ``EVENT_DTYPE``, shape (n,); ``previous`` is the chain hash of the
-    event before the first (0 at the start of a run). Returns the position in ``events`` of the
-    first event whose chain hash is not that of its contents, or None.
+    ``events`` is EVENT_DTYPE, shape (n,); ``previous`` is the chain hash before the first (0 at the
+    start). Returns the position of the first event whose chain hash is wrong, or None.
     """
     packed = np.ascontiguousarray(events, dtype=EVENT_DTYPE).tobytes()
     size = EVENT_DTYPE.itemsize

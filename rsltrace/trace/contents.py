@@ -1,7 +1,7 @@
-"""Checking that messages and entities are those that the hashes of the events stand for.
+"""Check messages and entities against the hashes of the events, and count a trace.
 
-The chain covers them by the content hashes of outputs. Readers do not compute these anew: that
-takes reading all of the file, and a file that was damaged has checksums that do not fit.
+The chain covers contents by the hashes of outputs. Reading does not compute these again: that needs
+the whole file, and damage is found by its checksums.
 """
 
 from __future__ import annotations
@@ -23,14 +23,12 @@ from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.reader import Trace
 
-# Counting a trace: how many events and outputs, of what kinds, of which entities, how often.
-
 _ENTITY = int(OutputKind.ENTITY)
 
 
 @dataclass(slots=True)
 class Series:
-    """Things that happened: how many, the first and the last of them (simulated ns)."""
+    """Occurrences of something: their number, the first and the last (simulated ns)."""
 
     count: int = 0
     first_ns: int = 0
@@ -38,7 +36,7 @@ class Series:
 
     @property
     def rate_hz(self) -> float | None:
-        """How often per simulated second, from the first to the last; None for fewer than two."""
+        """The rate per simulated second from the first to the last; None for fewer than two."""
         span_ns = self.last_ns - self.first_ns
         return (self.count - 1) * NS_PER_S / span_ns if span_ns > 0 else None
 
@@ -51,9 +49,9 @@ class Series:
 
 @dataclass(slots=True)
 class Counts:
-    """A whole trace, counted. Keys are the numbers of entities and kinds as the trace has them.
+    """The counts of a whole trace, by entity and by kind.
 
-    The creation of an entity is an output (and counted by kind), but not one of that entity's own.
+    The creation of an entity is an output (counted by kind), but not one of that entity.
     """
 
     events: dict[int, Series] = field(default_factory=dict)
@@ -62,13 +60,13 @@ class Counts:
     output_kinds: Counter[int] = field(default_factory=Counter)
 
     def rate_hz(self, entity: int) -> float | None:
-        """How often an entity ran, or (for one that never runs, as publishers) sent something."""
+        """The rate at which an entity ran or, if it never runs (publishers), sent."""
         series = self.events.get(entity) or self.outputs.get(entity)
         return series.rate_hz if series else None
 
 
 def count(trace: Trace) -> Counts:
-    """Read all events and outputs of ``trace``, a segment at a time, and count them.
+    """Count all events and outputs of ``trace``, a segment at a time.
 
     Raises TraceError where the trace is damaged.
     """
@@ -87,7 +85,7 @@ def count(trace: Trace) -> Counts:
 def add_series(
     series: dict[int, Series], entities: npt.NDArray[np.uint32], stamps: npt.NDArray[np.uint64]
 ) -> None:
-    """Add rows to the series of their entities: how many, the first time and the last."""
+    """Add rows to the series of their entities."""
     ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
     first = np.full(len(ids), 2**64 - 1, dtype=np.uint64)
     last = np.zeros(len(ids), dtype=np.uint64)
@@ -107,21 +105,21 @@ _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, Ou
 
 
 @dataclass(slots=True)
-class _Messages:
-    """The messages of a channel, in order: content hashes (as a log record, too) and times."""
+class _ChannelContents:
+    """The messages of a channel in order: content hashes (also as log records) and times."""
 
     hashes: array[int] = field(default_factory=lambda: array("Q"))
     as_logs: array[int] = field(default_factory=lambda: array("Q"))
     stamps: array[int] = field(default_factory=lambda: array("Q"))
-    told: int = 0
-    """How many of them outputs speak of."""
+    referenced: int = 0
+    """The number of them that outputs refer to."""
 
 
 def check_contents(trace: Trace) -> None:
-    """Raise TraceError at a message or entity that no event has, or that an event had otherwise.
+    """Raise TraceError at a message or entity that does not match an event.
 
-    Reads all messages; takes 16 bytes of memory for each. Texts of details, findings and states
-    are for people, and covered by nothing.
+    Reads all messages, with 16 bytes of memory each. Texts of details, findings and states are not
+    covered: they are for people.
     """
     messages = _hashed(trace)
     entities: set[int] = set()
@@ -142,25 +140,25 @@ def check_contents(trace: Trace) -> None:
     if not trace.complete:
         return  # what events that were never written had to do with may be there
     for channel_id, found in messages.items():
-        if found.told != len(found.hashes):
-            raise _changed(
+        if found.referenced != len(found.hashes):
+            raise _changed_error(
                 trace,
                 f"{len(found.hashes)} messages on {trace.channels[channel_id].topic} are there, "
-                f"and its events speak of {found.told}",
+                f"and its events refer to {found.referenced}",
             )
     if extra := trace.entities.keys() - entities - {0}:
-        raise _changed(trace, f"no event has made its entity {min(extra)}")
+        raise _changed_error(trace, f"no event has made its entity {min(extra)}")
 
 
-def _hashed(trace: Trace) -> dict[int, _Messages]:
-    """Read all messages once."""
+def _hashed(trace: Trace) -> dict[int, _ChannelContents]:
+    """Hash all messages."""
     channels = {i: channel for i, channel in trace.channels.items() if _has_content(channel)}
-    found = {i: _Messages() for i in channels}
+    found = {i: _ChannelContents() for i in channels}
     for channel_id, stamp_ns, sequence, data in trace.messages_of(frozenset(channels)):
         of_channel = found[channel_id]
         if sequence != len(of_channel.hashes):
             topic = channels[channel_id].topic
-            raise _changed(trace, f"message {sequence} on {topic} is out of order")
+            raise _changed_error(trace, f"message {sequence} on {topic} is out of order")
         of_channel.hashes.append(hash64(data))
         of_channel.stamps.append(stamp_ns)
         if channels[channel_id].topic == TOPIC_ROSOUT:
@@ -175,7 +173,7 @@ def _has_content(channel: ChannelInfo) -> bool:
 
 def _check_messages(
     trace: Trace,
-    messages: dict[int, _Messages],
+    messages: dict[int, _ChannelContents],
     outputs: npt.NDArray[np.void],
     stamps: npt.NDArray[np.uint64],
 ) -> None:
@@ -187,27 +185,27 @@ def _check_messages(
     sender = trace.entity(entity)
     topic, type_name = _topic_of(output, sender)
     if channel is None or found is None or (channel.topic, channel.type) != (topic, type_name):
-        raise _changed(
+        raise _changed_error(
             trace, f"event {event} sent messages on {topic} ({type_name}), which has no channel"
         )
     numbers = outputs["sequence"].astype(np.int64)
     if int(numbers.max()) >= len(found.hashes):
-        raise _changed(trace, f"message {int(numbers.max())} on {channel.topic} is missing")
+        raise _changed_error(trace, f"message {int(numbers.max())} on {channel.topic} is missing")
     hashes = found.as_logs if output.kind is OutputKind.LOG else found.hashes
     wrong = np.frombuffer(hashes, dtype=np.uint64)[numbers] != outputs["hash"]
     wrong |= np.frombuffer(found.stamps, dtype=np.uint64)[numbers] != stamps
     if wrong.any():
         at = int(np.argmax(wrong))
-        raise _changed(
+        raise _changed_error(
             trace,
             f"message {int(numbers[at])} on {channel.topic} is not the one that event "
             f"{int(outputs['event'][at])} sent",
         )
-    found.told += len(numbers)
+    found.referenced += len(numbers)
 
 
 def _topic_of(output: Output, sender: Entity) -> tuple[str, str]:
-    """Return the topic and the type of what was sent."""
+    """Return the topic and the type of an output."""
     if output.kind is OutputKind.LOG:
         return TOPIC_ROSOUT, "rcl_interfaces/msg/Log"
     if output.kind is OutputKind.REQUEST:
@@ -220,8 +218,8 @@ def _topic_of(output: Output, sender: Entity) -> tuple[str, str]:
 def _check_entity(trace: Trace, outputs: npt.NDArray[np.void]) -> None:
     event, content_hash, entity, _, _ = outputs[-1].item()
     if content_hash != identity_hash(trace.entity(entity)):
-        raise _changed(trace, f"entity {entity} is not the one that event {event} made")
+        raise _changed_error(trace, f"entity {entity} is not the one that event {event} made")
 
 
-def _changed(trace: Trace, what: str) -> TraceError:
+def _changed_error(trace: Trace, what: str) -> TraceError:
     return TraceError(f"{trace.name}: {what}; the trace was changed after it was recorded")

@@ -1,10 +1,9 @@
-"""Messages of a trace as objects, decoded by the schemas that the trace itself carries.
+"""Decode messages of a trace into objects, by the schemas in the trace itself.
 
 rosbags generates a Python decoder per type from schema text. A trace may come from anybody, so its
-schemas are checked before they reach that generator: only the parsed structure goes on, every name
-in it is a plain identifier, sizes and nesting are bounded, and constants (which decoding does not
-need) are left out. Those that name whole numbers are kept beside the classes, to be shown. Opening
-a trace runs none of this; only decoding a message does.
+schemas are checked first: only the parsed structure is used, every name is a plain identifier, and
+sizes and nesting are limited. Constants are not needed for decoding; integer ones are kept beside
+the classes, for display. Opening a trace runs none of this.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.cdr import STAND_IN_TYPE, with_wide_texts, without_wide_texts
+from rsltrace.trace.cdr import WIDE_TEXT_TYPE, replace_wide_texts, restore_wide_texts
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.mcap import records as limits
 from rsltrace.trace.mcap.records import SCHEMA_ENCODING
@@ -44,14 +43,14 @@ _NESTING_MAX = 32
 _ARRAY_ITEMS_MAX = 1 << 32
 
 
-_MISFITS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, MemoryError)
-"""What rosbags' decoders raise, some only in older versions, when data does not fit its type."""
+_DECODING_ERRORS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, MemoryError)
+"""Errors of rosbags' decoders, some only of older versions, for data that does not fit."""
 
 
 class Decoder:
     """Decodes the messages of one channel's schema: type ``name``, defined in ``types``.
 
-    With ``wide_texts`` it has some, in whose place ``types`` have messages.
+    ``wide_texts``: the schema has some, which ``types`` define as messages.
     """
 
     def __init__(self, channel: ChannelInfo) -> None:
@@ -63,23 +62,23 @@ class Decoder:
             raise self._unusable(f"it is longer than {limits.SCHEMA_BYTES_MAX} characters")
         if not _TYPE_NAME.fullmatch(channel.type):
             raise self._unusable(f"{channel.type!r} is no name of a type")
-        # Types named without a package are looked up beside the type: those a service names are in
-        # the package's msg folder, as if the request or response stood there itself.
+        # Types without a package are in the package of the type; those that a service names are in
+        # the package's msg folder.
         self.name = normalize_msgtype(channel.type.replace("/srv/", "/msg/", 1))
-        schema = without_wide_texts(channel.schema_text)
+        schema = replace_wide_texts(channel.schema_text)
         self.wide_texts = schema is not channel.schema_text
         try:
             types = get_types_from_msg(schema, self.name)
             self.types: dict[str, Any] = {
                 name: ([], _checked_fields(name, types)) for name in types
             }
-            self.items = sum(map(_unrolled, self.types.values()))
+            self.items = sum(map(_unrolled_items, self.types.values()))
             if self.items > limits.SCHEMA_ITEMS_MAX:
                 raise _UnsafeSchema(f"its fixed arrays have {self.items} strings or messages")
             depths: dict[str, int] = {}
             for name in types:
                 _nesting(name, types, depths)
-            # A store of its own per schema: two channels may define one type in different ways.
+            # A store per schema: two channels may define one type differently.
             self._store = Typestore()
             self._store.register(self.types)
             self._store.get_msgdef(self.name)
@@ -92,26 +91,25 @@ class Decoder:
     def decode(self, data: bytes) -> object:
         """Return the message, an instance of a class made for its type. Raises TraceError.
 
-        Arrays and sequences of numbers are numpy arrays; fields are attributes by their ROS names
-        (with an underscore behind those that Python reserves).
+        Arrays of numbers are numpy arrays; fields are attributes by their ROS names (with an
+        underscore behind Python's keywords).
         """
         try:
             message = self._store.deserialize_cdr(data, self.name)
-            return with_wide_texts(message) if self.wide_texts else message
-        except _MISFITS as error:
+            return restore_wide_texts(message) if self.wide_texts else message
+        except _DECODING_ERRORS as error:
             raise TraceError(
                 f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "
                 f"{error}"
             ) from error
 
     def fields_of(self, interface: str) -> dict[str, str] | None:
-        """Return the fields of one of the schema's types, with the types of those that are messages
-        (others: empty); None if it is not in the schema."""
+        """Return the fields of a type with their message types (others: empty), None if unknown."""
         found = self.types.get(interface)
         if found is None:
             return None
         return {
-            name: str(detail) if kind == Nodetype.NAME and detail != STAND_IN_TYPE else ""
+            name: str(detail) if kind == Nodetype.NAME and detail != WIDE_TEXT_TYPE else ""
             for name, (kind, detail) in found[1]
             if name not in PLACEHOLDERS
         }
@@ -137,7 +135,7 @@ class Decoder:
 
 
 class Decoders:
-    """The decoders of a trace: one for all channels of a schema, within limits for all schemas."""
+    """The decoders of a trace: one per schema, within limits for all schemas."""
 
     def __init__(self) -> None:
         self._by_channel: dict[int, Decoder] = {}
@@ -168,7 +166,7 @@ class Decoders:
 
 
 def to_plain(value: object) -> Any:
-    """Return a decoded message as what ``json`` writes: dicts, lists, numbers, strings.
+    """Return a decoded message for ``json``: dicts, lists, numbers, strings.
 
     JSON has no NaN or infinity; they become the strings ``NaN``, ``Infinity``, ``-Infinity``.
     """
@@ -195,7 +193,7 @@ _PLAIN = (int, str, bool, type(None))
 
 @lru_cache(maxsize=4096)
 def field_names(kind: Any) -> tuple[str, ...] | None:
-    """Return the names of the fields of decoded messages of a class; None if it is none."""
+    """Return the field names of a decoded message class; None for other classes."""
     if not dataclasses.is_dataclass(kind):
         return None
     names = (field.name for field in dataclasses.fields(kind))
@@ -203,11 +201,11 @@ def field_names(kind: Any) -> tuple[str, ...] | None:
 
 
 class _UnsafeSchema(ValueError):
-    """The schema says something that no ROS interface says."""
+    """The schema contains something that no ROS interface contains."""
 
 
 def _constants(definition: Any) -> list[tuple[str, str, int]]:
-    """Return the whole numbers that a message definition gives names to."""
+    """Return the integer constants of a message definition."""
     constants, fields = definition
     taken = {name for name, _ in fields}
     found = {
@@ -222,7 +220,7 @@ def _constants(definition: Any) -> list[tuple[str, str, int]]:
 
 
 def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:
-    """Return the fields of type ``name`` after checking all that the generator makes code of."""
+    """Return the fields of type ``name`` after checking everything that becomes code."""
     if not _TYPE_NAME.fullmatch(name):
         raise _UnsafeSchema(f"{name!r} is no name of a type")
     fields: list[tuple[str, Any]] = types[name][1]
@@ -236,8 +234,8 @@ def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:
     return fields
 
 
-def _unrolled(definition: tuple[list[Any], list[tuple[str, Any]]]) -> int:
-    """Return for how many items the generator writes a statement: those of fixed arrays."""
+def _unrolled_items(definition: tuple[list[Any], list[tuple[str, Any]]]) -> int:
+    """Return the number of items for which code is generated: those of fixed arrays."""
     arrays = [detail for _, (kind, detail) in definition[1] if kind == Nodetype.ARRAY]
     return sum(n for item, n in arrays if item[0] == Nodetype.NAME or item[1][0] == "string")
 
@@ -256,7 +254,7 @@ def _check_type(description: Any, types: dict[str, Any]) -> None:
         if item[0] not in (Nodetype.BASE, Nodetype.NAME):
             raise _UnsafeSchema("it has an array of arrays")
         _check_type(item, types)
-        # A fixed array of nothing would let arrays of arrays count forever without using data.
+        # Arrays of empty fixed arrays could count forever without using data.
         smallest = 1 if kind == Nodetype.ARRAY else 0
         if not isinstance(size, int) or not smallest <= size <= _ARRAY_ITEMS_MAX:
             raise _UnsafeSchema(f"an array cannot have {size} items")
@@ -265,7 +263,7 @@ def _check_type(description: Any, types: dict[str, Any]) -> None:
 
 
 def _nesting(name: str, types: dict[str, Any], known: dict[str, int]) -> int:
-    """Return how deeply type ``name`` nests others; ``known`` keeps what was found before."""
+    """Return how deeply type ``name`` nests others; ``known`` caches results."""
     if name not in known:
         known[name] = _NESTING_MAX  # what a type that contains itself finds
         inner = [0]

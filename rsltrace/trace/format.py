@@ -1,7 +1,7 @@
-"""Names, layouts and limits of the trace format. ``docs/trace-format.md`` is the prose of it.
+"""Names, layouts and limits of the trace format, described in ``docs/trace-format.md``.
 
-A trace is a ROS 2 MCAP file. Events and outputs are fixed-size CDR messages in chunks of their
-own, so that a reader can view a whole chunk as one numpy array without parsing it.
+A trace is a ROS 2 MCAP file. Events and outputs are CDR messages of fixed size in their own chunks,
+so that a reader can view a chunk as one numpy array without parsing it.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import struct
 
 import numpy as np
 
-from rsltrace.trace.mcap.layout import MESSAGE_HEADER_DTYPE
-from rsltrace.trace.mcap.records import Header
+from rsltrace.trace.mcap.chunk_builder import MESSAGE_HEADER_DTYPE
+from rsltrace.trace.mcap.records import McapHeader
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"
 LIBRARY = "rsltrace"
-"""What the header names as the writer, before the version."""
+"""The writer named in the header, before the version."""
 
 TOPIC_EVENTS = "/rsltrace/events"
 TOPIC_OUTPUTS = "/rsltrace/outputs"
@@ -34,7 +34,7 @@ PREFIX_RESPONSE = "/rsltrace/response"
 
 METADATA_OWN = "rsltrace:"
 METADATA_FORMAT = "rsltrace:format"
-"""The first record after the header, so that an interrupted file says what it is, too."""
+"""The first record after the header, so that an interrupted file is recognized, too."""
 METADATA_JOB = "rsltrace:job"
 METADATA_SOURCES = "rsltrace:sources"
 METADATA_CODE = "rsltrace:code"
@@ -45,26 +45,26 @@ METADATA_EDITS = "rsltrace:edits"
 METADATA_RESULT = "rsltrace:result"
 METADATA_FED = "rsltrace:fed"
 METADATA_NATIVE = "rsltrace:native"
-"""Only in traces of native runs: middleware, executors, clocks. See ``trace.timings``."""
+"""Only in traces of native runs: middleware, executors, clocks. See ``trace.native``."""
 METADATA_ROSBAG2 = "rosbag2"
 CHECKSUM_KEY = "checksum"
-"""In each metadata record of ours: its checksum, so that what is stored is checked when read."""
+"""The checksum in each metadata record of rsltrace."""
 CHECKSUMS_KEY = "checksums"
-"""In ``rsltrace:format``: of what kind the checksums are; missing in files without."""
+"""The kind of checksum, in ``rsltrace:format``; missing in files without."""
 ATTACHMENT_JOB = "job.yaml"
 ATTACHMENT_INDEX = "rsltrace/segments"
 
 EVENTS_PER_SEGMENT = SEGMENT_EVENTS
-"""Events are written in segments of this many: small enough to lose little when a run is killed
-and to read little when a diff looks one up, large enough to compress well."""
+"""Small enough to lose little of a killed run and to read little for one event, large enough to
+compress well."""
 
 OUTPUTS_PER_SEGMENT = 65536
-"""A segment ends early with the event that brings it to this many outputs: memory stays bounded
-even when every event publishes thousands of messages."""
+"""The event that reaches this number of outputs ends a segment early: memory stays bounded even if
+every event publishes thousands of messages."""
 
 PAYLOAD_BYTES_PER_CHUNK = 512 << 10
-"""A payload chunk is closed once it holds at least this many bytes: a whole one has to be fetched
-to look at one message, and larger ones hardly compress better."""
+"""A payload chunk of at least this size is closed: reading one message needs a whole chunk, and
+larger ones hardly compress better."""
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 """Encapsulation of plain little-endian CDR (XCDR version 1)."""
@@ -149,7 +149,7 @@ string stack         # lines of user code, innermost first
 }
 
 EVENT_REST = struct.Struct("<QQQQQQIIIBB")
-"""A CallbackEvent after its chain hash: exactly the bytes the chain hash covers."""
+"""A CallbackEvent after its chain hash: the bytes that the chain hash covers."""
 
 EVENT_REST_DTYPE = np.dtype(
     [
@@ -170,17 +170,16 @@ EVENT_DTYPE = np.dtype([("chain_hash", "<u8"), *EVENT_REST_DTYPE.descr])
 
 OUTPUT = struct.Struct("<QQIII")
 OUTPUT_HASHED = slice(8, 24)
-"""The bytes of an output (hash, entity, kind) that the event's output hash covers. The sequence is
-left out so that an event with the same outputs hashes alike wherever it stands."""
+"""The bytes of an output (hash, entity, kind) that the event's output hash covers. Without the
+sequence, so that events with the same outputs hash equally."""
 
 OUTPUT_CONTENT = struct.Struct("<QII")
-"""These bytes alone: hash, entity, kind."""
+"""Only these bytes: hash, entity, kind."""
 
 OUTPUT_CONTENT_DTYPE = np.dtype([("hash", "<u8"), ("entity", "<u4"), ("kind", "<u4")])
 OUTPUT_DTYPE = np.dtype([("event", "<u8"), *OUTPUT_CONTENT_DTYPE.descr, ("sequence", "<u4")])
 
 TIMING = struct.Struct("<8QI")
-"""A Timing."""
 
 TIMING_DTYPE = np.dtype(
     [
@@ -214,15 +213,15 @@ SEGMENT_DTYPE = np.dtype(
         ("outputs_length", "<u8"),
     ]
 )
-"""One row per segment of the attachment ``rsltrace/segments``. ``first_output`` counts outputs from
-the start of the run; ``chain_hash`` is that of the segment's last event; offsets and lengths are
-those of the Chunk records in the file (0 and 0: no outputs in this segment)."""
+"""One row per segment of the attachment ``rsltrace/segments``. ``first_output`` counts from the
+start of the run; ``chain_hash`` is that of the segment's last event; offsets and lengths are those
+of the Chunk records (0 and 0: no outputs)."""
 
 
-def begins_a_trace(header: Header) -> bool:
-    """Whether a file with nothing whole after this header is a trace: its run was killed then."""
+def begins_a_trace(header: McapHeader) -> bool:
+    """Whether a file with only this header is a trace whose run was killed."""
     return header.profile == PROFILE and header.library.split(" ")[0] == LIBRARY
 
 
 REPLAY_DIVERGED = "the replay stopped at the first event that differs"
-"""The stop reason of a replay that was compared with its trace."""
+"""The stop reason of a replay that differs from its trace."""

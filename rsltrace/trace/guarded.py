@@ -1,4 +1,4 @@
-"""The guard's summary of a run, as the metadata ``rsltrace:guard`` holds it."""
+"""The guard's call counts, as in the metadata ``rsltrace:guard``."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rsltrace.trace.model.finding import GuardCount, Mode, Source
 
 
 def counts_text(counts: Iterable[GuardCount]) -> str:
-    """Return the summary as JSON, in an order of its own."""
+    """Return the counts as sorted JSON."""
     rows = [[c.source.value, c.mode.value, c.node, c.call, c.count] for c in counts]
     return json.dumps(sorted(rows), ensure_ascii=False)
 
 
 def parse_counts(text: str) -> tuple[GuardCount, ...]:
-    """Return the summary of ``counts_text``. Raises TraceError for anything else."""
+    """Return the counts of ``counts_text``. Raises TraceError for anything else."""
     try:
         return tuple(
             GuardCount(Source(source), Mode(mode), str(node), str(call), int(count))

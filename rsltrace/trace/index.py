@@ -1,4 +1,4 @@
-"""What is where in a trace file, and how the summary at its end tells.
+"""The index of a trace: where everything is in the file, from the summary at its end.
 
 An interrupted trace has no summary; ``scan`` makes the same index by walking the file.
 """
@@ -25,8 +25,7 @@ from rsltrace.trace.format import (
     SEGMENT_DTYPE,
 )
 from rsltrace.trace.mcap import chunk as mcap_chunk
-from rsltrace.trace.mcap import summary as mcap_summary
-from rsltrace.trace.mcap import walk
+from rsltrace.trace.mcap import reader as mcap_summary
 from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     CHUNK_BYTES_MAX,
@@ -34,51 +33,50 @@ from rsltrace.trace.mcap.records import (
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
-    ChunkIndex,
-    CutOff,
+    ChunkIndexEntry,
     Damaged,
     Fields,
-    Header,
-    Schema,
-    Span,
+    McapHeader,
+    McapSchema,
+    RecordSpan,
+    TruncatedFile,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary
 
-# Pieces of a trace file, each read with an error that says where it is damaged and what to do.
+# Parts of a trace file; errors say where it is damaged and what to do.
 
 _CRC_BYTES = 4
 _MESSAGE_BODY_MIN = MESSAGE_HEAD.size - RECORD_HEAD.size
 _RECORDS_PER_CHUNK_MAX = 1 << 17
-"""A chunk of payloads is closed once it holds half a megabyte, which has room for fewer."""
+"""More than fit into half a megabyte, at which a payload chunk is closed."""
 
 
-def damaged(source: ByteSource, offset: int, what: str, why: object) -> TraceError:
-    """Return the error for damage found at ``offset`` of the file."""
+def damage_error(source: ByteSource, offset: int, what: str, why: object) -> TraceError:
+    """Return the error for damage at ``offset`` of the file."""
     return TraceError(
         f"{source.name}: {what} at offset {offset} is damaged ({why}); "
         "copy the file again or record it again"
     )
 
 
-def read_body(source: ByteSource, span: Span, opcode: int, what: str) -> bytes:
+def read_body(source: ByteSource, span: RecordSpan, opcode: int, what: str) -> bytes:
     """Return the body of the record at ``span``. Raises TraceError if it is not such a record."""
     try:
-        return walk.read_body(source, span, opcode)
+        return mcap_summary.read_body(source, span, opcode)
     except Damaged as error:
-        raise damaged(source, span.offset, what, error) from error
+        raise damage_error(source, span.offset, what, error) from error
 
 
-def read_chunk(source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX) -> bytes:
+def read_chunk(source: ByteSource, span: RecordSpan, size_max: int = CHUNK_BYTES_MAX) -> bytes:
     """Return the records of the chunk at ``span``, their CRC checked. Raises TraceError."""
     try:
         return mcap_chunk.read_chunk(source, span, size_max)
     except Damaged as error:
-        raise damaged(source, span.offset, "the chunk", error) from error
+        raise damage_error(source, span.offset, "the chunk", error) from error
 
 
-def read_attachment(source: ByteSource, span: Span) -> bytes:
+def read_attachment(source: ByteSource, span: RecordSpan) -> bytes:
     """Return the data of the attachment at ``span``, its CRC checked. Raises TraceError."""
     body = read_body(source, span, Opcode.ATTACHMENT, "the attachment")
     content, crc = body[:-_CRC_BYTES], body[-_CRC_BYTES:]
@@ -91,20 +89,20 @@ def read_attachment(source: ByteSource, span: Span) -> bytes:
         fields.text()
         return fields.take(fields.u64())
     except Damaged as error:
-        raise damaged(source, span.offset, "the attachment", error) from error
+        raise damage_error(source, span.offset, "the attachment", error) from error
 
 
 def metadata_checksum(name: str, mapping: Mapping[str, str]) -> str:
     """Return the checksum of a metadata record: XXH3 of its name, keys and values, in hex.
 
-    A zero byte stands between them, and the keys are in their order.
+    The keys are sorted, and a zero byte separates the texts.
     """
     texts = [name, *chain.from_iterable(sorted(mapping.items()))]
     return xxhash.xxh3_64_hexdigest("\0".join(texts).encode())
 
 
-def read_metadata(source: ByteSource, span: Span, *, checked: bool = False) -> dict[str, str]:
-    """Return the mapping of the metadata record at ``span``, without the checksum it may have.
+def read_metadata(source: ByteSource, span: RecordSpan, *, checked: bool = False) -> dict[str, str]:
+    """Return the mapping of the metadata record at ``span``, without its checksum.
 
     ``checked``: it must have one. Raises TraceError.
     """
@@ -116,7 +114,7 @@ def read_metadata(source: ByteSource, span: Span, *, checked: bool = False) -> d
             raise Damaged(f"the checksum of {name!r} does not match")
         return mapping
     except Damaged as error:
-        raise damaged(source, span.offset, "the metadata", error) from error
+        raise damage_error(source, span.offset, "the metadata", error) from error
 
 
 def messages_in(records: bytes) -> Iterator[tuple[int, int]]:
@@ -132,9 +130,9 @@ def messages_in(records: bytes) -> Iterator[tuple[int, int]]:
 
 
 MESSAGE_INDEX_FIXED = 15
-"""Bytes of a message index around its entries: head of the record, channel, length."""
+"""Bytes of a message index besides its entries: record head, channel, length."""
 _INDEX_ENTRY_BYTES = 16
-_NO_SCHEMA = Schema(0, "", "", "")
+_NO_SCHEMA = McapSchema(0, "", "", "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,40 +148,39 @@ class ChannelInfo:
 
 
 class ChunkEntry(NamedTuple):
-    """A chunk: where it is, how many messages of each channel it holds, where their indexes are.
+    """A chunk: its span, its number of messages by channel, and the spans of their indexes.
 
-    A channel without an index (the file was cut off behind the chunk), or with one that has no
-    entries (events and outputs), is found by walking; its count is then 0.
+    A channel without index (the file was cut off behind the chunk), or with an empty one (events
+    and outputs), is found by walking; its count is then 0.
     """
 
-    span: Span
+    span: RecordSpan
     counts: Mapping[int, int]
-    indexes: Mapping[int, Span]
+    indexes: Mapping[int, RecordSpan]
 
 
 @dataclass(slots=True)
 class TraceIndex:
-    """Everything needed to find things in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
+    """Where everything is in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
 
-    ``checksums``: its own metadata have some. ``summary_start`` is where the data section is over
-    (0: nobody knows). ``chunks_with`` returns,
-    in file order, the chunks that hold messages of some channels: a long run has thousands, which
-    only payloads need and opening does not. It may raise Damaged.
+    ``checksums``: its own metadata have some. ``summary_start`` is the end of the data section (0:
+    unknown). ``chunks_with`` returns the chunks with messages of some channels, in file order; only
+    payloads need these, a long run has thousands. It may raise Damaged.
     """
 
     complete: bool
-    header: Header
+    header: McapHeader
     channels: dict[int, ChannelInfo] = field(default_factory=dict)
     message_counts: dict[int, int] = field(default_factory=dict)
-    metadata: dict[str, Span] = field(default_factory=dict)
-    attachments: dict[str, Span] = field(default_factory=dict)
+    metadata: dict[str, RecordSpan] = field(default_factory=dict)
+    attachments: dict[str, RecordSpan] = field(default_factory=dict)
     checksums: bool = False
     summary_start: int = 0
     segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
     chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
 
-    def take(self, summary: Summary) -> None:
-        """Take over what the records of the file say of it."""
+    def take(self, summary: mcap_summary.McapSummary) -> None:
+        """Add what the records of the file say."""
         self.metadata, self.attachments = summary.metadata, summary.attachments
         for channel_id, schema_id, topic, _, metadata in summary.channels.values():
             _, name, encoding, text = summary.schemas.get(schema_id, _NO_SCHEMA)
@@ -194,7 +191,7 @@ class TraceIndex:
             self.message_counts = summary.statistics.counts
 
 
-def read_header(source: ByteSource) -> tuple[Header, int]:
+def read_header(source: ByteSource) -> tuple[McapHeader, int]:
     """Return the header and the offset behind it. Raises TraceFormatError if it is not MCAP."""
     head = source.read_at(0, min(source.size, len(MAGIC)))
     if not head:
@@ -208,12 +205,12 @@ def read_header(source: ByteSource) -> tuple[Header, int]:
         )
     try:
         return mcap_summary.read_header(source)
-    except CutOff as error:
+    except TruncatedFile as error:
         raise TraceFormatError(
             f"{source.name} ends in its first record: nothing can be read of it"
         ) from error
     except Damaged as error:
-        raise damaged(source, len(MAGIC), "the header", error) from error
+        raise damage_error(source, len(MAGIC), "the header", error) from error
 
 
 def read_summary(source: ByteSource) -> TraceIndex:
@@ -223,15 +220,15 @@ def read_summary(source: ByteSource) -> TraceIndex:
     try:
         footer = mcap_summary.read_footer(source)
     except Damaged as error:
-        raise damaged(source, source.size, "the footer before the end", error) from error
+        raise damage_error(source, source.size, "the footer before the end", error) from error
     # Other writers may leave out the summary, or its CRC.
     if not footer.summary_start or not footer.crc:
-        raise not_a_trace(source, index)
+        raise not_a_trace_error(source, index)
     index.summary_start = footer.summary_start
     try:
         summary = mcap_summary.read_summary(source, footer)
     except Damaged as error:
-        raise damaged(source, footer.summary_start, "the summary", error) from error
+        raise damage_error(source, footer.summary_start, "the summary", error) from error
     index.take(summary)
     index.chunks_with = lambda channels: [_chunk_entry(c) for c in summary.chunks(channels)]
     check_version(source, index)
@@ -241,22 +238,22 @@ def read_summary(source: ByteSource) -> TraceIndex:
     return index
 
 
-def _chunk_entry(chunk: ChunkIndex) -> ChunkEntry:
-    # Each index reaches to the next one: that gives its length, and so the number of messages.
+def _chunk_entry(chunk: ChunkIndexEntry) -> ChunkEntry:
+    # Each index ends where the next one begins, which gives the number of messages.
     starts = sorted((at, channel_id) for channel_id, at in chunk.indexes)
-    indexes: dict[int, Span] = {}
+    indexes: dict[int, RecordSpan] = {}
     counts: dict[int, int] = {}
     for position, (at, channel_id) in enumerate(starts):
         end = starts[position + 1][0] if position + 1 < len(starts) else chunk.end
-        indexes[channel_id] = Span(at, end - at)
+        indexes[channel_id] = RecordSpan(at, end - at)
         counts[channel_id] = (end - at - MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
     return ChunkEntry(chunk.span, counts, indexes)
 
 
 def check_version(source: ByteSource, index: TraceIndex) -> None:
-    """Raise TraceFormatError unless this is a trace of the format version that is read here."""
+    """Raise TraceFormatError unless this is a trace of the supported format version."""
     if METADATA_FORMAT not in index.metadata:
-        raise not_a_trace(source, index)
+        raise not_a_trace_error(source, index)
     found = read_metadata(source, index.metadata[METADATA_FORMAT])
     version = found.get("version", "")
     index.checksums = CHECKSUMS_KEY in found
@@ -267,8 +264,8 @@ def check_version(source: ByteSource, index: TraceIndex) -> None:
         )
 
 
-def not_a_trace(source: ByteSource, index: TraceIndex) -> TraceFormatError:
-    """Return the error for an MCAP file that somebody else wrote."""
+def not_a_trace_error(source: ByteSource, index: TraceIndex) -> TraceFormatError:
+    """Return the error for an MCAP file of another writer."""
     profile, library = index.header
     writer = f"written by {library!r}" if library else "of an unknown writer"
     hint = "; to use it as input, name it under bags: in a job" if profile == "ros2" else ""
@@ -277,10 +274,10 @@ def not_a_trace(source: ByteSource, index: TraceIndex) -> TraceFormatError:
     )
 
 
-def _read_segments(source: ByteSource, span: Span) -> npt.NDArray[np.void]:
+def _read_segments(source: ByteSource, span: RecordSpan) -> npt.NDArray[np.void]:
     data = read_attachment(source, span)
     if len(data) % SEGMENT_DTYPE.itemsize:
-        raise damaged(source, span.offset, ATTACHMENT_INDEX, "its length is not a multiple")
+        raise damage_error(source, span.offset, ATTACHMENT_INDEX, "its length is not a multiple")
     segments = np.frombuffer(data, dtype=SEGMENT_DTYPE)
     size = np.uint64(source.size)
     sound = all(
@@ -295,10 +292,10 @@ def _read_segments(source: ByteSource, span: Span) -> npt.NDArray[np.void]:
         )
     )
     if not sound:
-        raise damaged(source, span.offset, ATTACHMENT_INDEX, "its rows contradict each other")
+        raise damage_error(source, span.offset, ATTACHMENT_INDEX, "its rows contradict each other")
     return segments
 
 
 def _starts(counts: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
-    """Return where each count begins when they follow each other from 0."""
+    """Return where each count begins, counting from 0."""
     return np.cumsum(counts, dtype=np.uint64) - counts

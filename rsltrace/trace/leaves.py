@@ -1,4 +1,4 @@
-"""The fields of a type that hold values, however deep in it: what there is that could be other."""
+"""The fields of a type that hold values, at any depth."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
-from rsltrace.trace.cdr import STAND_IN_TYPE
+from rsltrace.trace.cdr import WIDE_TEXT_TYPE
 from rsltrace.trace.model.texts import NO_FIELD
 
 _DEPTH_MAX = 6
@@ -16,10 +16,10 @@ _DEPTH_MAX = 6
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A field by its name, with ``[]`` behind each array that it is in, and what one value of it is
-    (``float32``, ``string``; "" for messages).
+    """A field by its name, with ``[]`` behind each array, and the type of one value (``float32``,
+    ``string``; "" for messages).
 
-    With ``length_max`` it is an array itself, of up to so many items.
+    With ``length_max`` it is an array itself, with at most that many items.
     """
 
     name: str
@@ -28,7 +28,7 @@ class Leaf:
 
 
 def leaves_of(name: str, types: dict[str, Any]) -> list[Leaf]:
-    """Return the leaves of a type, which is defined in ``types`` as a decoder has them."""
+    """Return the value fields of a type, which is defined in ``types``."""
     return list(_leaves(name, types, "", _DEPTH_MAX))
 
 
@@ -44,7 +44,7 @@ def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator
         if kind == Nodetype.BASE:
             if field != NO_FIELD:
                 yield Leaf(name, detail[0])
-        elif detail == STAND_IN_TYPE:
+        elif detail == WIDE_TEXT_TYPE:
             yield Leaf(name, "string")
         elif depth > 1:
             yield from _leaves(detail, types, f"{name}.", depth - 1)

@@ -1,7 +1,7 @@
-"""Traces of native runs: when each callback really ran, and what that says of latencies.
+"""Traces of native runs: when each callback ran, and the latencies.
 
-A native run was observed on rclpy's own executors in real time. It has no digest that another run
-could repeat; what it has, and a simulated run has not, are the times of the callbacks.
+A native run was observed on rclpy's own executors in real time. Its digest cannot repeat; instead
+it has the times of the callbacks.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.reader import Trace
 
 CUT_AFTER_NS = 2 * NS_PER_S
-"""A callback that goes on for longer is in the trace in parts."""
+"""A longer callback is in the trace in parts."""
 _SUBSCRIPTION_INPUT = (EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
 
 
@@ -29,12 +29,12 @@ def is_native(trace: Trace) -> bool:
 
 
 def run_name(trace: Trace) -> str:
-    """Return what names a run in short: its digest, or that it is native."""
+    """Return the digest of a run, or ``native``."""
     return "native" if is_native(trace) else trace.digest
 
 
 def refuse_native(trace: Trace, what: str) -> None:
-    """Raise TraceError if a trace is of a native run, of which there is no ``what``."""
+    """Raise TraceError if a trace is of a native run, which has no ``what``."""
     if is_native(trace):
         raise TraceError(
             f"{trace.name} is of a native run: it was observed, not simulated, so {what}; record "
@@ -45,7 +45,7 @@ def refuse_native(trace: Trace, what: str) -> None:
 def timings(trace: Trace) -> npt.NDArray[np.void]:
     """Return when each event ran: TIMING_DTYPE, shape (events,); empty for a simulated run.
 
-    :raises TraceError: if that is not what the trace holds.
+    :raises TraceError: if the trace contains something else.
     """
     rows = bytearray()
     for _, _, data in trace.messages(TOPIC_TIMINGS):
@@ -63,7 +63,7 @@ def timings(trace: Trace) -> npt.NDArray[np.void]:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """Some durations in nanoseconds: how many, their median, 95 % quantile and maximum."""
+    """Statistics of durations in nanoseconds: number, median, 95 % quantile and maximum."""
 
     count: int
     median_ns: int
@@ -72,7 +72,7 @@ class Spread:
 
 
 def spread(values: npt.NDArray[np.int64]) -> Spread | None:
-    """Return the spread of durations, None of none."""
+    """Return the statistics of durations, None without any."""
     if not len(values):
         return None
     median, p95 = np.quantile(values, (0.5, 0.95)).astype(np.int64).tolist()
@@ -84,9 +84,9 @@ class CallbackFigures:
     """How the callbacks of one entity ran.
 
     ``duration`` is from start to end of each (or of its parts), ``wait`` from when it was ready,
-    ``latency`` from when its input was sent. ``jitter`` is by how much the time between two calls
-    of a timer is not its period. ``lost`` counts numbers that are missing between those that
-    came, where messages are numbered and their publisher is known.
+    ``latency`` from when its input was sent. ``jitter`` is the difference between a timer's period
+    and the time between calls. ``lost`` counts missing numbers between received messages, where
+    messages are numbered and their publisher is known.
     """
 
     entity: Entity
@@ -130,7 +130,7 @@ def callback_figures(trace: Trace) -> list[CallbackFigures]:
 
 
 def busy_threads(trace: Trace) -> dict[int, float]:
-    """Return which part of the run the callbacks in each thread took, between 0 and 1."""
+    """Return the fraction of the run that callbacks took, by thread."""
     rows = timings(trace)
     if not len(rows):
         return {}
@@ -143,14 +143,14 @@ def busy_threads(trace: Trace) -> dict[int, float]:
 
 
 def event_columns(trace: Trace) -> npt.NDArray[np.void]:
-    """Return the columns of all events that say when what ran, and because of what."""
+    """Return the columns of all events that say what ran when, and why."""
     names = ["stamp", "entity", "kind", "flags", "cause_event", "cause_output", "outputs"]
     parts = [events[names] for events in trace.events()]
     return np.concatenate(parts) if parts else np.zeros(0, [(n, np.uint64) for n in names])
 
 
 def senders_of(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
-    """Return who sent the input of each event, -1 where that is unknown."""
+    """Return the sender of each event's input, -1 where it is unknown."""
     parts = [outputs["entity"] for outputs in trace.outputs()]
     entities = np.concatenate(parts) if parts else np.zeros(0, np.uint32)
     firsts = np.cumsum(events["outputs"], dtype=np.int64) - events["outputs"]
@@ -177,8 +177,7 @@ def _jitter(entity: Entity, rows: npt.NDArray[np.void]) -> Spread | None:
 def missing_numbers(
     sequences: npt.NDArray[np.uint64], senders: npt.NDArray[np.int64]
 ) -> int | None:
-    """Return how many numbers are missing between those that came, of known senders; None if
-    nothing is numbered."""
+    """Return how many numbers are missing between those received, None if nothing is numbered."""
     known = (sequences != 0) & (senders >= 0)
     if not known.any():
         return None

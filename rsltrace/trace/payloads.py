@@ -1,7 +1,7 @@
-"""Finding the messages of a trace: by channel and sequence, or all of a topic.
+"""Find the messages of a trace: by channel and sequence, or all of a topic.
 
-The chunk list says how many messages of a channel each chunk holds, so the n-th message of a
-channel is found by bisection: one chunk is unpacked, nothing is scanned.
+The index has the number of messages by chunk and channel, so bisection finds the chunk with the
+n-th message: only that one is decompressed.
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from rsltrace.trace.index import (
     MESSAGE_INDEX_FIXED,
     ChunkEntry,
     TraceIndex,
-    damaged,
+    damage_error,
     messages_in,
     read_body,
     read_chunk,
 )
 from rsltrace.trace.mcap.chunk import message_at
-from rsltrace.trace.mcap.records import Damaged, Fields, Span
+from rsltrace.trace.mcap.records import Damaged, Fields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 
 _CHUNKS_CACHED = 4
-"""Payload chunks have about half a megabyte, so this is memory; two topics read side by side need
-two."""
+"""Payload chunks have about half a megabyte; two topics side by side need two."""
 
 _INDEX_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 
@@ -64,9 +63,11 @@ class PayloadReader:
         try:
             message = message_at(records, offsets[place], channel_id)
         except Damaged as error:
-            raise damaged(self._source, entry.span.offset, "the chunk", error) from error
+            raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
         if message.sequence != sequence:
-            raise damaged(self._source, entry.span.offset, "the chunk", "messages are out of order")
+            raise damage_error(
+                self._source, entry.span.offset, "the chunk", "messages are out of order"
+            )
         return message.log_time, records[message.start : message.end]
 
     def messages(self, channel_ids: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
@@ -85,12 +86,15 @@ class PayloadReader:
                     _, sequence, log_time, start, end = message_at(records, offset, channel_id)
                     yield channel_id, log_time, sequence, records[start:end]
             except Damaged as error:
-                raise damaged(self._source, entry.span.offset, "the chunk", error) from error
+                raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
 
-    def holding(self, channel_id: int, first: int, last: int, text: bytes) -> Iterator[int]:
-        """Yield which messages ``first`` … ``last`` of a channel may have ``text`` in their bytes.
+    def messages_with_text(
+        self, channel_id: int, first: int, last: int, text: bytes
+    ) -> Iterator[int]:
+        """Yield which messages ``first`` … ``last`` of a channel may contain ``text`` in their
+        bytes.
 
-        ``text`` is lower case; letters of ASCII in the messages may be of either.
+        ``text`` is lower case; ASCII letters in the messages may be of either case.
         """
         firsts, entries = self._of_channel(channel_id)
         for position in range(max(bisect_right(firsts, first) - 1, 0), len(entries)):
@@ -100,8 +104,8 @@ class PayloadReader:
                 if first <= firsts[position] + place <= last:
                     yield firsts[position] + place
 
-    def _find_in_chunk(self, span: Span, text: bytes) -> dict[int, list[int]]:
-        """Return by channel which of its messages in a chunk hold ``text``."""
+    def _find_in_chunk(self, span: RecordSpan, text: bytes) -> dict[int, list[int]]:
+        """Return by channel which of its messages in a chunk contain ``text``."""
         records = self._records(span)
         folded = records.lower()
         at = folded.find(text)
@@ -119,7 +123,7 @@ class PayloadReader:
                         found.setdefault(channel_id, []).append(place)
                     at = folded.find(text, end)
         except Damaged as error:
-            raise damaged(self._source, span.offset, "the chunk", error) from error
+            raise damage_error(self._source, span.offset, "the chunk", error) from error
         return found
 
     def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
@@ -141,17 +145,19 @@ class PayloadReader:
             found = self._by_channel[channel_id] = (firsts, entries)
         return found
 
-    def _read_records(self, span: Span) -> bytes:
+    def _read_records(self, span: RecordSpan) -> bytes:
         return read_chunk(self._source, span)
 
-    def _read_offsets(self, span: Span, index_span: Span | None, channel_id: int) -> list[int]:
-        """Return where in the records of a chunk the messages of a channel are."""
+    def _read_offsets(
+        self, span: RecordSpan, index_span: RecordSpan | None, channel_id: int
+    ) -> list[int]:
+        """Return the offsets of a channel's messages in the records of a chunk."""
         if index_span is None or index_span.length <= MESSAGE_INDEX_FIXED:
             try:
                 walked = messages_in(self._records(span))
                 return [offset for channel, offset in walked if channel == channel_id]
             except Damaged as error:
-                raise damaged(self._source, span.offset, "the chunk", error) from error
+                raise damage_error(self._source, span.offset, "the chunk", error) from error
         body = read_body(self._source, index_span, Opcode.MESSAGE_INDEX, "the message index")
         try:
             fields = Fields(body)
@@ -161,7 +167,9 @@ class PayloadReader:
             if len(entries) % _INDEX_DTYPE.itemsize:
                 raise Damaged("an entry is cut off")
         except Damaged as error:
-            raise damaged(self._source, index_span.offset, "the message index", error) from error
+            raise damage_error(
+                self._source, index_span.offset, "the message index", error
+            ) from error
         table: npt.NDArray[np.void] = np.frombuffer(entries, dtype=_INDEX_DTYPE)
         offsets: list[int] = table["offset"].tolist()
         return offsets

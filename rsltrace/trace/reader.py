@@ -1,8 +1,8 @@
-"""Reading a trace: one read-only object that fetches what is asked for, and only that.
+"""Read a trace: one read-only object that fetches only what is asked for.
 
-Opening reads the summary at the end of the file, not the run; a digest of a million events costs
-as much as one of ten. A trace whose run was killed has no summary: it is walked once and then read
-in the same way, with ``complete`` false.
+Opening reads the summary at the end of the file, so the digest of a million events costs as much as
+that of ten. A trace whose run was killed has no summary: the file is scanned once and then read in
+the same way, with ``complete`` false.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
@@ -47,23 +46,21 @@ from rsltrace.trace.guarded import parse_counts
 from rsltrace.trace.index import (
     ChannelInfo,
     TraceIndex,
-    damaged,
+    damage_error,
     read_attachment,
     read_metadata,
     read_summary,
 )
-from rsltrace.trace.mcap.place import open_source
+from rsltrace.trace.mcap.reader import McapSummary, check_data, has_end, read_body, walk_records
 from rsltrace.trace.mcap.records import (
     ENTITY_ID_MAX,
     MAGIC,
     Damaged,
-    Header,
+    McapHeader,
     parse_channel,
     parse_schema,
 )
-from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary, check_data, has_end
-from rsltrace.trace.mcap.walk import read_body, walk_records
+from rsltrace.trace.mcap.source import ByteSource, open_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, Event, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, Mode
@@ -74,54 +71,52 @@ from rsltrace.trace.segments import SegmentReader, event_of, output_of
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder, Decoders
     from rsltrace.trace.leaves import Leaf
-    from rsltrace.trace.tables import Tables
+    from rsltrace.trace.tables import TraceTables
 
 # Checking a whole trace: every byte against the file's checksum, every event against its hashes.
-#
-# Reading checks what it reads. This reads everything, and also finds what no single read can see:
-# a changed environment or job, or events whose hashes are not those of their contents.
+# Other reads check what they read; this also finds a changed environment or job, and events whose
+# hashes do not match their contents.
 
 _DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
 
 
 def check_data_section(source: ByteSource, summary_start: int) -> None:
-    """Raise TraceError unless the bytes before the summary have the checksum given there."""
+    """Raise TraceError unless the bytes before the summary match its checksum."""
     try:
         check_data(source, summary_start)
     except Damaged as error:
-        raise damaged(source, 0, "the data section", error) from error
+        raise damage_error(source, 0, "the data section", error) from error
 
 
 def check_records(source: ByteSource, index: TraceIndex) -> None:
-    """Raise TraceError unless the records before the summary follow each other without a gap, and
-    have the channels and schemas that the summary says.
+    """Raise TraceError unless the records before the summary are contiguous and define the channels
+    and schemas of the summary.
 
-    A checksum may have been made for bytes that are no MCAP file, and who reads a file from its
-    start knows no summary.
+    A checksum may cover bytes that are no MCAP file, and sequential readers see no summary.
     """
-    told = Summary()
+    summary = McapSummary()
     try:
         for opcode, span in walk_records(source, len(MAGIC), index.summary_start):
             if opcode in _DEFINITIONS:
-                _add_once(told, opcode, read_body(source, span, opcode))
+                _add_unique(summary, opcode, read_body(source, span, opcode))
     except Damaged as error:
-        raise damaged(source, 0, "the data section", error) from error
+        raise damage_error(source, 0, "the data section", error) from error
     found = TraceIndex(complete=True, header=index.header)
-    found.take(told)
+    found.take(summary)
     if found.channels != index.channels:
-        raise damaged(
+        raise damage_error(
             source, index.summary_start, "the summary", "its channels are not those before it"
         )
 
 
-def _add_once(told: Summary, opcode: int, body: bytes) -> None:
-    """Add a channel or schema. Raises Damaged if there is another one of its id."""
+def _add_unique(summary: McapSummary, opcode: int, body: bytes) -> None:
+    """Add a channel or schema. Raises Damaged if its id has another definition."""
     if opcode == Opcode.SCHEMA:
         schema = parse_schema(body)
-        is_only = told.schemas.setdefault(schema.id, schema) == schema
+        is_only = summary.schemas.setdefault(schema.id, schema) == schema
     else:
         channel = parse_channel(body)
-        is_only = told.channels.setdefault(channel.id, channel) == channel
+        is_only = summary.channels.setdefault(channel.id, channel) == channel
     if not is_only:
         raise Damaged("a channel or schema is defined twice, in two ways")
 
@@ -170,18 +165,18 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 RUN = Entity(0, 0, EntityKind.SYSTEM, "", "", 0, {})
-"""The run itself, in traces that do not describe it: what belongs to no node."""
+"""The run itself, which owns what belongs to no node, in traces that do not describe it."""
 
 
 class Trace:
-    """A trace, opened. A context manager; every method may raise TraceError for damage it meets.
+    """An open trace. A context manager; every method may raise TraceError for damage.
 
-    ``complete`` is false for an interrupted run; then everything up to the last whole segment is
-    here. Times are simulated nanoseconds, hashes unsigned 64-bit integers.
+    ``complete`` is false for an interrupted run, which is readable up to its last whole segment.
+    Times are simulated nanoseconds, hashes unsigned 64-bit integers.
     """
 
     def __init__(self, source: ByteSource) -> None:
-        """Read the index of ``source``, which belongs to this object from now on."""
+        """Read the index of ``source``, and own it from now on."""
         self._source = source
         try:
             if has_end(source):
@@ -194,7 +189,7 @@ class Trace:
             for channel in index.channels.values():
                 ids.setdefault(channel.topic, []).append(channel.id)
             for topic in (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS):
-                # A run killed at once may have an entity to its name but no event, or neither.
+                # A run killed at once may have entities but no events, or neither.
                 if topic not in ids and index.complete:
                     raise TraceError(f"{source.name} has no channel {topic}; it is no whole trace")
             self._index = index
@@ -219,29 +214,22 @@ class Trace:
     def open(cls, path: Path | str) -> Trace:
         """Open the trace at ``path``, or at an address (``https://…``) given as a string.
 
-        Raises TraceError if it is missing or damaged, TraceFormatError if it is something else
-        (a plain recording, no MCAP) or of another format version, SetupError for an address if
-        fsspec is not installed.
+        Raises TraceError if it is missing or damaged, TraceFormatError if it is something else (a
+        plain recording, no MCAP) or has another format version, SetupError for an address without
+        fsspec.
         """
         return cls(open_source(path))
 
     def close(self) -> None:
-        """Let go of the file. Arrays handed out stay valid."""
+        """Close the file. Arrays returned before stay valid."""
         self._source.close()
         self._segments.forget()
 
     def __enter__(self) -> Trace:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
-
-    # What kind of file it is and how the run went.
 
     @property
     def name(self) -> str:
@@ -255,7 +243,7 @@ class Trace:
 
     @property
     def bytes_read(self) -> int:
-        """How many bytes were fetched from the file so far."""
+        """The number of bytes fetched from the file so far."""
         return self._source.bytes_read
 
     @property
@@ -264,40 +252,39 @@ class Trace:
         return self._index.complete
 
     @property
-    def header(self) -> Header:
-        """The profile (``ros2``) and what wrote the trace (``rsltrace 0.1.0``)."""
+    def header(self) -> McapHeader:
+        """The profile (``ros2``) and the writing library (``rsltrace 0.1.0``)."""
         return self._index.header
 
     @property
     def digest(self) -> str:
-        """The last chain hash as 16 hex digits, equal for equal runs (no event: zeros)."""
+        """The last chain hash as 16 hex digits, equal for equal runs (no events: zeros)."""
         table = self.segments
         return digest_text(int(table["chain_hash"][-1]) if len(table) else 0)
 
     @property
     def event_count(self) -> int:
-        """How many events there are."""
+        """The number of events."""
         return int(self.segments["events"].sum(dtype=np.uint64))
 
     @property
     def output_count(self) -> int:
-        """How many outputs all events have."""
+        """The number of outputs of all events."""
         return int(self.segments["outputs"].sum(dtype=np.uint64))
 
     @property
     def start_ns(self) -> int:
-        """When the run started: as its result says, or else the earliest event (0: none)."""
+        """The start of the run, by its result or its earliest event (0: none)."""
         return self._result_ns("start_time", min(self.segments["start_stamp"].tolist(), default=0))
 
     @property
     def end_ns(self) -> int:
-        """When the run ended: as its result says, or else the latest event (0: none)."""
+        """The end of the run, by its result or its latest event (0: none)."""
         return self._result_ns("end_time", max(self.segments["end_stamp"].tolist(), default=0))
 
     @property
     def ended_after(self) -> int | None:
-        """How many events there were when the run ended, and its nodes were told; None if the
-        trace does not say."""
+        """The number of events before the nodes were shut down; None if unknown."""
         text = self.result.get("ended_after", "")
         return int(text) if text.isascii() and text.isdigit() else None
 
@@ -308,20 +295,20 @@ class Trace:
 
     @cached_property
     def environment(self) -> dict[str, str]:
-        """What the run was made with: the metadata ``rsltrace:environment``, and what the result
-        adds to it (numerical libraries that the run has imported itself)."""
+        """The environment of the run: the metadata ``rsltrace:environment``, and numerical
+        libraries that the run imported, from the result."""
         numerics = self.result.get("numerics")
         late = {"numerics": numerics} if numerics else {}
         return {**self.metadata(METADATA_ENVIRONMENT), **late}
 
     @cached_property
     def job(self) -> dict[str, str]:
-        """What was asked for: the metadata ``rsltrace:job``."""
+        """The requested job: the metadata ``rsltrace:job``."""
         return self.metadata(METADATA_JOB)
 
     @cached_property
     def job_text(self) -> str:
-        """The job file as it was, or an empty text when the run had none."""
+        """The job file, or an empty text if there was none."""
         data = self.attachment(ATTACHMENT_JOB)
         return data.decode("utf-8", "replace") if data is not None else ""
 
@@ -339,7 +326,7 @@ class Trace:
         return read_attachment(self._source, span) if span else None
 
     def check(self) -> None:
-        """Read the whole file and raise TraceError at the first thing in it that is not right.
+        """Read the whole file and raise TraceError at the first damage.
 
         An interrupted trace has no checksum over the file; its hashes are checked all the same.
         """
@@ -347,8 +334,6 @@ class Trace:
             check_data_section(self._source, self._index.summary_start)
             check_records(self._source, self._index)
         check_hashes(self._source, self._segments)
-
-    # Entities.
 
     @cached_property
     def entities(self) -> dict[int, Entity]:
@@ -372,10 +357,8 @@ class Trace:
         return entity
 
     def node_of(self, entity: Entity) -> Entity:
-        """Return the node that owns ``entity``: a node itself, or the run for what has no node."""
+        """Return the node that owns ``entity``: a node itself, or the run."""
         return self.entity(entity.node)
-
-    # Events and outputs.
 
     @property
     def segments(self) -> npt.NDArray[np.void]:
@@ -385,7 +368,7 @@ class Trace:
     def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
         """Yield the events ``first <= index < last`` as arrays of EVENT_DTYPE, one per segment.
 
-        The arrays look into the file's bytes: they are read-only and not contiguous.
+        The arrays are read-only views of the file's bytes, and not contiguous.
         """
         for segment, begin, end in self._pieces(first, last):
             yield self._segments.cached_events(segment)[begin:end]
@@ -412,11 +395,9 @@ class Trace:
         low, high = np.searchsorted(outputs["event"], bounds).tolist()
         return [output_of(row, self.name) for row in outputs[low:high]]
 
-    # What the guard found.
-
     @cached_property
     def findings(self) -> dict[int, list[Finding]]:
-        """What the guard found, by event and in order; events without findings are missing."""
+        """The guard's findings by event, in order; without entries for events that have none."""
         kept = {
             event: [finding for finding in answers if finding.mode is not Mode.VIRTUAL]
             for event, answers in self.answers.items()
@@ -425,7 +406,7 @@ class Trace:
 
     @cached_property
     def answers(self) -> dict[int, list[Finding]]:
-        """The findings, with what came from outside in an order that the run has made."""
+        """The findings, and answers from outside that the run put in order."""
         answers: dict[int, list[Finding]] = {}
         for _, _, data in self.messages(TOPIC_FINDINGS):
             finding = self._named(unpack_finding, data)
@@ -434,7 +415,7 @@ class Trace:
 
     @cached_property
     def code_lines(self) -> dict[int, list[CodeLine]]:
-        """The places in the code that the run has met, by entity and in the order of meeting."""
+        """The code lines that the run noted, by entity and in order."""
         lines: dict[int, list[CodeLine]] = {}
         for _, _, data in self.messages(TOPIC_CODE_LINES):
             line = self._named(unpack_code_line, data)
@@ -443,7 +424,7 @@ class Trace:
 
     @cached_property
     def sent_from(self) -> dict[tuple[int, int], list[CodeLine]]:
-        """The places from which outputs came, by their entity and the one whose callback ran."""
+        """The code lines that outputs came from, by their entity and the one whose callback ran."""
         lines: dict[tuple[int, int], list[CodeLine]] = {}
         for line in chain.from_iterable(self.code_lines.values()):
             if line.output != NO_SEQUENCE and line.event < self.event_count:
@@ -453,17 +434,15 @@ class Trace:
 
     @cached_property
     def switches(self) -> dict[int, str]:
-        """The lines (``module.py:31``) before which other threads went on, by the event that ended
-        there."""
+        """The lines (``module.py:31``) before which another thread continued, by the event that
+        ended there."""
         lines = self.code_lines.get(0, [])
         return {line.event: line.place for line in lines if line.output != NO_SEQUENCE}
 
     @cached_property
     def guarded(self) -> tuple[GuardCount, ...]:
-        """How often the guard met each call; empty for a run without guard, or cut off."""
+        """How often the guard saw each call; empty for a run without guard, or cut off."""
         return self._named(parse_counts, self.metadata(METADATA_GUARD).get("calls", "[]"))
-
-    # Payloads.
 
     @property
     def channels(self) -> Mapping[int, ChannelInfo]:
@@ -472,11 +451,11 @@ class Trace:
 
     @property
     def message_counts(self) -> Mapping[int, int]:
-        """By channel id, how many messages it has (absent: none)."""
+        """The number of messages by channel id (absent: none)."""
         return self._index.message_counts
 
     def channel_of(self, output: Output) -> ChannelInfo | None:
-        """Return the channel with the payloads of outputs like this, or None if there is none."""
+        """Return the channel with the payloads of an output, or None."""
         if output.kind is OutputKind.LOG:
             return self._channel(TOPIC_ROSOUT, "")
         entity = self.entity(output.entity)
@@ -489,7 +468,7 @@ class Trace:
         return self._channel(TOPIC_DETAILS, "")
 
     def payload(self, output: Output) -> tuple[int, str, bytes] | None:
-        """Return (stamp in ns, topic, data) of what an output sent, or None if it was not kept."""
+        """Return (stamp in ns, topic, data) of an output's message, None if it was not recorded."""
         if output.sequence == NO_SEQUENCE:
             return None
         channel = self.channel_of(output)
@@ -519,17 +498,17 @@ class Trace:
             yield stamp_ns, sequence, data
 
     def holding(self, channel: int, first: int, last: int, text: bytes) -> Iterator[int]:
-        """Yield the numbers ``first`` … ``last`` of a channel's messages in whose bytes ``text``
-        is, in lower case, whatever case theirs is; it may lie across two messages."""
-        yield from self._payloads.holding(channel, first, last, text)
+        """Yield the numbers ``first`` … ``last`` of a channel's messages whose bytes contain
+        ``text``, which is lower case, in any case; it may span two messages."""
+        yield from self._payloads.messages_with_text(channel, first, last, text)
 
     def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
         """Yield (channel, stamp in ns, sequence, data) of every message of some channels."""
         yield from self._payloads.messages(channels)
 
     def fields_of(self, interface: str) -> Mapping[str, str] | None:
-        """Return the fields of an interface (``nav_msgs/msg/Odometry``) with those of them that are
-        messages (others: empty); None if no readable schema of the trace defines it."""
+        """Return the fields of an interface (``nav_msgs/msg/Odometry``) with their message types
+        (others: empty); None if no readable schema of the trace defines it."""
         package = interface.partition("/")[0]
         for channel in self.channels.values():
             if channel.type == interface or package in channel.schema_text:
@@ -540,8 +519,10 @@ class Trace:
         return None
 
     def leaves(self, topic: str) -> list[Leaf]:
-        """Return the fields of a topic's messages that hold values. Raises TraceError if the topic
-        has no messages here, or no usable schema."""
+        """Return the fields of a topic's messages that hold values.
+
+        Raises TraceError if the topic has no messages here, or no usable schema.
+        """
         found = self._channel(topic, "")
         if found is None:
             raise TraceError(f"{self.name} has no messages on {topic}")
@@ -550,7 +531,7 @@ class Trace:
     def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
         """Return ``data`` decoded by the schema of a channel (or its id, or its topic).
 
-        Raises TraceError if there is no such channel, or schema and data do not fit.
+        Raises TraceError if there is no such channel, or the data does not fit.
         """
         if isinstance(channel, str):
             found = self._channel(channel, "")
@@ -566,14 +547,14 @@ class Trace:
             raise TraceError(f"{self.name}: {error}") from error
 
     @property
-    def tables(self) -> Tables:
-        """Its events, outputs, entities and decoded messages, as tables for Arrow and pandas."""
-        from rsltrace.trace.tables import Tables
+    def tables(self) -> TraceTables:
+        """Its events, outputs, entities and decoded messages as tables for Arrow and pandas."""
+        from rsltrace.trace.tables import TraceTables
 
-        return Tables(self, self._decoder)
+        return TraceTables(self, self._decoder)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of it; of one that cannot be read, why."""
+        """Return what a notebook shows, or why the trace cannot be read."""
         from rsltrace.trace.model.html import Sheet
 
         sheet = Sheet(f"trace {Path(self.name).name}")
@@ -604,21 +585,21 @@ class Trace:
 
     def _decoder(self, channel: ChannelInfo) -> Decoder:
         if self._decoders is None:
-            # Its library takes as long as opening a trace.
+            # Its library takes as long to import as opening a trace.
             from rsltrace.trace.decode import Decoders
 
             self._decoders = Decoders()
         return self._decoders.of(channel)
 
     def _named(self, read: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T:
-        """Read something; errors begin with the name of the file, since two may be open."""
+        """Call a reader; errors begin with the name of the file, since two may be open."""
         try:
             return read(*args, **more)
         except TraceError as error:
             raise TraceError(f"{self.name}: {error}") from error
 
     def _channel(self, topic: str, type_name: str) -> ChannelInfo | None:
-        """Return the channel of a topic: the one of that type, where there are several."""
+        """Return the channel of a topic: of several the one with that type."""
         ids = self._ids_of_topic.get(topic, ())
         if len(ids) == 1:
             return self.channels[ids[0]]
@@ -631,7 +612,7 @@ class Trace:
         return self._segments.segment_of(index)
 
     def _pieces(self, first: int, last: int | None) -> Iterator[tuple[int, int, int]]:
-        """Yield (segment, begin, end) for the parts of segments that hold a range of events."""
+        """Yield (segment, begin, end) of the parts of segments in a range of events."""
         count = self.event_count
         last = count if last is None else min(last, count)
         first = max(first, 0)
@@ -651,7 +632,7 @@ class Trace:
         return otherwise
 
     def _check_result(self) -> None:
-        """The result is not covered by a checksum, but what matters of it is known twice."""
+        """Check the digest in the result, which no checksum covers, against the events."""
         said = self.result.get("digest")
         if self.complete and said != self.digest:
             raise TraceError(

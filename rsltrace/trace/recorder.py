@@ -1,7 +1,6 @@
 """Turn what happens in a run into the records of a trace: hashes, numbers, links.
 
-This is the part of recording that runs on every callback; it does no more than pack and hash. The
-writer decides what becomes of the bytes.
+This runs at every callback, so it only packs and hashes. The writer handles the bytes.
 """
 
 from __future__ import annotations
@@ -21,10 +20,10 @@ _DRAW = int(OutputKind.DRAW)
 
 
 class Recorder:
-    """The event under way, and the hash chain so far.
+    """The current event, and the hash chain so far.
 
-    ``outputs`` and ``output_hash`` belong to the event under way; ``end_event`` closes it.
-    ``add_output`` is the writer's, or tells others as well (``tell``).
+    ``outputs`` and ``output_hash`` belong to the current event; ``end_event`` closes it.
+    ``add_output`` is the writer's, unless ``tell`` adds observers.
     """
 
     def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
@@ -41,27 +40,26 @@ class Recorder:
 
     @property
     def digest(self) -> str:
-        """The run so far as 16 hex digits: the chain hash of the last event."""
+        """The digest of the run so far: the chain hash of the last event."""
         return f"{self.chain_hash:016x}"
 
-    def tell(self, told: Sequence[Callable[[int, int, int], None]]) -> None:
-        """Call each of ``told`` with the kind, entity and content hash of every output from now on,
-        and nobody else."""
+    def tell(self, observers: Sequence[Callable[[int, int, int], None]]) -> None:
+        """Call each observer with kind, entity and content hash of every output from now on."""
         add_output = self.writer.add_output
-        if not told:
+        if not observers:
             self.add_output = add_output
             return
 
         def tell(packed: bytes) -> None:
             add_output(packed)
             content_hash, entity, kind = OUTPUT_CONTENT.unpack(packed)
-            for one in told:
+            for one in observers:
                 one(kind, entity, content_hash)
 
         self.add_output = tell
 
     def output(self, kind: int, entity: int, content_hash: int, sequence: int = NO_SEQUENCE) -> int:
-        """Add an output to the event under way; return which of its outputs it is."""
+        """Add an output to the current event; return its number in it."""
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
         add_output, add_sequence = self.add_output, self._add_sequence
@@ -72,7 +70,7 @@ class Recorder:
         return position
 
     def draw(self, entity: int, draw: int) -> None:
-        """Add what chance has decided to the event under way: it has no payload."""
+        """Add a random decision to the current event: it has no payload."""
         packed = _pack_output(draw, entity, _DRAW)
         self.output_hash = hash64(packed, self.output_hash)
         add_output = self.add_output
@@ -100,24 +98,24 @@ class Recorder:
     def detail(
         self, kind: OutputKind, entity: int, stamp_ns: int, text: str, content_hash: int
     ) -> int:
-        """Add an output that is described by a text (which itself is not hashed)."""
+        """Add an output described by a text, which is not hashed."""
         sequence = self.writer.add_detail(self.index, self.outputs, stamp_ns, text)
         return self.output(kind, entity, content_hash, sequence)
 
     def finding(self, finding: Finding, stamp_ns: int) -> None:
-        """Write down what the guard found in the event under way. It is not hashed."""
+        """Record a finding of the guard in the current event. It is not hashed."""
         self.writer.add_finding(finding, stamp_ns)
 
     def code_line(self, line: CodeLine, stamp_ns: int) -> None:
-        """Write down a place in the code. It is not hashed."""
+        """Record a code line. It is not hashed."""
         self.writer.add_code_line(line, stamp_ns)
 
     def state(self, node: int, stamp_ns: int, changes: str) -> None:
-        """Write down how the state of a node changed in the event under way. It is not hashed."""
+        """Record how a node's state changed in the current event. It is not hashed."""
         self.writer.add_state(self.index, node, stamp_ns, changes)
 
     def entity(self, entity: Entity) -> None:
-        """Write down an entity. Its content is part of the event that created it."""
+        """Record an entity; its identity is part of the event that created it."""
         self.writer.add_entity(entity)
         self.output(OutputKind.ENTITY, entity.id, identity_hash(entity))
 
@@ -132,7 +130,7 @@ class Recorder:
         input_hash: int,
         state_hash: int = 0,
     ) -> None:
-        """Close the event under way and move the hash chain on."""
+        """Close the current event and extend the hash chain."""
         rest = _pack_event(
             self.index,
             stamp_ns,

@@ -1,9 +1,8 @@
-"""The ``rosbag2`` metadata record: what makes ``ros2 bag`` take a trace for a bag of its own.
+"""The ``rosbag2`` metadata record, which makes ``ros2 bag`` accept a trace as a bag.
 
-rosbag2's MCAP plugin stores its bag metadata (version 9 since Jazzy) as one YAML text in a
-metadata record. The text is written by hand, in the plugin's order of keys, because a general YAML
-writer would be a dependency of recording for the sake of twenty lines. Nothing here depends on
-where the file lies: the file name in it is fixed, and readers put in the real one.
+rosbag2's MCAP plugin stores its metadata (version 9 since Jazzy) as YAML in a metadata record. It
+is written by hand in the plugin's order of keys, which spares recording a YAML library. The file
+name in it is fixed; readers put in the real one.
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ _NOT_TEXT = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "
 
 
 @dataclass(frozen=True, slots=True)
-class BagTopic:
-    """One channel as rosbag2 lists it. ``qos_yaml`` is a YAML sequence (``[]`` when unknown)."""
+class BagTopicMetadata:
+    """One channel as rosbag2 lists it. ``qos_yaml`` is a YAML sequence (``[]`` if unknown)."""
 
     name: str
     type: str
@@ -36,7 +35,7 @@ class BagTopic:
 
 
 def bag_metadata_yaml(
-    topics: Sequence[BagTopic],
+    topics: Sequence[BagTopicMetadata],
     *,
     start_ns: int,
     duration_ns: int,
@@ -86,8 +85,8 @@ def bag_metadata_yaml(
 def normalized_qos(qos_yaml: str, *, topic: str) -> str:
     """Return ``qos_yaml`` ready to be stored: ``[]`` for nothing, no newline at its end.
 
-    rosbag2 refuses an empty text where it expects a sequence, so nothing is an empty sequence.
-    Raises OutputError when the text cannot be a YAML sequence: a bag player would stumble over it.
+    rosbag2 expects a sequence and refuses an empty text. Raises OutputError for a text that cannot
+    be a YAML sequence: a player would fail on it.
     """
     text = textwrap.dedent(qos_yaml).strip("\n")
     if not text.strip():
@@ -108,6 +107,6 @@ def _qos_lines(qos_yaml: str) -> list[str]:
 
 
 def _scalar(text: str) -> str:
-    """Quote what YAML could take for something else than a string (JSON strings are YAML)."""
+    """Quote texts that YAML could take for something other than a string."""
     plain = _PLAIN.fullmatch(text) and text.lower() not in _NOT_TEXT
     return text if plain else json.dumps(text)

@@ -1,8 +1,8 @@
-"""The index of a trace that has none: its run was killed, or is still going on.
+"""Make the index of a trace without summary: its run was killed, or is still going on.
 
-The file is walked from its start as far as its records are whole. What comes after the last whole
-segment (payloads and outputs of events that were never written) belongs to no event. What is whole
-but does not match its checksum, or has more behind it, is no cut but damage, and an error.
+The file is walked as far as its records are whole. Payloads and outputs after the last whole
+segment belong to no event. A whole record that does not match its checksum, or is followed by other
+bytes, is damage and an error.
 """
 
 from __future__ import annotations
@@ -28,15 +28,14 @@ from rsltrace.trace.index import (
     TraceIndex,
     check_version,
     messages_in,
-    not_a_trace,
+    not_a_trace_error,
     read_header,
 )
 from rsltrace.trace.mcap.chunk import read_chunk
-from rsltrace.trace.mcap.records import Damaged, Fields, Span
+from rsltrace.trace.mcap.reader import McapSummary, length_by_fields, read_body, whole_records
+from rsltrace.trace.mcap.records import Damaged, Fields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.mcap.summary import Summary
-from rsltrace.trace.mcap.walk import length_by_fields, read_body, whole_records
-from rsltrace.trace.segments import check_numbered, events_in, outputs_in
+from rsltrace.trace.segments import check_numbered, events_in, outputs_in, segment_row
 
 
 def scan(source: ByteSource) -> TraceIndex:
@@ -49,12 +48,12 @@ class _Scanner:
         self._source = source
         header, self._whole = read_header(source)
         self._index = TraceIndex(complete=False, header=header)
-        self._summary = Summary()
+        self._summary = McapSummary()
         self._chunks: list[ChunkEntry] = []
         self._rows: list[np.void] = []
         self._event_channel = -1
         self._output_channel = -1
-        self._pending_outputs = (Span(0, 0), 0)
+        self._pending_outputs = (RecordSpan(0, 0), 0)
         self._what = "the record"
 
     def run(self) -> TraceIndex:
@@ -84,7 +83,7 @@ class _Scanner:
                     "its header, before anything of the run was in it (its run was killed, or has "
                     "just begun): nothing can be read of it; record it again"
                 )
-            raise not_a_trace(self._source, index)
+            raise not_a_trace_error(self._source, index)
         index.take(summary)
         if self._rows:
             index.segments = np.array(self._rows, dtype=SEGMENT_DTYPE)
@@ -97,8 +96,8 @@ class _Scanner:
         ]
         return index
 
-    def _take(self, opcode: int, span: Span) -> None:
-        """Take over a record. Raises Damaged."""
+    def _take(self, opcode: int, span: RecordSpan) -> None:
+        """Add a record. Raises Damaged."""
         if opcode == Opcode.CHUNK:
             self._chunk(span)
             return
@@ -121,13 +120,13 @@ class _Scanner:
             self._event_channel = ids.get(TOPIC_EVENTS, -1)
             self._output_channel = ids.get(TOPIC_OUTPUTS, -1)
 
-    def _message_index(self, span: Span, channel_id: int) -> None:
+    def _message_index(self, span: RecordSpan, channel_id: int) -> None:
         if not self._chunks or channel_id not in self._chunks[-1].counts:
             raise Damaged("it is not the index of the chunk before it")
         last = self._chunks[-1]
         self._chunks[-1] = last._replace(indexes={**last.indexes, channel_id: span})
 
-    def _chunk(self, span: Span) -> None:
+    def _chunk(self, span: RecordSpan) -> None:
         records = read_chunk(self._source, span)
         self._check_channels()
         counts: Mapping[int, int]
@@ -144,31 +143,25 @@ class _Scanner:
         self._chunks.append(ChunkEntry(span, counts, {}))
 
     def _check_channels(self) -> None:
-        """Before the first chunk there are our channels: MCAP has no checksum for their names."""
+        """Check that rsltrace's channels precede the chunks: no checksum covers their names."""
         topics = {channel.topic for channel in self._summary.channels.values()}
         for topic in _OWN - topics:
             raise Damaged(f"there is no channel {topic} before it")
 
-    def _events(self, span: Span, records: bytes) -> int:
+    def _events(self, span: RecordSpan, records: bytes) -> int:
         events = events_in(records, self._event_channel)
-        row = np.zeros(1, dtype=SEGMENT_DTYPE)[0]
+        first_event = first_output = 0
         if self._rows:
             last = self._rows[-1]
-            row["first_event"] = last["first_event"] + last["events"]
-            row["first_output"] = last["first_output"] + last["outputs"]
-        check_numbered(events, int(row["first_event"]))
+            first_event = int(last["first_event"] + last["events"])
+            first_output = int(last["first_output"] + last["outputs"])
+        check_numbered(events, first_event)
         outputs_span, outputs_count = self._pending_outputs
         if outputs_count != int(events["outputs"].sum(dtype=np.uint64)):
             raise Damaged("its events have other outputs than are in the file")
-        row["events"] = len(events)
-        row["outputs"] = outputs_count
-        row["chain_hash"] = events["chain_hash"][-1]
-        row["start_stamp"] = events["stamp"].min()
-        row["end_stamp"] = events["stamp"].max()
-        row["events_offset"], row["events_length"] = span
-        row["outputs_offset"], row["outputs_length"] = outputs_span
-        self._rows.append(row)
-        self._pending_outputs = (Span(0, 0), 0)
+        firsts = (first_event, first_output)
+        self._rows.append(segment_row(events, outputs_count, firsts, span, outputs_span)[0])
+        self._pending_outputs = (RecordSpan(0, 0), 0)
         return len(events)
 
     def _damaged(self, why: Damaged) -> TraceError:
@@ -183,4 +176,4 @@ class _Scanner:
 _OWN = frozenset((TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS))
 
 _NAMED_AFTER = {int(Opcode.METADATA): 0, int(Opcode.ATTACHMENT): 16}
-"""How many bytes stand before the name in the records that have one."""
+"""The number of bytes before the name, in the records that have one."""

@@ -1,11 +1,14 @@
-"""Events and outputs of a trace, a segment at a time, seen in place.
+"""Events and outputs of a trace, a segment at a time: arrays of records of one size.
 
-A chunk of events is one array of fixed-size records, so reading a segment is: fetch, unpack, check
-the CRC, look at the bytes as a numpy array. Nothing is parsed or copied per event.
+Reading a segment means: fetch, decompress, check the CRC, view the bytes as a numpy array. Nothing
+is parsed or copied per event. Writing copies contiguous fields in one piece: for numpy each field
+is a loop over the array.
 """
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -14,21 +17,123 @@ from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.format import (
+    CDR_HEADER,
     EVENT_DTYPE,
     EVENT_MESSAGE_DTYPE,
+    EVENT_REST_DTYPE,
+    OUTPUT_CONTENT_DTYPE,
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
+    SEGMENT_DTYPE,
 )
-from rsltrace.trace.index import damaged, read_chunk
-from rsltrace.trace.mcap.records import RECORD_HEAD, Damaged, Span
+from rsltrace.trace.index import damage_error, read_chunk
+from rsltrace.trace.mcap.chunk_builder import ChunkBody, rows_chunk
+from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, Damaged, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.model.event import Event, EventFlag, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventFlag, EventKind, Output, OutputKind
+
+_SEQUENCE_MASK = 2**32 - 1
+_CHAINED_DTYPE = np.dtype([("chain_hash", "<u8"), ("rest", f"V{EVENT_REST_DTYPE.itemsize}")])
+_NUMBERED_DTYPE = np.dtype(
+    [("event", "<u8"), ("content", f"V{OUTPUT_CONTENT_DTYPE.itemsize}"), ("sequence", "<u4")]
+)
+assert _CHAINED_DTYPE.itemsize == EVENT_DTYPE.itemsize
+assert _NUMBERED_DTYPE.itemsize == OUTPUT_DTYPE.itemsize
+
+
+def event_rows(rests: Sequence[bytes], chain_hashes: array[int]) -> npt.NDArray[np.void]:
+    """Return the events as an array of EVENT_DTYPE, shape (n,). ``rests`` are packed EVENT_REST."""
+    assert len(rests) == len(chain_hashes)
+    rows = np.empty(len(rests), dtype=_CHAINED_DTYPE)
+    rows["chain_hash"] = chain_hashes
+    rows["rest"] = np.frombuffer(b"".join(rests), dtype=_CHAINED_DTYPE["rest"])
+    return rows.view(EVENT_DTYPE)
+
+
+def output_rows(
+    contents: Sequence[bytes], sequences: array[int], events: npt.NDArray[np.void]
+) -> npt.NDArray[np.void]:
+    """Return the outputs of ``events`` as an array of OUTPUT_DTYPE, shape (n,).
+
+    ``contents`` are packed OUTPUT_CONTENT, ``sequences`` those of all outputs except draws.
+    """
+    packed, numbered = _contents(contents)
+    owners = np.repeat(events["index"], events["outputs"])
+    assert len(owners) == len(packed), "outputs do not match their events"
+    assert np.count_nonzero(numbered) == len(sequences), "outputs do not match their sequences"
+    rows = np.empty(len(packed), dtype=_NUMBERED_DTYPE)
+    rows["event"] = owners
+    rows["content"] = packed.view(_NUMBERED_DTYPE["content"])
+    sequence = np.full(len(packed), NO_SEQUENCE, dtype="<u4")
+    sequence[numbered] = sequences
+    rows["sequence"] = sequence
+    return rows.view(OUTPUT_DTYPE)
+
+
+def count_numbered(contents: Sequence[bytes]) -> int:
+    """Return how many of these outputs have a sequence."""
+    return int(np.count_nonzero(_contents(contents)[1]))
+
+
+def _contents(
+    contents: Sequence[bytes],
+) -> tuple[npt.NDArray[np.void], npt.NDArray[np.bool_]]:
+    """Return outputs as an array of OUTPUT_CONTENT_DTYPE, and which have a sequence."""
+    packed = np.frombuffer(b"".join(contents), dtype=OUTPUT_CONTENT_DTYPE)
+    return packed, packed["kind"] != OutputKind.DRAW
+
+
+def events_chunk(rows: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
+    """Return the chunk of a segment's events; a message's time is its event's stamp."""
+    messages = _messages(rows, EVENT_MESSAGE_DTYPE, channel_id)
+    messages["message_sequence"] = rows["index"] & np.uint64(_SEQUENCE_MASK)
+    messages["log_time"] = messages["publish_time"] = rows["stamp"]
+    return rows_chunk(messages, channel_id)
+
+
+def outputs_chunk(
+    rows: npt.NDArray[np.void],
+    events: npt.NDArray[np.void],
+    first_output: int,
+    channel_id: int,
+) -> ChunkBody:
+    """Return the chunk of a segment's outputs; a message's time is the stamp of its event.
+
+    ``rows`` are OUTPUT_DTYPE, ``events`` the segment's EVENT_DTYPE rows; ``first_output`` is the
+    number of outputs before them.
+    """
+    messages = _messages(rows, OUTPUT_MESSAGE_DTYPE, channel_id)
+    numbers = np.arange(first_output, first_output + len(rows), dtype=np.uint64)
+    messages["message_sequence"] = numbers & np.uint64(_SEQUENCE_MASK)
+    stamps = np.repeat(events["stamp"], events["outputs"])
+    messages["log_time"] = messages["publish_time"] = stamps
+    return rows_chunk(messages, channel_id)
+
+
+def _messages(
+    rows: npt.NDArray[np.void], layout: np.dtype[np.void], channel_id: int
+) -> npt.NDArray[np.void]:
+    """Return messages of ``layout`` with ``rows``; the caller sets sequence and times."""
+    head = np.zeros(1, dtype=layout)
+    head["opcode"] = MESSAGE
+    head["length"] = layout.itemsize - RECORD_HEAD.size
+    head["channel_id"] = channel_id
+    head["cdr"] = CDR_HEADER
+    whole = np.dtype(f"V{layout.itemsize}")
+    row = np.dtype(f"V{rows.dtype.itemsize}")
+    messages = np.empty(len(rows), dtype=layout)
+    messages.view(whole)[:] = head.view(whole)
+    messages.view([("head", f"V{whole.itemsize - row.itemsize}"), ("row", row)])["row"] = rows.view(
+        row
+    )
+    return messages
+
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"
-"""The CDR header as numpy gives it: without the zeros at its end."""
+"""The CDR header in numpy, which drops zeros at the end."""
 
 _SEGMENTS_CACHED = 4
-"""For looking up single events: a diff goes back and forth between two or three places."""
+"""For single events: a diff goes back and forth between two or three places."""
 
 
 def events_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
@@ -87,32 +192,32 @@ class SegmentReader:
         self._event_channel = event_channel
         self._output_channel = output_channel
         self._first_events = table["first_event"]
-        # Caches of this object, not of the class: they go away with the trace.
+        # Caches per object, so that they end with the trace.
         self.cached_events = lru_cache(maxsize=_SEGMENTS_CACHED)(self.events)
         self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
 
     def forget(self) -> None:
-        """Drop what is cached."""
+        """Drop the caches."""
         self.cached_events.cache_clear()
         self.cached_outputs.cache_clear()
 
     def segment_of(self, event: int) -> int:
-        """Return the number of the segment that holds ``event`` (which must exist)."""
+        """Return the number of the segment that contains ``event`` (which must exist)."""
         return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1
 
     def events(self, segment: int) -> npt.NDArray[np.void]:
         """Return the events of a segment: EVENT_DTYPE, shape (n,), read-only. Raises TraceError."""
         row = self.table[segment]
-        span = Span(int(row["events_offset"]), int(row["events_length"]))
+        span = RecordSpan(int(row["events_offset"]), int(row["events_length"]))
         try:
-            # What the table says is all the memory there is for it.
+            # The table's counts limit the memory.
             size_max = int(row["events"]) * EVENT_MESSAGE_DTYPE.itemsize
             events = events_in(read_chunk(self._source, span, size_max), self._event_channel)
             if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
-                raise Damaged("it is not the one the index speaks of")
+                raise Damaged("it is not the chunk of the index")
             check_numbered(events, int(row["first_event"]))
         except Damaged as error:
-            raise damaged(self._source, span.offset, "the events chunk", error) from error
+            raise damage_error(self._source, span.offset, "the events chunk", error) from error
         return events
 
     def outputs(self, segment: int) -> npt.NDArray[np.void]:
@@ -120,7 +225,7 @@ class SegmentReader:
         row = self.table[segment]
         if not row["outputs"]:
             return np.zeros(0, dtype=OUTPUT_DTYPE)
-        span = Span(int(row["outputs_offset"]), int(row["outputs_length"]))
+        span = RecordSpan(int(row["outputs_offset"]), int(row["outputs_length"]))
         try:
             size_max = int(row["outputs"]) * OUTPUT_MESSAGE_DTYPE.itemsize
             outputs = outputs_in(read_chunk(self._source, span, size_max), self._output_channel)
@@ -132,17 +237,36 @@ class SegmentReader:
                 or owners[-1] >= first + int(row["events"])
                 or (owners[1:] < owners[:-1]).any()
             ):
-                raise Damaged("it is not the one the index speaks of")
+                raise Damaged("it is not the chunk of the index")
         except Damaged as error:
-            raise damaged(self._source, span.offset, "the outputs chunk", error) from error
+            raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs
 
 
-def event_of(row: np.void, name: str = "trace") -> Event:
-    """Return an element of an array of EVENT_DTYPE, from a file of that name, as an Event.
+def segment_row(
+    events: npt.NDArray[np.void],
+    outputs: int,
+    firsts: tuple[int, int],
+    events_span: tuple[int, int],
+    outputs_span: tuple[int, int],
+) -> npt.NDArray[np.void]:
+    """Return the row of a segment: SEGMENT_DTYPE, shape (1,).
 
-    Raises TraceError.
+    ``outputs`` is their number, ``firsts`` the numbers of events and outputs before the segment;
+    the spans are (offset, length) of the chunks.
     """
+    row = np.zeros(1, dtype=SEGMENT_DTYPE)
+    row["first_event"], row["first_output"] = firsts
+    row["events"], row["outputs"] = len(events), outputs
+    row["chain_hash"] = events["chain_hash"][-1]
+    row["start_stamp"], row["end_stamp"] = events["stamp"].min(), events["stamp"].max()
+    row["events_offset"], row["events_length"] = events_span
+    row["outputs_offset"], row["outputs_length"] = outputs_span
+    return row
+
+
+def event_of(row: np.void, name: str = "trace") -> Event:
+    """Return a row of EVENT_DTYPE, from the file ``name``, as an Event. Raises TraceError."""
     chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
         row.item()
     )
@@ -168,10 +292,7 @@ def event_of(row: np.void, name: str = "trace") -> Event:
 
 
 def output_of(row: np.void, name: str = "trace") -> Output:
-    """Return an element of an array of OUTPUT_DTYPE, from a file of that name, as an Output.
-
-    Raises TraceError.
-    """
+    """Return a row of OUTPUT_DTYPE, from the file ``name``, as an Output. Raises TraceError."""
     event, content_hash, entity, kind, sequence = row.item()
     try:
         return Output(event, entity, OutputKind(kind), content_hash, sequence)

@@ -1,4 +1,4 @@
-"""The recorded state of a node after one of its events, made of what changed until then."""
+"""The recorded state of a node after an event, from the changes until then."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Leaf = str | npt.NDArray[Any]
 def state_after(trace: Trace, node: int, event: int) -> dict[str, Leaf]:
     """Return a node's state by path (``estimator.P``) after an event; empty if not recorded.
 
-    :raises TraceError: if what is recorded makes no sense.
+    :raises TraceError: if the recorded changes are invalid.
     """
     attributes: dict[str, dict[str, Leaf]] = {}
     try:

@@ -1,9 +1,8 @@
-"""Writing a trace as a stream: bounded memory, the same bytes for the same calls.
+"""Write a trace as a stream: bounded memory, the same bytes for the same calls.
 
-The loop hands over events, outputs and payloads as they happen; they wait in plain lists, and every
-few thousand events a *segment* goes to the file: first the payloads, then the outputs, then the
-events, so that whatever an event refers to is in the file before it. A run that is killed leaves
-a file that reads up to its last whole segment.
+The loop adds events, outputs and payloads as they happen. Every few thousand events a *segment* is
+written: payloads, then outputs, then events, so that whatever an event refers to precedes it in the
+file. The file of a killed run is readable up to its last whole segment.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace._version import __version__
 from rsltrace.errors import OutputError
-from rsltrace.trace import chunks
+from rsltrace.trace import segments
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
@@ -56,14 +54,14 @@ from rsltrace.trace.format import (
     TOPIC_TIMINGS,
 )
 from rsltrace.trace.index import metadata_checksum
-from rsltrace.trace.mcap.chunk_body import Waiting, messages_chunk
-from rsltrace.trace.mcap.deferred import DeferredWriter
+from rsltrace.trace.mcap.buffered_writer import BufferedWriter
+from rsltrace.trace.mcap.chunk_builder import PendingMessages, messages_chunk
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
 from rsltrace.trace.model.finding import Finding
-from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
+from rsltrace.trace.rosbag2 import KEY, BagTopicMetadata, bag_metadata_yaml, normalized_qos
 
 _HEADER_BYTES = MESSAGE_HEAD.size
 SEGMENT_MEDIA_TYPE = "application/octet-stream"
@@ -72,14 +70,14 @@ SEGMENT_MEDIA_TYPE = "application/octet-stream"
 class TraceWriter:
     """Writes one trace.
 
-    An event's outputs are added before the event itself; entities and payloads at any time before
-    the event that refers to them. ``add_output`` takes an output of the event that is added next,
-    packed by ``format.OUTPUT_CONTENT``, and unless it is a draw, ``add_sequence`` takes the
-    sequence of its payload (or NO_SEQUENCE). Both are methods of what collects them, since a run
-    calls them for every message. ``close`` ends the file; used as a context manager, leaving the
-    block without ``close`` gives the file up as an interrupted run would (``abort``).
+    Add an event's outputs before the event; entities and payloads at any time before the event that
+    refers to them. ``add_output`` takes an output of the next event, packed by
+    ``format.OUTPUT_CONTENT``; unless it is a draw, ``add_sequence`` takes the sequence of its
+    payload (or NO_SEQUENCE). Both are methods of the collecting lists, since a run calls them for
+    every message. ``close`` ends the file; leaving the ``with`` block without it leaves the file of
+    an interrupted run (``abort``).
 
-    Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no room,
+    Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no space,
     a failing disk, a file too large. The file is then readable up to its last whole segment.
     """
 
@@ -91,11 +89,11 @@ class TraceWriter:
         compression: str = "zstd",
         events_per_segment: int | None = None,
     ) -> None:
-        """Create the file. ``compression`` is ``zstd`` or empty; None is the usual segment.
-        Without a ``path`` everything waits for ``settle``.
+        """Create the file. ``compression`` is ``zstd`` or empty. Without ``path``, buffer until
+        ``settle``.
 
-        Raises OutputError if ``path`` exists and ``force`` is false, if it is a folder, or if it
-        cannot be created; a missing folder is not made, since it is more often a typing mistake.
+        Raises OutputError if ``path`` exists and ``force`` is false, is a folder, or cannot be
+        created. Missing folders are not made: mostly they are typing errors.
         """
         self._segment_events = events_per_segment or EVENTS_PER_SEGMENT
         self._rests: list[bytes] = []
@@ -104,9 +102,9 @@ class TraceWriter:
         self.add_output: Callable[[bytes], None] = self._outputs.append
         self._output_sequences = array("I")
         self.add_sequence: Callable[[int], None] = self._output_sequences.append
-        self._payloads: Waiting = []
+        self._payloads: PendingMessages = []
         self._payload_bytes = 0
-        self._entities: Waiting = []
+        self._entities: PendingMessages = []
         self._entity_bytes = 0
         self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
@@ -117,7 +115,7 @@ class TraceWriter:
         self._ros_distro = ""
         about = {"profile": PROFILE, "library": f"{LIBRARY} {__version__}"}
         self._stream = (
-            DeferredWriter(compression=compression, **about)
+            BufferedWriter(compression=compression, **about)
             if path is None
             else McapWriter(
                 path, force=force, compression=compression, progress=self._progress, **about
@@ -138,25 +136,20 @@ class TraceWriter:
     def __enter__(self) -> TraceWriter:
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.abort()
 
     def _progress(self) -> str:
         return f"{self._events_written} events"
 
     def settle(self, path: Path, *, force: bool) -> None:
-        """Create the file, with all that there is so far. Once, where there was no path before.
+        """Create the file of a writer without one, with everything added so far.
 
         :raises OutputError: as when a trace is created.
         """
         deferred = self._stream
-        assert isinstance(deferred, DeferredWriter), "it has no place yet"
-        self._stream, chunks_at = deferred.pour(path, force=force, progress=self._progress)
+        assert isinstance(deferred, BufferedWriter), "it has no place yet"
+        self._stream, chunks_at = deferred.write_to(path, force=force, progress=self._progress)
         rows = np.frombuffer(b"".join(self._segments), dtype=SEGMENT_DTYPE).copy()
         for row in rows:
             for what in ("events", "outputs") if row["outputs"] else ("events",):
@@ -165,36 +158,36 @@ class TraceWriter:
 
     @property
     def place(self) -> Path:
-        """Where the trace is: beside the one that it replaces, until it is closed."""
+        """The written file: beside the one that it replaces, until it is closed."""
         return self._stream.place
 
     @property
     def kept(self) -> str:
-        """What to say of the trace that it should have replaced and has not; else ""."""
+        """What to say about a trace that should have been replaced and was not; else ""."""
         return self._stream.kept
 
     @property
     def event_count(self) -> int:
-        """How many events were added."""
+        """The number of events added."""
         return self._events_written + len(self._rests)
 
     @property
     def output_count(self) -> int:
-        """How many outputs were added."""
+        """The number of outputs added."""
         return self._outputs_written + len(self._outputs)
 
     @property
     def digest(self) -> str:
-        """The digest of the run so far: the last chain hash as 16 hex digits."""
+        """The digest so far: the last chain hash as 16 hex digits."""
         return digest_text(self._chain_hashes[-1] if self._chain_hashes else self._last_chain_hash)
 
     @property
     def size(self) -> int:
-        """How many bytes are in the file; what is still collected for a chunk is not."""
+        """The size of the file, without what is collected for the next chunk."""
         return self._stream.bytes_written
 
     def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
-        """Write a metadata record, its keys sorted: equal mappings give equal bytes."""
+        """Write a metadata record with sorted keys: equal mappings give equal bytes."""
         if name == METADATA_ENVIRONMENT:
             self._ros_distro = mapping.get("ros_distro", "")
         checksum = metadata_checksum(name, mapping)
@@ -216,9 +209,9 @@ class TraceWriter:
         """Return the id of the channel of ``topic``, written now if it is new.
 
         ``type_name`` is the interface (``std_msgs/msg/String``; ``std_srvs/srv/Trigger_Request``),
-        ``schema_text`` its ros2msg definition with all it depends on, ``qos_yaml`` the QoS
-        profiles offered as rosbag2 stores them, ``type_hash`` the RIHS01 hash. A topic has one
-        channel per type; when it is there already its id is returned and its first QoS stays.
+        ``schema_text`` its ros2msg definition with dependencies, ``qos_yaml`` the offered QoS
+        profiles as rosbag2 stores them, ``type_hash`` the RIHS01 hash. A topic has one channel per
+        type, whose first QoS stays.
         """
         key = (topic, type_name)
         channel_id = self._channel_ids.get(key)
@@ -233,7 +226,7 @@ class TraceWriter:
         return channel_id
 
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
-        """Take a message (CDR with its 4-byte header). Returns its sequence in the channel."""
+        """Add a message (CDR with its 4-byte header). Returns its sequence in the channel."""
         sequence = self._sequences[channel_id]
         self._payloads.extend((channel_id, sequence, stamp_ns, data))
         self._sequences[channel_id] = sequence + 1
@@ -243,14 +236,14 @@ class TraceWriter:
         return sequence
 
     def add_event(self, rest: bytes, chain_hash: int) -> None:
-        """Take the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
+        """Add the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
         self._rests.append(rest)
         self._chain_hashes.append(chain_hash)
         if len(self._rests) >= self._segment_events or len(self._outputs) >= OUTPUTS_PER_SEGMENT:
             self._write_segment()
 
     def add_entity(self, entity: Entity) -> int:
-        """Take an entity; to be called before the first event that names it."""
+        """Add an entity before the first event that names it."""
         channel_id, data = self._entity_channel, pack_entity(entity)
         sequence = self._sequences[channel_id]
         self._entities.extend((channel_id, sequence, entity.created_ns, data))
@@ -261,37 +254,36 @@ class TraceWriter:
         return sequence
 
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
-        """Take the text of output number ``output`` of ``event``. Returns its sequence."""
+        """Add the text of output number ``output`` of ``event``. Returns its sequence."""
         return self.add_payload(self._detail_channel, stamp_ns, pack_detail(event, output, text))
 
     def add_finding(self, finding: Finding, stamp_ns: int) -> int:
-        """Take a finding of the guard. Its channel is there once there is something in it."""
+        """Add a finding of the guard."""
         channel_id = self._own_channel(TOPIC_FINDINGS, SCHEMA_FINDING)
         return self.add_payload(channel_id, stamp_ns, pack_finding(finding))
 
     def add_code_line(self, line: CodeLine, stamp_ns: int) -> int:
-        """Take a place in the code."""
+        """Add a code line."""
         channel_id = self._own_channel(TOPIC_CODE_LINES, SCHEMA_CODE_LINE)
         return self.add_payload(channel_id, stamp_ns, pack_code_line(line))
 
     def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
-        """Take what changed in a node's state, as JSON."""
+        """Add changes of a node's state, as JSON."""
         channel_id = self._own_channel(TOPIC_STATES, SCHEMA_STATE)
         return self.add_payload(channel_id, stamp_ns, pack_detail(event, node, changes))
 
     def add_timing(self, packed: bytes, stamp_ns: int) -> int:
-        """Take when and for how long the next event ran, packed by ``format.TIMING``."""
+        """Add the times of the next event, packed by ``format.TIMING``."""
         channel_id = self._own_channel(TOPIC_TIMINGS, SCHEMA_TIMING)
         return self.add_payload(channel_id, stamp_ns, CDR_HEADER + packed)
 
     def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
-        """Write what is left, then the indexes, and close the file.
+        """Write the rest and the indexes, and close the file.
 
         ``result`` says how the run ended (``stop_reason``, ``exit_code``; ``start_time`` and
         ``end_time`` in simulated nanoseconds, by default those of the first and last message).
-        Version, digest and counts are added here. Outputs of an event that was never added are
-        left out. With ``replace``, the trace takes the place of one that was there. After an
-        OutputError the file is closed, too.
+        Version, digest and counts are added here. Outputs of an unfinished event are dropped. With
+        ``replace``, the trace replaces an older one. After an OutputError the file is closed, too.
         """
         try:
             self._drop_unfinished_event()
@@ -307,14 +299,14 @@ class TraceWriter:
             self._stream.abort()
 
     def abort(self) -> None:
-        """Close the file without an end, as if the run had been killed. Harmless when closed."""
+        """Close the file without an end, as if the run was killed. Harmless when closed."""
         self._stream.abort()
 
     def _own_channel(self, topic: str, type_name: str) -> int:
         return self.add_channel(topic, type_name, SCHEMA_TEXT[type_name])
 
     def _write_entities(self) -> None:
-        """Write them apart: who reads a trace needs them first, and should get nothing else."""
+        """Write them in their own chunk: a reader needs them first, and nothing else."""
         if self._entities:
             self._write_waiting(self._entities)
             self._entity_bytes = 0
@@ -335,7 +327,7 @@ class TraceWriter:
         self._write_waiting(self._payloads)
         self._payload_bytes = 0
 
-    def _write_waiting(self, waiting: Waiting) -> None:
+    def _write_waiting(self, waiting: PendingMessages) -> None:
         try:
             self._stream.chunk(messages_chunk(waiting))
             waiting.clear()
@@ -353,25 +345,17 @@ class TraceWriter:
             raise
 
     def _write_events_and_outputs(self) -> None:
-        events = chunks.event_rows(self._rests, self._chain_hashes)
+        events = segments.event_rows(self._rests, self._chain_hashes)
         self._check(events)
-        outputs = chunks.output_rows(self._outputs, self._output_sequences, events)
+        outputs = segments.output_rows(self._outputs, self._output_sequences, events)
         outputs_at = (0, 0)
         if len(outputs):
             outputs_at = self._stream.chunk(
-                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
+                segments.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
             )
-        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel))
-        row = np.zeros(1, dtype=SEGMENT_DTYPE)
-        row["first_event"] = self._events_written
-        row["events"] = len(events)
-        row["first_output"] = self._outputs_written
-        row["outputs"] = len(outputs)
-        row["chain_hash"] = events["chain_hash"][-1]
-        row["start_stamp"] = events["stamp"].min()
-        row["end_stamp"] = events["stamp"].max()
-        row["events_offset"], row["events_length"] = events_at
-        row["outputs_offset"], row["outputs_length"] = outputs_at
+        events_at = self._stream.chunk(segments.events_chunk(events, self._event_channel))
+        firsts = (self._events_written, self._outputs_written)
+        row = segments.segment_row(events, len(outputs), firsts, events_at, outputs_at)
         self._segments.append(row.tobytes())
         self._last_chain_hash = self._chain_hashes[-1]
         self._events_written += len(events)
@@ -382,17 +366,17 @@ class TraceWriter:
         del self._chain_hashes[:]
 
     def _check(self, events: npt.NDArray[np.void]) -> None:
-        """A recorder that miscounts would write a trace that misleads: stop at once instead."""
+        """Stop at once if the recorder miscounts: such a trace would mislead."""
         first = self._events_written
         indexes = np.arange(first, first + len(events), dtype=np.uint64)
         assert np.array_equal(events["index"], indexes), "events are not numbered 0, 1, 2, …"
 
     def _drop_unfinished_event(self) -> None:
-        """Forget what came after the last whole event: an interrupt may have come anywhere."""
+        """Drop what follows the last whole event: an interrupt may come anywhere."""
         del self._rests[len(self._chain_hashes) :]
-        events = chunks.event_rows(self._rests, self._chain_hashes)
+        events = segments.event_rows(self._rests, self._chain_hashes)
         del self._outputs[int(events["outputs"].sum()) :]
-        del self._output_sequences[chunks.count_numbered(self._outputs) :]
+        del self._output_sequences[segments.count_numbered(self._outputs) :]
 
     def _result(self, given: Mapping[str, str]) -> dict[str, str]:
         return {
@@ -407,7 +391,7 @@ class TraceWriter:
 
     def _bag_metadata(self) -> str:
         topics = [
-            BagTopic(
+            BagTopicMetadata(
                 name=channel.topic,
                 type=type_name,
                 type_hash=channel.metadata.get("topic_type_hash", ""),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.guard.audit.audit import audit_path
-from rsltrace.guard.audit.rules import Treatment
+from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, NodeSpec, StopSpec
 from rsltrace.run import run
 from rsltrace.trace.model.finding import Mode
@@ -45,6 +45,9 @@ CALLS = [
     "os.environ.get('NOTHING')",
     "os.getenv('NOTHING')",
     "os.getpid()",
+    "os.getloadavg()",
+    "gc.get_objects()",
+    "threading.get_native_id()",
     "os.cpu_count()",
     "pathlib.Path.home()",
     "os.path.getmtime('/')",
@@ -55,8 +58,8 @@ CALLS = [
     "f'{id(N)}'",
 ]
 IMPORTS = (
-    "import datetime, email.utils, glob, numpy, os, pathlib, random, secrets, socket, subprocess, "
-    "time, timeit, uuid\nfrom rclpy.node import Node\n"
+    "import datetime, email.utils, gc, glob, numpy, os, pathlib, random, secrets, socket, "
+    "subprocess, threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
 )
 
 

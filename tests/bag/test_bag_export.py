@@ -155,7 +155,7 @@ def test_nothing_is_lost_or_left_half_done(
 def test_force_replaces_bags_only(tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home" / "thesis.tex").write_text("precious")
-    with pytest.raises(OutputError, match="what is there is no bag"):
+    with pytest.raises(OutputError, match="the existing folder is not a bag"):
         check_bag_folder(tmp_path / "home", force=True)
     with pytest.raises(OutputError, match="does not exist; create it"):
         check_bag_folder(tmp_path / "no" / "out", force=True)

@@ -7,18 +7,18 @@ from collections.abc import Iterator
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.trace.recordings.merge import Message, Piece, merge
+from rsltrace.trace.recordings.merge import BagMessage, RecordingPart, merge
 
 stamps = st.lists(st.integers(0, 30), max_size=8).map(sorted)
 # A piece may start earlier than its first message: a start is a promise, not a message.
 pieces = st.lists(st.tuples(stamps, st.integers(0, 5)), max_size=6)
 
 
-def make(order: int, times: list[int], early: int = 0) -> Piece:
-    def read() -> Iterator[Message]:
+def make(order: int, times: list[int], early: int = 0) -> RecordingPart:
+    def read() -> Iterator[BagMessage]:
         return iter([(t, order, b"%d" % i) for i, t in enumerate(times)])
 
-    return Piece(max(0, times[0] - early) if times else 0, order, read)
+    return RecordingPart(max(0, times[0] - early) if times else 0, order, read)
 
 
 @given(pieces, st.randoms(use_true_random=False))
@@ -36,12 +36,12 @@ def test_the_result_is_sorted_by_time_piece_and_place(
 def test_a_piece_is_opened_when_its_time_has_come_and_not_before() -> None:
     opened: list[int] = []
 
-    def piece(order: int, times: list[int]) -> Piece:
-        def read() -> Iterator[Message]:
+    def piece(order: int, times: list[int]) -> RecordingPart:
+        def read() -> Iterator[BagMessage]:
             opened.append(order)
             yield from ((t, order, b"") for t in times)
 
-        return Piece(times[0], order, read)
+        return RecordingPart(times[0], order, read)
 
     messages = merge([piece(0, [0, 1, 5]), piece(1, [2, 3]), piece(2, [6])])
     assert opened == []

@@ -7,20 +7,20 @@ from collections.abc import Iterator
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.trace.recordings.merge import Message
+from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.playback import reordered
 
 
 @given(st.lists(st.integers(0, 50), max_size=60))
 def test_reordering_is_a_stable_sort(stamps: list[int]) -> None:
-    messages: list[Message] = [(stamp, i, b"") for i, stamp in enumerate(stamps)]
+    messages: list[BagMessage] = [(stamp, i, b"") for i, stamp in enumerate(stamps)]
     assert list(reordered(lambda: iter(messages))) == sorted(messages, key=lambda m: m[0])
 
 
 def test_only_as_many_messages_wait_as_may_come_late() -> None:
     taken = 0
 
-    def messages() -> Iterator[Message]:
+    def messages() -> Iterator[BagMessage]:
         nonlocal taken
         taken = 0
         for i in range(10_000):

@@ -34,8 +34,7 @@ def test_what_is_said() -> None:
     assert both == "nobody publishes /t, which /a and /b listen to"
     many = silent_topics(entities(*(("/b", SUB, f"/t{n}") for n in range(5))))
     assert many == (
-        "nobody publishes what is listened to: /t0 (for /b), /t1 (for /b), /t2 (for /b) and 2 more "
-        "topics"
+        "topics without a publisher: /t0 (for /b), /t1 (for /b), /t2 (for /b) and 2 more topics"
     )
 
 
@@ -53,8 +52,7 @@ def test_what_is_said_of_clients() -> None:
     both = without_server(entities(("/a", calls, "/s"), ("/b", calls, "/s")))
     assert both == "nobody serves /s, of which /a and /b are clients"
     assert without_server(entities(*(("/b", calls, f"/s{n}") for n in range(4)))) == (
-        "nobody serves what there are clients of: /s0 (for /b), /s1 (for /b), /s2 (for /b) and 1 "
-        "more services"
+        "services without a server: /s0 (for /b), /s1 (for /b), /s2 (for /b) and 1 more services"
     )
 
 

@@ -16,7 +16,7 @@ import rsltrace
 from rsltrace.diff.report import render
 from rsltrace.errors import TraceError
 from rsltrace.trace.mcap import records as limits
-from rsltrace.trace.mcap.source import public, without_secrets
+from rsltrace.trace.mcap.source import public_address, redacted
 from rsltrace.trace.reader import Trace
 from tests.range_server import RangeServer
 
@@ -218,12 +218,12 @@ def test_an_address_where_a_path_is_wanted(command: str) -> None:
     ],
 )
 def test_what_is_shown_of_an_address(address: str, shown: str) -> None:
-    assert public(address) == shown
-    told = without_secrets(f"500, url=URL('{address}') {json.dumps(address)}", address)
+    assert public_address(address) == shown
+    told = redacted(f"500, url=URL('{address}') {json.dumps(address)}", address)
     assert told.count(shown) == 2
 
 
 def test_a_library_that_writes_an_address_in_its_own_way() -> None:
     address = "https://us%65r:p%40ss@host/a?sig=abc%2Fdef"
-    told = without_secrets("cannot open ('user', 'p@ss') https://x:y@host/?sig=abc/def", address)
+    told = redacted("cannot open ('user', 'p@ss') https://x:y@host/?sig=abc/def", address)
     assert told == "cannot open ('…', '…') https://host/?…"

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.guard.watched.functions import watched_calls
+from rsltrace.guard.call_reports import reported_calls
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.process import search_path
 from tests.guard.conftest import list_as_wheel
@@ -201,7 +201,7 @@ def test_reads_of_the_environment_are_met_however_many_runs_there_were(tmp_path:
 
     kind = type(os.environ)
     for _ in range(600):  # Python 3.13 trusts what it has cached after 1000 changes of a class
-        with watched_calls():
+        with reported_calls():
             assert not os.environ.get("NOTHING")
         assert not any(os.environ.get("NOTHING") for _ in range(3))
     (tmp_path / "cold.py").write_text(READS)

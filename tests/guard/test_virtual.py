@@ -496,7 +496,7 @@ def test_whose_code_reads_a_clock_is_told_from_its_file_and_not_from_its_modules
     places = {"here": sys._getframe().f_code.co_filename, "json": json.__file__}
 
     def whose(name: str, file: str, **more: str) -> tuple[int, dict[str, int]]:
-        names = {"whose": guard.whose, "frame": sys._getframe, "__file__": name, **more}
+        names = {"whose": guard.file_kind, "frame": sys._getframe, "__file__": name, **more}
         exec(compile("kind = whose(globals(), frame())", file, "exec"), names)
         return names["kind"], guard.kinds  # type: ignore[return-value]
 

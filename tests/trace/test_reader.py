@@ -16,7 +16,7 @@ from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import index as index_module
 from rsltrace.trace.format import EVENT_DTYPE, EVENTS_PER_SEGMENT, OUTPUT_DTYPE
 from rsltrace.trace.index import read_chunk
-from rsltrace.trace.mcap.records import Span
+from rsltrace.trace.mcap.records import RecordSpan
 from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
@@ -234,7 +234,7 @@ def test_looking_up_neighbours_unpacks_a_segment_once(
     write_run(path, 1000)
     unpacked = []
 
-    def count(source: FileSource, span: Span, size_max: int) -> bytes:
+    def count(source: FileSource, span: RecordSpan, size_max: int) -> bytes:
         unpacked.append(span)
         return read_chunk(source, span, size_max)
 

@@ -228,7 +228,9 @@ def test_a_link_leads_to_what_is_replaced(path: Path) -> None:
 def test_nothing_but_a_trace_is_taken_for_one_that_was_given_up(path: Path) -> None:
     path.write_bytes(MAGIC)
     unfinished(path).write_text("precious")
-    with pytest.raises(OutputError, match=r"run\.unfinished\.mcap: what is there is no trace"):
+    with pytest.raises(
+        OutputError, match=r"run\.unfinished\.mcap: the existing file is not a trace"
+    ):
         Sink(path, force=True)
     unfinished(path).unlink()
     unfinished(path).symlink_to(path.parent / "elsewhere")

@@ -57,7 +57,9 @@ def test_force_replaces_a_longer_file(tmp_path: Path) -> None:
 def test_force_replaces_nothing_but_traces(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "job.yaml"
     path.write_bytes(content)
-    with pytest.raises(OutputError, match=r"job\.yaml: what is there is no trace \(it is not MCAP"):
+    with pytest.raises(
+        OutputError, match=r"job\.yaml: the existing file is not a trace \(not MCAP"
+    ):
         TraceWriter(path, force=True)
     assert path.read_bytes() == content
 
@@ -413,15 +415,15 @@ def test_an_interrupt_in_the_middle_of_a_write_ends_the_trace_there(
                 feeder.event(EventKind.TIMER, 1, step)
 
         run(EVENTS_PER_SEGMENT + 10)
-        real = writer_module.chunks.events_chunk
+        real = writer_module.segments.events_chunk
 
         def interrupt(*_: object) -> None:
             raise KeyboardInterrupt
 
-        monkeypatch.setattr(writer_module.chunks, "events_chunk", interrupt)
+        monkeypatch.setattr(writer_module.segments, "events_chunk", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(EVENTS_PER_SEGMENT)
-        monkeypatch.setattr(writer_module.chunks, "events_chunk", real)
+        monkeypatch.setattr(writer_module.segments, "events_chunk", real)
         with pytest.raises(OutputError, match="interrupted in the middle of a segment"):
             feeder.writer.close(result={})
     with Trace.open(path) as trace:

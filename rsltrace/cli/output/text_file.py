@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import OutputError, SetupError
-
-
-@contextmanager
-def undone(path: Path) -> Iterator[None]:
-    """Remove a file that was made here if the ``with`` block does not end well."""
-    try:
-        yield
-    except BaseException:
-        with suppress(OSError):
-            path.unlink()
-        raise
+from rsltrace.trace.model.regular_file import replacement_of
 
 
 def write_text(path: Path, text: str) -> None:
@@ -28,18 +15,12 @@ def write_text(path: Path, text: str) -> None:
 
     :raises OutputError: if it cannot be written; what was there stays.
     """
-    final = Path(os.path.realpath(path))
-    work = final.with_name(f".{final.name}.part-{os.getpid()}")
     try:
         if path.exists() and not path.is_file():
             path.write_text(text, encoding="utf-8")
             return
-        with work.open("x", encoding="utf-8") as file, undone(work):
+        with replacement_of(path) as work, work.open("x", encoding="utf-8") as file:
             file.write(text)
-            file.flush()
-            if final.exists():
-                os.chmod(work, final.stat().st_mode & 0o777)
-            os.replace(work, final)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
@@ -68,10 +49,8 @@ def save_picture(figure: Any, path: Path) -> None:
 
     :raises OutputError: the file cannot be written; what was there stays.
     """
-    work = path.with_name(f".{path.name}.part-{os.getpid()}")
     try:
-        with undone(work):
+        with replacement_of(path) as work:
             figure.savefig(work, format=path.suffix[1:].lower(), dpi=150)
-            os.replace(work, path)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error

@@ -1,1 +1,1 @@
-"""A static look at the sources of nodes for what could make runs differ. Nothing is executed."""
+"""The audit: what in the sources of nodes could make runs differ."""

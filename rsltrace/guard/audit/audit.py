@@ -1,4 +1,4 @@
-"""Auditing a path or a job: from files to findings."""
+"""Audit a path or a job: from files to findings."""
 
 from __future__ import annotations
 
@@ -11,19 +11,21 @@ import tokenize
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rsltrace.errors import JobError
-from rsltrace.guard.audit.calls import Place, find_calls
-from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.rules import Audit, Found, Treatment, allowed
-from rsltrace.guard.audit.scopes import Module, Scope, parse_scopes
+from rsltrace.guard.audit.calls import CallSite, find_calls
+from rsltrace.guard.audit.names import NameResolver
+from rsltrace.guard.audit.rules import Audit, Found
+from rsltrace.guard.audit.scopes import ModuleSource, NameScope, parse_scopes
+from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.trace.model.finding import Policy
 from rsltrace.trace.model.module_search import find_module
 from rsltrace.trace.model.regular_file import read_regular
 
-# Which files to look at: those of a path, or those that a job's nodes come from, and no others.
+# Which files to read: those of a path, or those of a job's nodes and their imports.
 
 _INSTALLED = {"site-packages", "dist-packages"}
 _NOT_SOURCES = {"build", "install", "log", "node_modules", "__pycache__"}
@@ -32,17 +34,17 @@ _ALLOW = re.compile(r"#.*\brsltrace:\s*allow\b(?P<kinds>[\w ,\t-]*)")
 
 @dataclass(eq=False)
 class SourceFile:
-    """A Python file to look at. ``allowed`` has the kinds that a comment allows, by line; an empty
+    """A Python file to audit. ``allowed`` maps lines to the kinds that a comment allows; an empty
     set allows all."""
 
     path: Path
-    module: Module
+    module: ModuleSource
     as_script: bool = False
     allowed: dict[int, frozenset[str]] = field(default_factory=dict)
 
 
 def read_source(path: Path, name: str, *, as_script: bool = False) -> SourceFile:
-    """Return a file taken apart.
+    """Parse a file.
 
     :raises OSError, SyntaxError, ValueError: if it is no Python source.
     """
@@ -65,8 +67,8 @@ def _allowed(text: str) -> dict[int, frozenset[str]]:
     return found
 
 
-class Collection:
-    """Files by module name, each once, with those that could not be read."""
+class SourceCollection:
+    """Source files by module name, each once, and those that could not be read."""
 
     def __init__(self) -> None:
         self.files: dict[str, SourceFile] = {}
@@ -97,18 +99,18 @@ class Collection:
         return None
 
 
-def collect_path(path: Path) -> Collection:
+def collect_path(path: Path) -> SourceCollection:
     """Return the Python file at a path, or those below a folder."""
-    found = Collection()
+    found = SourceCollection()
     if path.is_dir():
-        for file in _below(path):
+        for file in _python_files(path):
             found.add(file, module_name(file))
     else:
         found.add(path, module_name(path), as_script=True)
     return found
 
 
-def _below(folder: Path) -> Iterator[Path]:
+def _python_files(folder: Path) -> Iterator[Path]:
     for here, folders, files in os.walk(folder):
         if "pyvenv.cfg" in files:
             folders.clear()
@@ -123,7 +125,7 @@ def _below(folder: Path) -> Iterator[Path]:
 
 
 def module_name(path: Path) -> str:
-    """Return the full name of a file's module: as far up as there are packages."""
+    """Return the full name of a file's module, its packages included."""
     path = path.absolute()
     parts = [] if path.name == "__init__.py" else [path.stem]
     folder = path.parent
@@ -138,14 +140,13 @@ def collect_modules(
     scripts: Sequence[Path],
     folders: Sequence[Path],
     programs: AbstractSet[str] = frozenset(),
-) -> tuple[Collection, list[str]]:
-    """Return modules by name, and what they import as far as it is the user's own; also the names
-    that were not found. ``programs`` are those that ``python -m`` runs.
+) -> tuple[SourceCollection, list[str]]:
+    """Return modules by name with the user's modules that they import, and the names not found.
 
-    The user's own are modules below ``folders`` (no virtual environment there), and of an installed
-    package those of the package itself.
+    ``programs`` are the modules that ``python -m`` runs. The user's modules are those below
+    ``folders`` (virtual environments excluded), and those of the same installed package.
     """
-    found = Collection()
+    found = SourceCollection()
     path = [*map(str, folders), *sys.path]
     missing = []
     waiting: list[tuple[str, str]] = [(name, name.partition(".")[0]) for name in names]
@@ -188,11 +189,9 @@ def _is_own(file: Path, name: str, package: str, folders: Sequence[Path]) -> boo
     )
 
 
-# What the guard does about a place in the sources: the job's, or that of the node that runs it.
-#
-# A node may have a ``guard:`` of its own. Code at the top of a module runs under the job's, since
-# no node is there yet; what stands in a node's class runs under the node's; any other function
-# under that of each node whose imports lead to it.
+# What the guard does about a call site depends on the policy of the job or of the node that runs
+# it. Code at the top of a module runs under the job's, since no node exists yet; code in a node's
+# class under the node's; any other function under that of each node whose imports lead to it.
 
 _LEAST_SAFE_FIRST = (
     Treatment.NOTHING,
@@ -205,12 +204,8 @@ _LEAST_SAFE_FIRST = (
 
 
 @dataclass
-class _Group:
-    """Nodes that are guarded alike.
-
-    ``targets`` are theirs (``module:Class``, or scripts), ``files`` what these and their imports
-    are.
-    """
+class _NodeGroup:
+    """Nodes with equal policies, with their targets (``module:Class`` or scripts) and files."""
 
     policy: Policy
     whose: str
@@ -219,9 +214,9 @@ class _Group:
 
 
 class GuardTreatment:
-    """Says what is done about a place. ``policy`` is the job's, None if it has no guard at all."""
+    """Returns what the guard does about a call site. ``policy`` is the job's; None: no guard."""
 
-    def __init__(self, policy: Policy | None, groups: Sequence[_Group] = ()) -> None:
+    def __init__(self, policy: Policy | None, groups: Sequence[_NodeGroup] = ()) -> None:
         self._policy = policy
         self._groups = groups
 
@@ -229,20 +224,20 @@ class GuardTreatment:
     def of_job(
         cls, job: Job, targets: Sequence[str | Path], folders: Sequence[Path]
     ) -> GuardTreatment:
-        """Return what the guards of a job and its nodes do; ``targets`` are those of the nodes."""
+        """Return the treatment by the guards of a job and its nodes, which have ``targets``."""
         if not job.guard.enabled:
             return cls(None)
         of_job = policy_of(job.guard)
         if all(spec.guard is None for spec in job.nodes):
             return cls(of_job)
-        groups: list[_Group] = []
+        groups: list[_NodeGroup] = []
         for spec, target in zip(job.nodes, targets, strict=True):
             policy, whose = of_job, "the job"
             if spec.guard is not None:
                 policy, whose = policy_of(job.guard, spec.guard), f"node {spec.name or spec.target}"
             group = next((one for one in groups if one.policy == policy), None)
             if group is None:
-                groups.append(group := _Group(policy, whose, []))
+                groups.append(group := _NodeGroup(policy, whose, []))
             group.targets.append(target)
         for group in groups:
             names = [module_of(target) for target in group.targets if isinstance(target, str)]
@@ -251,12 +246,12 @@ class GuardTreatment:
             group.files = frozenset(one.path.resolve() for one in reached.files.values())
         return cls(of_job, groups)
 
-    def of(self, source: SourceFile, place: Place) -> tuple[Treatment, str]:
-        """Return the treatment of a place, and what that means; of several, the least safe."""
+    def of(self, source: SourceFile, place: CallSite) -> tuple[Treatment, str]:
+        """Return the treatment of a call site and its meaning; of several, the least safe."""
         groups = self._that_get_to(source, place)
         if not groups:
-            return _done(source, place, self._policy, "the job")
-        all_done = [_done(source, place, group.policy, group.whose) for group in groups]
+            return _treatment(source, place, self._policy, "the job")
+        all_done = [_treatment(source, place, group.policy, group.whose) for group in groups]
         least = min(all_done, key=lambda done: _LEAST_SAFE_FIRST.index(done[0]))
         group = groups[all_done.index(least)]
         treatment, does = least
@@ -266,8 +261,8 @@ class GuardTreatment:
         runs_in = "" if group.whose in does else f" when {group.whose} runs it"
         return treatment, f"{does}{runs_in} ({other[0].value} elsewhere)"
 
-    def _that_get_to(self, source: SourceFile, place: Place) -> Sequence[_Group]:
-        scope: Scope | None = source.module.scope_of(place.node)
+    def _that_get_to(self, source: SourceFile, place: CallSite) -> Sequence[_NodeGroup]:
+        scope: NameScope | None = source.module.scope_of(place.node)
         if scope is source.module.top or not self._groups:
             return ()
         while scope is not None and scope.parent is not source.module.top:
@@ -283,25 +278,25 @@ def module_of(target: str) -> str:
     return target.partition(":")[0]
 
 
-def _done(
-    source: SourceFile, place: Place, policy: Policy | None, whose: str
+def _treatment(
+    source: SourceFile, place: CallSite, policy: Policy | None, whose: str
 ) -> tuple[Treatment, str]:
     rule = place.rule
     globs = policy.allowed.get(rule.source, ()) if policy and rule.source else ()
-    if allowed(source.module.name, globs):
+    if any(fnmatchcase(source.module.name, glob) for glob in globs):
         return Treatment.NOTHING, f"{whose} allows it to this module"
     return rule.treated(policy, whose)
 
 
 Executables = Callable[[str, str], "str | Path"]
-"""Given ``package/executable`` and where it is written: ``module:function``, or a script's path."""
+"""Maps ``package/executable``, and where it is written, to ``module:function`` or a script."""
 ModuleFolders = Callable[[Iterable[Path]], list[Path]]
 
 
 def audit_path(path: Path) -> Audit:
-    """Look at a Python file, or at all below a folder; the guard's defaults are taken.
+    """Audit a Python file, or all files below a folder, with the guard's defaults.
 
-    :raises JobError: if there is nothing to look at.
+    :raises JobError: if there is nothing to audit.
     """
     if not path.exists():
         raise JobError(f"{path}: there is no such file or folder")
@@ -314,9 +309,9 @@ def audit_path(path: Path) -> Audit:
 def audit_job(
     job: Job, executable: Executables, module_folders: ModuleFolders | None = None
 ) -> Audit:
-    """Look at the modules of a job's nodes, and at what those import below its search path.
+    """Audit the modules of a job's nodes, and their imports below its search path.
 
-    Where nodes are executables of packages, ``module_folders`` tells the folders of their modules.
+    ``module_folders`` returns the folders of the modules of packages' executables.
 
     :raises JobError: if a node's module is not found.
     """
@@ -358,11 +353,11 @@ def audit_job(
     return _audit(collection, GuardTreatment.of_job(job, targets, folders))
 
 
-def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
+def _audit(collection: SourceCollection, guard: GuardTreatment) -> Audit:
     sources = list(collection.files.values())
-    names = Names({source.module.name: source.module for source in sources})
+    names = NameResolver({source.module.name: source.module for source in sources})
     called: set[ast.AST] = set()
-    places: list[tuple[SourceFile, Place]] = []
+    places: list[tuple[SourceFile, CallSite]] = []
     for source in sources:
         for place in find_calls(source.module, names, as_script=source.as_script):
             if place.alias is None:
@@ -376,7 +371,7 @@ def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
         if _is_silenced(source, place):
             silenced += 1
             continue
-        found.add(_found(source, place, guard))
+        found.add(_finding(source, place, guard))
     return Audit(
         tuple(sorted(found)),
         len(sources),
@@ -386,7 +381,7 @@ def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
     )
 
 
-def _is_silenced(source: SourceFile, place: Place) -> bool:
+def _is_silenced(source: SourceFile, place: CallSite) -> bool:
     first = place.node.lineno
     last = first if isinstance(place.node, ast.stmt) else place.node.end_lineno or first
     for line in range(first, last + 1):
@@ -396,7 +391,7 @@ def _is_silenced(source: SourceFile, place: Place) -> bool:
     return False
 
 
-def _found(source: SourceFile, place: Place, guard: GuardTreatment) -> Found:
+def _finding(source: SourceFile, place: CallSite, guard: GuardTreatment) -> Found:
     treatment, does = guard.of(source, place)
     node = place.node
     return Found(

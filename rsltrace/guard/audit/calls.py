@@ -1,41 +1,39 @@
-"""Going through one file: every call, and every function that is passed on to be called later."""
+"""Find call sites in one module: calls, and functions passed on to be called later."""
 
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-from rsltrace.guard.audit import rules
-from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, Rule, rule_of
-from rsltrace.guard.audit.scopes import Module, Scope
+from rsltrace.guard import rules
+from rsltrace.guard.audit.names import NameResolver
+from rsltrace.guard.audit.scopes import ModuleSource, NameScope
 from rsltrace.guard.audit.sets import is_set, order_matters
+from rsltrace.guard.rules import METHODS, RULES, SHARED_GENERATORS, Rule, sql_call
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
-# Differences of two looks at a ROS clock in one function: in a simulation they are 0.
+# Differences of two reads of a ROS clock in one function: 0 in a simulation.
 
 _DEPTH_MAX = 8
 _CONVERSIONS = ("float", "int", "abs")
 
 
-def is_difference_of_now(node: ast.expr, scope: Scope, depth: int = 0) -> bool:
-    """Return whether an expression is a difference of two times that this function looked up,
-    however converted."""
+def is_difference_of_now(node: ast.expr, scope: NameScope, depth: int = 0) -> bool:
+    """Return whether an expression is the difference of two times read in this function."""
     if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Sub):
         return all(_is_now(side, scope, depth) for side in (node.left, node.right))
     return _within(node, scope, depth, is_difference_of_now)
 
 
-def _is_now(node: ast.expr, scope: Scope, depth: int) -> bool:
+def _is_now(node: ast.expr, scope: NameScope, depth: int) -> bool:
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
         return node.func.attr == "now" and not node.args and _is_clock(node.func.value)
     return _within(node, scope, depth, _is_now)
 
 
 def _is_clock(node: ast.expr) -> bool:
-    """Return whether an expression is a ROS clock, as far as its name tells."""
+    """Return whether an expression is a ROS clock, judging by its name."""
     if isinstance(node, ast.Call):
         return isinstance(node.func, ast.Attribute) and node.func.attr == "get_clock"
     name = node.attr if isinstance(node, ast.Attribute) else getattr(node, "id", "")
@@ -43,9 +41,9 @@ def _is_clock(node: ast.expr) -> bool:
 
 
 def _within(
-    node: ast.expr, scope: Scope, depth: int, holds: Callable[[ast.expr, Scope, int], bool]
+    node: ast.expr, scope: NameScope, depth: int, holds: Callable[[ast.expr, NameScope, int], bool]
 ) -> bool:
-    """Look below conversions of a time, and behind names of the function."""
+    """Look through conversions of a time and names of the function."""
     if depth > _DEPTH_MAX:
         return False
     if isinstance(node, ast.Attribute) and node.attr in ("nanoseconds", "nanosec", "sec"):
@@ -68,36 +66,36 @@ _FUNCTIONS = {f"{place}.{name}" for place, names in NEVER_CALLED.items() for nam
 _READERS = ("builtins.getattr", "builtins.hasattr")
 
 
-def exchanged(
-    module: Module, node: ast.AST, names: Names
+def replaced_functions(
+    module: ModuleSource, node: ast.AST, names: NameResolver
 ) -> Iterator[tuple[ast.stmt | ast.expr, str]]:
-    """Yield where ``node`` replaces such a function, or overrides it, and its full name.
+    """Yield where ``node`` replaces or overrides such a function, and its full name.
 
-    Found are ``Executor._take_timer = …``, ``setattr(Executor, "_take_timer", …)`` and what else is
-    called with a class and a name (``patch.object``), full names in a text (``patch``), and methods
-    of an executor of one's own.
+    Finds ``Executor._take_timer = …``, ``setattr(Executor, "_take_timer", …)`` and other calls with
+    a class and a name (``patch.object``), full names in a text (``patch``), and methods of the
+    user's executors.
     """
     if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
-        yield from _known(node, names.of(node, module.scope_of(node)))
+        yield from _never_called(node, names.of(node, module.scope_of(node)))
     elif isinstance(node, ast.Call) and node.args:
-        yield from _known(node, _called_with(module, node, names))
+        yield from _never_called(node, _called_with(module, node, names))
     elif isinstance(node, ast.ClassDef):
         own_module = EXECUTOR.rpartition(".")[0]
         for method in (one for one in node.body if isinstance(one, ast.FunctionDef)):
             for base in node.bases:
                 name = names.of(ast.Attribute(base, method.name, ast.Load()), module.scope_of(base))
                 if name is not None and name.startswith(own_module):
-                    yield from _known(method, name)
+                    yield from _never_called(method, name)
 
 
-def _known(
+def _never_called(
     node: ast.stmt | ast.expr, name: str | None
 ) -> Iterator[tuple[ast.stmt | ast.expr, str]]:
     if name in _FUNCTIONS:
         yield node, str(name)
 
 
-def _called_with(module: Module, node: ast.Call, names: Names) -> str | None:
+def _called_with(module: ModuleSource, node: ast.Call, names: NameResolver) -> str | None:
     texts = [one.value if isinstance(one, ast.Constant) else None for one in node.args[:2]]
     if isinstance(texts[0], str):
         return texts[0]
@@ -107,10 +105,6 @@ def _called_with(module: Module, node: ast.Call, names: Names) -> str | None:
     return names.of(ast.Attribute(node.args[0], texts[1], ast.Load()), scope)
 
 
-_SQL = re.compile(
-    r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)",
-    re.IGNORECASE,
-)
 _SORTERS = ("builtins.sorted", "builtins.min", "builtins.max")
 _DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 _ORDERINGS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
@@ -128,8 +122,8 @@ _SHOWING = ("str", "repr", "hex", "print", "format", "sorted", "min", "max", "di
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """A place that is worth a line. ``alias`` is the expression of a mere alias."""
+class CallSite:
+    """A call that the audit reports. ``alias`` is the expression if it only binds a name."""
 
     node: ast.expr | ast.stmt
     call: str
@@ -137,86 +131,89 @@ class Place:
     alias: ast.expr | None = None
 
 
-def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iterator[Place]:
-    """Yield what is found in a module; ``as_script``: its ``if __name__ == "__main__"`` runs."""
+def find_calls(
+    module: ModuleSource, names: NameResolver, *, as_script: bool = False
+) -> Iterator[CallSite]:
+    """Yield the call sites of a module; ``as_script``: its ``__main__`` block runs, too."""
     skipped = set() if as_script else set(_never_run(module))
-    seeded = _seeded(module, names)
+    seeded = _seeded_generators(module, names)
     stack: list[ast.AST] = [module.tree]
     while stack:
         node = stack.pop()
         if node in skipped:
             continue
-        for place in _at(module, node, names):
-            shared = place.rule in SHARED and place.call.startswith(tuple(seeded))
+        for place in _call_sites(module, node, names):
+            shared = place.rule.is_shared and place.call.startswith(tuple(seeded))
             if not shared:
                 yield place
         stack.extend(ast.iter_child_nodes(node))
 
 
-def _at(module: Module, node: ast.AST, names: Names) -> Iterator[Place]:
-    for place, name in exchanged(module, node, names):
-        yield Place(place, name, rules.EXCHANGED)
+def _call_sites(module: ModuleSource, node: ast.AST, names: NameResolver) -> Iterator[CallSite]:
+    for place, name in replaced_functions(module, node, names):
+        yield CallSite(place, name, rules.REPLACED_FUNCTION)
     if isinstance(node, ast.Call):
         yield from _call(module, node, names)
     elif isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Load):
         yield from _reference(module, node, names)
     elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
         if node.name == "__del__" and isinstance(module.parents.get(node), ast.ClassDef):
-            yield Place(node, "__del__()", rules.DEL)
+            yield CallSite(node, "__del__()", rules.FINALIZER)
     elif isinstance(node, ast.FormattedValue):
         spec = node.format_spec
         last = spec.values[-1] if isinstance(spec, ast.JoinedStr) and spec.values else None
         if isinstance(last, ast.Constant) and str(last.value).endswith("n"):
-            yield Place(node.value, "format 'n'", rules.LOCALE_FORMAT)
+            yield CallSite(node.value, "format 'n'", rules.LOCALE)
     elif (
         isinstance(node, ast.BinOp)
         and isinstance(node.op, _DIVISIONS)
         and is_difference_of_now(node.right, module.scope_of(node))
     ):
-        yield Place(node, f"division by {_text(node.right)}", rules.STANDS_STILL)
+        yield CallSite(node, f"division by {_text(node.right)}", rules.ZERO_DURATION)
     if isinstance(node, ast.expr):
         scope = module.scope_of(node)
         if is_set(node, scope, names) and order_matters(node, scope, names):
-            yield Place(node, f"order of the set {_text(node)}", rules.ORDER)
+            yield CallSite(node, f"order of the set {_text(node)}", rules.ORDER)
 
 
-def _call(module: Module, node: ast.Call, names: Names) -> Iterator[Place]:
+def _call(module: ModuleSource, node: ast.Call, names: NameResolver) -> Iterator[CallSite]:
     scope = module.scope_of(node)
     names.passed.clear()
     name = names.of(node.func, scope)
     if isinstance(node.func, ast.Attribute) and node.func.attr == "__hash__":
         if not _inside_hash(module, node):
-            yield Place(node, "__hash__()", rules.HASH)
+            yield CallSite(node, "__hash__()", rules.HASH)
         return
     if name is None:
         if isinstance(node.func, ast.Attribute):
             rule = METHODS.get(node.func.attr)
-            if rule is not None and not _consumed(module, node, scope, names):
-                yield Place(node, f"{node.func.attr}()", rule)
+            if rule is not None and not _is_order_ignored(module, node, scope, names):
+                yield CallSite(node, f"{node.func.attr}()", rule)
             if node.func.attr in ("execute", "executemany", "executescript") and node.args:
                 yield from _sql(node)
             elif node.func.attr == "sort":
                 yield from _sorting(node, scope, names)
         return
-    rule = rule_of(name)
+    rule = RULES.get(name)
     if rule is not None:
-        condition = CONDITIONS.get(name)
-        listed = rule.kind == "directory" and _consumed(module, node, scope, names)
-        if (condition is None or condition(node)) and not listed:
+        listed = rule.kind == "directory" and _is_order_ignored(module, node, scope, names)
+        if (rule.when is None or rule.when(node)) and not listed:
             first = node.args[0] if node.args and rule.kind in ("environment", "clock") else None
             given = repr(first.value) if isinstance(first, ast.Constant) else ""
-            yield Place(node, f"{name.removeprefix('builtins.')}({given})", rule)
+            yield CallSite(node, f"{name.removeprefix('builtins.')}({given})", rule)
     elif name == "builtins.id":
         if _shows_address(module, node, scope, names):
-            yield Place(node, "id()", rules.ADDRESS)
+            yield CallSite(node, "id()", rules.ADDRESS)
     elif name == "builtins.hash":
         if not _inside_hash(module, node) and not _plain_number(node):
-            yield Place(node, "hash()", rules.HASH)
+            yield CallSite(node, "hash()", rules.HASH)
     elif name in _SORTERS:
         yield from _sorting(node, scope, names)
 
 
-def _reference(module: Module, node: ast.Name | ast.Attribute, names: Names) -> Iterator[Place]:
+def _reference(
+    module: ModuleSource, node: ast.Name | ast.Attribute, names: NameResolver
+) -> Iterator[CallSite]:
     parent = module.parents.get(node)
     scope = module.scope_of(node)
     if isinstance(parent, ast.Attribute):
@@ -237,10 +234,10 @@ def _reference(module: Module, node: ast.Name | ast.Attribute, names: Names) -> 
             return  # an alias: what is read through it is found there
         key = parent.slice if isinstance(parent, ast.Subscript) else None
         shown = f"[{key.value!r}]" if isinstance(key, ast.Constant) else ""
-        yield Place(node, f"os.environ{shown}", rules.ENVIRON)
+        yield CallSite(node, f"os.environ{shown}", rules.ENVIRONMENT)
         return
-    rule = rule_of(name)
-    if rule is None or name in ("numpy.datetime64", "datetime.datetime.fromtimestamp"):
+    rule = RULES.get(name)
+    if rule is None:
         return
     if rule.is_class or rule.kind in ("finalizer", "locale"):
         is_base = isinstance(parent, ast.ClassDef) and node in parent.bases
@@ -249,40 +246,42 @@ def _reference(module: Module, node: ast.Name | ast.Attribute, names: Names) -> 
             return
     shown = name.removeprefix("builtins.")
     if rule.kind in ("thread", "process") and isinstance(parent, ast.ClassDef):
-        yield Place(node, f"class {parent.name}({shown})", rule)
+        yield CallSite(node, f"class {parent.name}({shown})", rule)
     else:
         bound = isinstance(parent, (ast.Assign, ast.AnnAssign, ast.arguments))
-        yield Place(node, shown, rule, alias=node if bound else None)
+        yield CallSite(node, shown, rule, alias=node if bound else None)
 
 
-def _environ(module: Module, attribute: ast.Attribute) -> Iterator[Place]:
+def _environ(module: ModuleSource, attribute: ast.Attribute) -> Iterator[CallSite]:
     if attribute.attr in ("update", "clear", "__setitem__", "__delitem__"):
         return
     call = module.parents.get(attribute)
     first = call.args[0] if isinstance(call, ast.Call) and call.args else None
     given = f"[{first.value!r}]" if isinstance(first, ast.Constant) else ""
-    yield Place(attribute, f"os.environ{given}", rules.ENVIRON)
+    yield CallSite(attribute, f"os.environ{given}", rules.ENVIRONMENT)
 
 
-def _sorting(node: ast.Call, scope: Scope, names: Names) -> Iterator[Place]:
-    """``sorted(things, key=id)``."""
+def _sorting(node: ast.Call, scope: NameScope, names: NameResolver) -> Iterator[CallSite]:
+    """Find ``sorted(items, key=id)``."""
     for word in node.keywords:
         name = names.of(word.value, scope) if word.arg == "key" else None
         if name in ("builtins.id", "builtins.hash"):
             rule = rules.ADDRESS if name == "builtins.id" else rules.HASH
-            yield Place(word.value, f"order by {name.removeprefix('builtins.')}()", rule)
+            yield CallSite(word.value, f"order by {name.removeprefix('builtins.')}()", rule)
 
 
-def _sql(node: ast.Call) -> Iterator[Place]:
+def _sql(node: ast.Call) -> Iterator[CallSite]:
     first = node.args[0]
     if isinstance(first, ast.Constant) and isinstance(first.value, str):
-        match = _SQL.search(first.value)
-        if match is not None:
-            yield Place(first, f"SQLite: {match.group()}", rules.SQL_CLOCK)
+        found = sql_call(first.value)
+        if found is not None:
+            yield CallSite(first, *found)
 
 
-def _consumed(module: Module, node: ast.expr, scope: Scope, names: Names) -> bool:
-    """Whether the order of a listing is not looked at: ``sorted(os.listdir(folder))``."""
+def _is_order_ignored(
+    module: ModuleSource, node: ast.expr, scope: NameScope, names: NameResolver
+) -> bool:
+    """Whether the order of a listing does not matter: ``sorted(os.listdir(folder))``."""
     place: ast.AST = node
     user = module.parents.get(place)
     while isinstance(user, (ast.comprehension, ast.GeneratorExp, ast.ListComp, ast.SetComp)):
@@ -296,7 +295,9 @@ def _consumed(module: Module, node: ast.expr, scope: Scope, names: Names) -> boo
     )
 
 
-def _shows_address(module: Module, node: ast.Call, scope: Scope, names: Names) -> bool:
+def _shows_address(
+    module: ModuleSource, node: ast.Call, scope: NameScope, names: NameResolver
+) -> bool:
     """Whether an ``id()`` is compared, shown or computed with; as a key it does no harm."""
     user = module.parents.get(node)
     if isinstance(user, ast.Compare):
@@ -316,7 +317,7 @@ def _shows_address(module: Module, node: ast.Call, scope: Scope, names: Names) -
     return False
 
 
-def _inside_hash(module: Module, node: ast.AST) -> bool:
+def _inside_hash(module: ModuleSource, node: ast.AST) -> bool:
     place: ast.AST | None = node
     while place is not None and not isinstance(place, (ast.FunctionDef, ast.AsyncFunctionDef)):
         place = module.parents.get(place)
@@ -328,8 +329,8 @@ def _plain_number(node: ast.Call) -> bool:
     return isinstance(first, ast.Constant) and isinstance(first.value, (int, float))
 
 
-def _in_annotation(module: Module, node: ast.AST) -> bool:
-    """Whether a name stands for a type only: an annotation, ``isinstance``, ``except``."""
+def _in_annotation(module: ModuleSource, node: ast.AST) -> bool:
+    """Whether a name only names a type: in an annotation, ``isinstance``, ``except``."""
     child, parent = node, module.parents.get(node)
     while isinstance(parent, ast.expr):
         if isinstance(parent, ast.Call) and isinstance(parent.func, ast.Name):
@@ -346,18 +347,18 @@ def _in_annotation(module: Module, node: ast.AST) -> bool:
     return isinstance(parent, (ast.arg, ast.ExceptHandler))
 
 
-def _seeded(module: Module, names: Names) -> set[str]:
+def _seeded_generators(module: ModuleSource, names: NameResolver) -> set[str]:
     """Return the prefixes of shared generators that the module seeds itself."""
     found = set()
     for node in ast.walk(module.tree):
-        if isinstance(node, ast.Call) and not rules.unseeded(node):
+        if isinstance(node, ast.Call) and not rules.is_unseeded(node):
             name = names.of(node.func, module.scope_of(node))
-            found |= {prefix for prefix, seed in SEEDED_BY.items() if name == seed}
+            found |= {prefix for prefix, seed in SHARED_GENERATORS.items() if name == seed}
     return found
 
 
-def _never_run(module: Module) -> Iterator[ast.stmt]:
-    """Yield what only runs when the file is started itself, and what is for type checkers."""
+def _never_run(module: ModuleSource) -> Iterator[ast.stmt]:
+    """Yield the statements that run only as a script, or only for type checkers."""
     for node in module.tree.body:
         if isinstance(node, ast.If):
             text = ast.dump(node.test)

@@ -1,4 +1,4 @@
-"""What an expression stands for, by its full name, through aliases and the user's own modules."""
+"""Resolve expressions to full names, through aliases and the user's own modules."""
 
 from __future__ import annotations
 
@@ -6,33 +6,41 @@ import ast
 import builtins
 from collections.abc import Iterator, Mapping
 
-from rsltrace.guard.audit.rules import RULES
-from rsltrace.guard.audit.scopes import Annotated, Binding, Imported, Module, Scope
+from rsltrace.guard.audit.scopes import (
+    AnnotatedName,
+    Binding,
+    ImportedName,
+    ModuleSource,
+    NameScope,
+)
+from rsltrace.guard.rules import RULES
 
 _DEPTH_MAX = 20
 _BUILTINS = frozenset(dir(builtins))
 _LOADERS = ("builtins.__import__", "importlib.import_module")
 
 
-class Names:
+class NameResolver:
     """Resolves expressions in a set of modules.
 
     ``passed`` collects the aliases (``now = time.time``) that led to a name.
     """
 
-    def __init__(self, modules: Mapping[str, Module]) -> None:
+    def __init__(self, modules: Mapping[str, ModuleSource]) -> None:
         self._modules = modules
         self.passed: set[ast.AST] = set()
-        self._asked: set[tuple[Scope, str]] = set()
-        """Names that are being resolved. What ``line = line.strip()`` says of ``line`` is nothing;
-        without this, a dozen such lines would take forever."""
+        self._asked: set[tuple[NameScope, str]] = set()
+        """Names being resolved: ``line = line.strip()`` says nothing about ``line``, and a dozen
+        such lines would take forever."""
 
-    def of(self, node: ast.expr, scope: Scope, depth: int = 0) -> str | None:
-        """Return the full name of what ``node`` stands for, or None if that is not known."""
+    def of(self, node: ast.expr, scope: NameScope, depth: int = 0) -> str | None:
+        """Return the full name of an expression, or None if it is not known."""
         if depth > _DEPTH_MAX:
             return None
         if isinstance(node, ast.Name):
-            return self._first(self.bindings(node, scope), node.id, depth, _place(node.id, scope))
+            return self._first(
+                self.bindings(node, scope), node.id, depth, _binding_scope(node.id, scope)
+            )
         if isinstance(node, ast.Attribute):
             owner = scope.own_class
             if owner is not None and _is_self(node.value):
@@ -53,19 +61,19 @@ class Names:
                     return found_name
         return None
 
-    def bindings(self, node: ast.Name, scope: Scope) -> Iterator[tuple[Binding, Scope]]:
-        """Yield what a name is bound to, innermost scope that knows it."""
-        place = _place(node.id, scope)
+    def bindings(self, node: ast.Name, scope: NameScope) -> Iterator[tuple[Binding, NameScope]]:
+        """Yield what a name is bound to in the innermost scope that knows it."""
+        place = _binding_scope(node.id, scope)
         if place is not None:
             for binding in place.names[node.id]:
                 yield binding, _evaluated_in(binding, place)
             return
         for star in scope.module.stars:
             if f"{star}.{node.id}" in RULES or self._has(star, node.id):
-                yield Imported(f"{star}.{node.id}"), scope
+                yield ImportedName(f"{star}.{node.id}"), scope
                 return
         if node.id in _BUILTINS:
-            yield Imported(f"builtins.{node.id}"), scope
+            yield ImportedName(f"builtins.{node.id}"), scope
 
     def _has(self, module: str, name: str) -> bool:
         loaded = self._modules.get(module)
@@ -73,12 +81,12 @@ class Names:
 
     def _first(
         self,
-        bindings: Iterator[tuple[Binding, Scope]],
+        bindings: Iterator[tuple[Binding, NameScope]],
         name: str,
         depth: int,
-        place: Scope | None,
+        place: NameScope | None,
     ) -> str | None:
-        """Return what a name of ``place`` (None: Python's own) stands for, as far as known."""
+        """Return the full name of a name in ``place`` (None: a built-in), or None."""
         key = None if place is None else (place, name)
         if key in self._asked:
             return None
@@ -94,8 +102,8 @@ class Names:
             if key is not None:
                 self._asked.remove(key)
 
-    def _bound(self, binding: Binding, scope: Scope, depth: int) -> str | None:
-        if isinstance(binding, Imported):
+    def _bound(self, binding: Binding, scope: NameScope, depth: int) -> str | None:
+        if isinstance(binding, ImportedName):
             return self._canonical(binding.name, depth + 1)
         if isinstance(binding, ast.ClassDef):
             return f"{scope.module.name}.{_path(binding, scope.module)}"
@@ -106,15 +114,15 @@ class Names:
             if found is not None:
                 self.passed.add(binding)
             return found
-        assert binding is None or isinstance(binding, Annotated)
+        assert binding is None or isinstance(binding, AnnotatedName)
         return None
 
-    def _loads(self, node: ast.Call, scope: Scope, depth: int) -> bool:
+    def _loads(self, node: ast.Call, scope: NameScope, depth: int) -> bool:
         name = self.of(node.func, scope, depth + 1)
         return name in _LOADERS or name == "builtins.getattr"
 
-    def _called(self, node: ast.Call, scope: Scope, depth: int) -> str | None:
-        """Return what ``__import__("time")`` and ``getattr(time, "time")`` stand for."""
+    def _called(self, node: ast.Call, scope: NameScope, depth: int) -> str | None:
+        """Return the full name of ``__import__("time")`` or ``getattr(time, "time")``."""
         name = self.of(node.func, scope, depth + 1)
         texts = [a.value if isinstance(a, ast.Constant) else None for a in node.args]
         if name in _LOADERS and texts and isinstance(texts[0], str):
@@ -125,7 +133,7 @@ class Names:
         return None
 
     def _canonical(self, name: str, depth: int) -> str | None:
-        """Follow a name through the modules at hand: their imports, the bases of their classes."""
+        """Follow a name through the modules: their imports and the bases of their classes."""
         if depth > _DEPTH_MAX or name in RULES:
             return name
         parts = name.split(".")
@@ -136,7 +144,7 @@ class Names:
             return self._inside(module, parts[count:], depth)
         return name
 
-    def _inside(self, module: Module, rest: list[str], depth: int) -> str | None:
+    def _inside(self, module: ModuleSource, rest: list[str], depth: int) -> str | None:
         full = ".".join([module.name, *rest])
         if full in self._modules:
             return full
@@ -157,7 +165,7 @@ class Names:
             return self._canonical(".".join([name, *rest[position + 1 :]]), depth + 1)
         return full
 
-    def _inherited(self, scope: Scope, rest: list[str], depth: int) -> str | None:
+    def _inherited(self, scope: NameScope, rest: list[str], depth: int) -> str | None:
         if not isinstance(scope.node, ast.ClassDef) or scope.parent is None:
             return None
         for base in scope.node.bases:
@@ -168,7 +176,7 @@ class Names:
         return None
 
 
-def _path(node: ast.ClassDef, module: Module) -> str:
+def _path(node: ast.ClassDef, module: ModuleSource) -> str:
     parts = [node.name]
     place = module.parents.get(node)
     while place is not None:
@@ -178,9 +186,9 @@ def _path(node: ast.ClassDef, module: Module) -> str:
     return ".".join(parts)
 
 
-def _place(name: str, scope: Scope) -> Scope | None:
+def _binding_scope(name: str, scope: NameScope) -> NameScope | None:
     """Return the innermost scope around an expression that knows a name."""
-    place: Scope | None = scope
+    place: NameScope | None = scope
     while place is not None:
         if (place is scope or place.kind != "class") and name in place.names:
             return place
@@ -188,8 +196,8 @@ def _place(name: str, scope: Scope) -> Scope | None:
     return None
 
 
-def _evaluated_in(binding: Binding, scope: Scope) -> Scope:
-    """Return the scope of an expression bound in ``scope``: a default is of the outer one."""
+def _evaluated_in(binding: Binding, scope: NameScope) -> NameScope:
+    """Return the scope in which a bound expression is evaluated: of a default the outer one."""
     if isinstance(binding, ast.expr) and binding in scope.module.parents:
         return scope.module.scope_of(binding)
     return scope

@@ -1,7 +1,7 @@
-"""Names and what they stand for: ``now`` is ``time.time`` after ``from time import time as now``.
+"""Scopes and their names: ``now`` is ``time.time`` after ``from time import time as now``.
 
-A scope keeps, for each name bound in it, every expression it was ever bound to; what is unknown
-(a parameter, a loop variable) is None. Order of execution is not looked at.
+A scope keeps for each name every expression bound to it; None if unknown (a parameter, a loop
+variable). The order of execution does not matter.
 """
 
 from __future__ import annotations
@@ -13,63 +13,63 @@ from typing import TypeAlias
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
-    """A name that stands for a module or something in one, by its full name."""
+class ImportedName:
+    """A name of a module or of something in one, by its full name."""
 
     name: str
 
 
 @dataclass(frozen=True, slots=True)
-class Annotated:
+class AnnotatedName:
     """A name of which only the type is known."""
 
     type: ast.expr
 
 
-Binding: TypeAlias = "ast.expr | Imported | Annotated | ast.ClassDef | None"
+Binding: TypeAlias = "ast.expr | ImportedName | AnnotatedName | ast.ClassDef | None"
 
 
 @dataclass(eq=False)
-class Scope:
-    """Names of a module, class, function or comprehension."""
+class NameScope:
+    """The names of a module, class, function or comprehension."""
 
     kind: str
-    parent: Scope | None
-    module: Module
+    parent: NameScope | None
+    module: ModuleSource
     node: ast.AST | None = None
     names: dict[str, list[Binding]] = field(default_factory=lambda: defaultdict(list))
     attributes: dict[str, list[Binding]] = field(default_factory=lambda: defaultdict(list))
     """Of a class: what its methods bind to ``self.name``."""
 
     @property
-    def own_class(self) -> Scope | None:
+    def own_class(self) -> NameScope | None:
         """The class of the method that this scope is in."""
-        scope: Scope | None = self
+        scope: NameScope | None = self
         while scope is not None and scope.kind != "class":
             scope = scope.parent
         return scope
 
 
 @dataclass(eq=False)
-class Module:
-    """One source file, taken apart."""
+class ModuleSource:
+    """One parsed source file."""
 
     name: str
     is_package: bool
     tree: ast.Module
-    scopes: dict[ast.AST, Scope] = field(default_factory=dict)
-    """The scope that each function, class, lambda and comprehension opens, and the file's own."""
+    scopes: dict[ast.AST, NameScope] = field(default_factory=dict)
+    """The scopes of functions, classes, lambdas and comprehensions, and of the file."""
     parents: dict[ast.AST, ast.AST] = field(default_factory=dict)
     stars: list[str] = field(default_factory=list)
     imports: set[str] = field(default_factory=set)
-    """Full names of all that is imported anywhere in the file."""
+    """Full names of everything that the file imports."""
 
     @property
-    def top(self) -> Scope:
+    def top(self) -> NameScope:
         """The scope of the file itself."""
         return self.scopes[self.tree]
 
-    def scope_of(self, node: ast.AST) -> Scope:
+    def scope_of(self, node: ast.AST) -> NameScope:
         """Return the scope in which an expression is evaluated."""
         child, place = node, self.parents.get(node)
         while place is not None:
@@ -80,7 +80,7 @@ class Module:
 
 
 def _outside_of(child: ast.AST, place: ast.AST) -> bool:
-    """Whether a part of a function or class is evaluated where that stands: defaults, bases, …"""
+    """Whether a part of a function or class is evaluated outside: defaults, bases, …"""
     if isinstance(place, ast.ClassDef):
         return child not in place.body
     if isinstance(place, (ast.FunctionDef, ast.AsyncFunctionDef)):
@@ -96,9 +96,9 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
-def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> Module:
-    """Return a module with its scopes filled in."""
-    module = Module(name, is_package, tree)
+def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> ModuleSource:
+    """Return a module with its scopes."""
+    module = ModuleSource(name, is_package, tree)
     for parent in ast.walk(tree):
         for child in ast.iter_child_nodes(parent):
             module.parents[child] = parent
@@ -107,14 +107,14 @@ def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> Mo
 
 
 class _Binder(ast.NodeVisitor):
-    def __init__(self, module: Module) -> None:
+    def __init__(self, module: ModuleSource) -> None:
         self.module = module
-        self.scope = Scope("module", None, module)
+        self.scope = NameScope("module", None, module)
         module.scopes[module.tree] = self.scope
 
     def _within(self, node: ast.AST, kind: str) -> None:
         outer = self.scope
-        self.scope = Scope(kind, outer, self.module, node)
+        self.scope = NameScope(kind, outer, self.module, node)
         self.module.scopes[node] = self.scope
         if isinstance(node, _FUNCTIONS):
             self._parameters(node.args)
@@ -146,7 +146,7 @@ class _Binder(ast.NodeVisitor):
         for parameter, default in pairs:
             annotation = parameter.annotation
             given = default is not None and not isinstance(default, ast.Constant)
-            known = Annotated(annotation) if annotation is not None else None
+            known = AnnotatedName(annotation) if annotation is not None else None
             self.scope.names[parameter.arg].append(default if given else known)
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
@@ -177,11 +177,11 @@ class _Binder(ast.NodeVisitor):
         for alias in node.names:
             self.module.imports.add(alias.name)
             first = alias.name.partition(".")[0]
-            bound = Imported(alias.name if alias.asname else first)
+            bound = ImportedName(alias.name if alias.asname else first)
             self.scope.names[alias.asname or first].append(bound)
 
     def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
-        source = _source(self.module, node)
+        source = _imported_module(self.module, node)
         self.module.imports.add(source)
         for alias in node.names:
             if alias.name == "*":
@@ -189,7 +189,7 @@ class _Binder(ast.NodeVisitor):
                 continue
             full = f"{source}.{alias.name}" if source else alias.name
             self.module.imports.add(full)
-            self.scope.names[alias.asname or alias.name].append(Imported(full))
+            self.scope.names[alias.asname or alias.name].append(ImportedName(full))
 
     def visit_Assign(self, node: ast.Assign) -> None:
         for target in node.targets:
@@ -197,7 +197,7 @@ class _Binder(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
-        self._bind(node.target, Annotated(node.annotation))
+        self._bind(node.target, AnnotatedName(node.annotation))
         self.generic_visit(node)
 
     def visit_NamedExpr(self, node: ast.NamedExpr) -> None:
@@ -229,14 +229,11 @@ def _is_self(node: ast.expr) -> bool:
     return isinstance(node, ast.Name) and node.id in ("self", "cls")
 
 
-def _source(module: Module, node: ast.ImportFrom) -> str:
-    """Return the full name of the module that ``from … import`` means."""
+def _imported_module(module: ModuleSource, node: ast.ImportFrom) -> str:
+    """Return the full name of the module in ``from … import``."""
     if not node.level:
         return node.module or ""
     parts = module.name.split(".")
     up = node.level - 1 if module.is_package else node.level
     parts = parts[: len(parts) - up] if up else parts
     return ".".join([*parts, *([node.module] if node.module else [])])
-
-
-__all__ = ["Annotated", "Binding", "Imported", "Module", "Scope", "parse_scopes"]

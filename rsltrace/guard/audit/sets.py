@@ -1,15 +1,15 @@
-"""Which expressions are sets, and where the order of one matters.
+"""Which expressions are sets, and where their order matters.
 
-A set of plain integers has the same order in every process, and what only counts, sorts or tests
-the members does not see the order; neither is worth a line.
+A set of plain integers has the same order in every process. Counting, sorting and testing members
+does not depend on the order. Neither is reported.
 """
 
 from __future__ import annotations
 
 import ast
 
-from rsltrace.guard.audit.names import Names
-from rsltrace.guard.audit.scopes import Annotated, Binding, Scope
+from rsltrace.guard.audit.names import NameResolver
+from rsltrace.guard.audit.scopes import AnnotatedName, Binding, NameScope
 
 _MAKERS = {"builtins.set", "builtins.frozenset", "weakref.WeakSet"}
 _TYPES = _MAKERS | {
@@ -25,7 +25,7 @@ _UNORDERED = {
     *(f"statistics.{name}" for name in "mean fmean median pstdev pvariance stdev variance".split()),
     "math.fsum",
 }
-"""They give the same in whatever order the members come, unless a key makes some alike."""
+"""Their results do not depend on the order of members, unless a key makes some equal."""
 _ORDERED = {
     *(
         f"builtins.{name}"
@@ -37,21 +37,21 @@ _ORDERED = {
     "pickle.dumps",
 }
 _ORDERED_IN = ("collections.", "heapq.", "itertools.", "numpy.", "random.", "statistics.")
-"""Modules whose functions go through what they are given."""
+"""Modules whose functions iterate over their arguments."""
 _KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
 
-def is_set(node: ast.expr, scope: Scope, names: Names) -> bool:
+def is_set(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     """Return whether an expression is a set whose order is not known."""
     return _is_set(node, scope, names, frozenset()) is True
 
 
-def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]) -> bool | None:
-    """Do ``is_set``; None says nothing either way: ``s = s | more`` leaves ``s`` what it is.
-
-    ``asked`` are the bindings in question.
-    """
+def _is_set(
+    node: ast.expr, scope: NameScope, names: NameResolver, asked: frozenset[object]
+) -> bool | None:
+    """Do ``is_set``; None: unknown, as ``s = s | more`` leaves ``s`` what it is. ``asked`` are the
+    bindings being resolved."""
     if isinstance(node, ast.Set):
         return not all(isinstance(x, ast.Constant) and type(x.value) is int for x in node.elts)
     if isinstance(node, ast.SetComp):
@@ -70,7 +70,7 @@ def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]
             return _is_set(function.value, scope, names, asked)
         made = names.of(function, scope) in _MAKERS
         return made and not (node.args and _is_range(node.args[0], scope, names))
-    bindings: list[tuple[Binding, Scope]] = []
+    bindings: list[tuple[Binding, NameScope]] = []
     if isinstance(node, ast.Name):
         bindings = list(names.bindings(node, scope))
     elif isinstance(node, ast.Attribute):
@@ -92,16 +92,16 @@ def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]
 
 
 def _binds_set(
-    binding: Binding, scope: Scope, names: Names, asked: frozenset[object]
+    binding: Binding, scope: NameScope, names: NameResolver, asked: frozenset[object]
 ) -> bool | None:
-    if isinstance(binding, Annotated):
+    if isinstance(binding, AnnotatedName):
         return _annotates_set(binding.type, scope, names)
     if isinstance(binding, ast.expr):
         return _is_set(binding, scope.module.scope_of(binding), names, asked)
     return False
 
 
-def _annotates_set(node: ast.expr, scope: Scope, names: Names) -> bool:
+def _annotates_set(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         try:
             node = ast.parse(node.value, mode="eval").body
@@ -115,12 +115,12 @@ def _annotates_set(node: ast.expr, scope: Scope, names: Names) -> bool:
     return names.of(node, scope) in _TYPES
 
 
-def _is_range(node: ast.expr, scope: Scope, names: Names) -> bool:
+def _is_range(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
     return isinstance(node, ast.Call) and names.of(node.func, scope) == "builtins.range"
 
 
-def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
-    """Return whether the place in which a set stands sees the order of its members."""
+def order_matters(node: ast.expr, scope: NameScope, names: NameResolver) -> bool:
+    """Return whether the context of a set depends on the order of its members."""
     parent = scope.module.parents.get(node)
     if isinstance(parent, (ast.For, ast.AsyncFor)):
         return parent.iter is node and not _only_collects(parent)
@@ -131,7 +131,7 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
     if isinstance(parent, ast.AugAssign):
         return isinstance(parent.op, ast.Add)  # to a list
     if isinstance(parent, ast.Assign):
-        return any(map(_takes_apart, parent.targets))
+        return any(map(_unpacks, parent.targets))
     if isinstance(parent, ast.Attribute):
         used = scope.module.parents.get(parent)
         called = isinstance(used, ast.Call) and used.func is parent
@@ -144,14 +144,14 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
     return isinstance(parent, ast.YieldFrom)
 
 
-def _takes_apart(target: ast.expr) -> bool:
-    """Whether an assignment gives the members of a set to several: ``a, b = s``, ``r[1:] = s``."""
+def _unpacks(target: ast.expr) -> bool:
+    """Whether an assignment unpacks a set: ``a, b = s``, ``r[1:] = s``."""
     if isinstance(target, ast.Subscript):
         return isinstance(target.slice, ast.Slice)
     return isinstance(target, (ast.Tuple, ast.List))
 
 
-def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
+def _call_matters(call: ast.Call, scope: NameScope, names: NameResolver) -> bool:
     name = names.of(call.func, scope) or ""
     if name in _UNORDERED:
         return any(word.arg == "key" for word in call.keywords)
@@ -160,15 +160,15 @@ def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
     return isinstance(call.func, ast.Attribute) and call.func.attr in _KEEPING
 
 
-def _comprehension_matters(part: ast.comprehension, scope: Scope, names: Names) -> bool:
+def _comprehension_matters(part: ast.comprehension, scope: NameScope, names: NameResolver) -> bool:
     whole = scope.module.parents[part]
     if isinstance(whole, ast.SetComp):
         return False
     return not _ends_unordered(whole, scope, names)
 
 
-def _ends_unordered(node: ast.AST, scope: Scope, names: Names) -> bool:
-    """Whether what is made of a set goes right into something that does not see its order."""
+def _ends_unordered(node: ast.AST, scope: NameScope, names: NameResolver) -> bool:
+    """Whether the result goes directly into a function that ignores its order."""
     user = scope.module.parents.get(node)
     return (
         isinstance(user, ast.Call)
@@ -179,7 +179,7 @@ def _ends_unordered(node: ast.AST, scope: Scope, names: Names) -> bool:
 
 
 def _only_collects(loop: ast.For | ast.AsyncFor) -> bool:
-    """Whether a loop does nothing but put members into other sets, or delete what they name."""
+    """Whether a loop only adds members to other sets, or deletes what they name."""
     return all(
         isinstance(line, ast.Delete)
         or (

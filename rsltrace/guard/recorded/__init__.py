@@ -1,1 +1,1 @@
-"""What comes from outside: recorded in a run, and given again in a re-run."""
+"""Calls whose answers come from outside: recorded in a run, returned again in a re-run."""

@@ -1,7 +1,6 @@
 """File descriptors whose answers are recorded: ``os.open``, ``os.read``, terminals, devices.
 
-In a re-run such a descriptor leads nowhere: what is read from it comes from the trace, what is
-written to it is dropped.
+In a re-run such a descriptor is not connected: reads come from the trace, writes are dropped.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.descriptor_table import Descriptor, number_of
+from rsltrace.guard.descriptor_table import RecordedDescriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.process_ids import meant_path
+from rsltrace.guard.process_ids import real_path
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
+from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Mode, Source
 
 _RECORD = Mode.RECORD
@@ -40,16 +39,29 @@ _isatty = copy_of(os.isatty)  # type: ignore[arg-type]
 _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
-def recording(source: Source, frame: FrameType) -> Guard | None:
-    """Return the guard if user code asks and the job records this source."""
+def recording_guard(source: Source, frame: FrameType) -> Guard | None:
+    """Return the guard if user code calls and the job records this source."""
     guard = engaged()
     if guard is None or guard.mode(source, frame) is not _RECORD:
         return None
-    return guard if guard.is_for_user(frame) else None
+    return guard if guard.is_user_call(frame) else None
 
 
-def tracked(fd: object) -> tuple[Guard, Descriptor] | None:
-    """Return the guard and what it knows of a descriptor, if its answers are recorded."""
+def recording_call(source: Source, call: str, real: Callable[..., Any]) -> Any:
+    """Return the replacement of a function whose answers are recorded as they are."""
+
+    def function(*arguments: Any, **options: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = recording_guard(source, frame)
+        if guard is None:
+            return real(*arguments, **options)
+        return guard.record(source, call, lambda: real(*arguments, **options), frame)
+
+    return function
+
+
+def recorded_descriptor(fd: object) -> tuple[Guard, RecordedDescriptor] | None:
+    """Return the guard and its entry of a descriptor, if its answers are recorded."""
     guard = engaged()
     if guard is None:
         return None
@@ -57,47 +69,49 @@ def tracked(fd: object) -> tuple[Guard, Descriptor] | None:
     return None if found is None or found.is_folder else (guard, found)
 
 
-def stand_in(flags: int = 0) -> int:
-    """Return a descriptor for a re-run that leads nowhere, and that event loops accept."""
+def unconnected_descriptor(flags: int = 0) -> int:
+    """Return a descriptor for a re-run that leads nowhere and that event loops accept."""
     nonblocking = os.EFD_NONBLOCK if flags & os.O_NONBLOCK else 0
     return os.eventfd(0, os.EFD_CLOEXEC | nonblocking)
 
 
 def _opening(real: Callable[..., int]) -> Any:
     def open_(path: Any, flags: int, *more: Any, **options: Any) -> int:
-        path = meant_path(path)
+        path = real_path(path)
         frame = sys._getframe(1)
         wanted = not flags & _MAKES_FILES and flags & os.O_ACCMODE != os.O_WRONLY
-        guard = recording(Source.FILE, frame) if wanted else None
+        guard = recording_guard(Source.FILE, frame) if wanted else None
         if guard is None:
             return real(path, flags, *more, **options)
-        opened: list[int] = []
+        open_raw: list[int] = []
 
         def is_folder() -> bool:
-            opened.append(real(path, flags, *more, **options))
-            return stat.S_ISDIR(os.fstat(opened[0]).st_mode)
+            open_raw.append(real(path, flags, *more, **options))
+            return stat.S_ISDIR(os.fstat(open_raw[0]).st_mode)
 
         call = f"os.open({os.fsdecode(path)!r})"
-        folder = bool(guard.recorded(Source.FILE, call, is_folder, frame))
-        if not opened:  # a folder is the run's own, or its listing is not recorded anyway
-            opened.append(real(path, flags, *more, **options) if folder else stand_in(flags))
-        guard.descriptors.drop(opened[0])
-        guard.descriptors.add(opened[0], Source.FILE, is_folder=folder)
-        return opened[0]
+        folder = bool(guard.record(Source.FILE, call, is_folder, frame))
+        if not open_raw:  # a folder is the run's own, or its listing is not recorded anyway
+            open_raw.append(
+                real(path, flags, *more, **options) if folder else unconnected_descriptor(flags)
+            )
+        guard.descriptors.drop(open_raw[0])
+        guard.descriptors.add(open_raw[0], Source.FILE, is_folder=folder)
+        return open_raw[0]
 
     return open_
 
 
 def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function of a descriptor and plain values."""
+    """Return the replacement of a function that takes a descriptor and plain values."""
     call = f"{module}.{name}()"
 
     def function(fd: Any, *arguments: Any, **options: Any) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, *arguments, **options)
         guard, known = found
-        return guard.recorded(
+        return guard.record(
             known.source,
             call,
             lambda: real(fd, *arguments, **options),
@@ -108,7 +122,7 @@ def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
     return function
 
 
-def _looking(real: Callable[..., Any]) -> Any:
+def _recording_fstat(real: Callable[..., Any]) -> Any:
     def fstat(fd: int) -> Any:
         guard = engaged()
         known = guard.descriptors.find(fd) if guard is not None else None
@@ -127,27 +141,27 @@ def recorded_stat(
     call: str,
     real: Callable[[], Any],
     frame: FrameType,
-    of: int = 0,
+    number: int = 0,
 ) -> os.stat_result:
-    """Return what ``os.stat`` and its like tell, from outside or from the trace."""
+    """Return the result of ``os.stat`` and the like, from outside or from the trace."""
 
     def fields() -> list[Any]:
         found = real()
         return [list(found), found.st_atime_ns, found.st_mtime_ns, found.st_ctime_ns]
 
-    values, *times = guard.recorded(source, call, fields, frame, of)
+    values, *times = guard.record(source, call, fields, frame, number)
     names = ("st_atime_ns", "st_mtime_ns", "st_ctime_ns")
     return os.stat_result(tuple(values), dict(zip(names, times, strict=True)))
 
 
 def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             frame = sys._getframe(1)
             patient = waiting_guard(frame)
             if patient is not None and _blocks(fd):
-                return wait_unrecorded(patient, when_readable(fd, lambda: real(fd, size)), frame)
+                return wait_unrecorded(patient, wait_readable(fd, lambda: real(fd, size)), frame)
             return real(fd, size)
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 
@@ -155,7 +169,7 @@ def _reading(real: Callable[..., bytes]) -> Any:
 
 
 def _blocks(fd: int) -> bool:
-    """Return whether reading from a descriptor may have to wait for somebody."""
+    """Return whether a read from a descriptor may have to wait."""
     try:
         kind = _real_fstat(fd).st_mode
         waits = stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)
@@ -167,7 +181,7 @@ def _blocks(fd: int) -> bool:
 
 def _reading_into(real: Callable[..., int]) -> Any:
     def readv(fd: int, buffers: Any, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, buffers)
 
@@ -187,21 +201,21 @@ def _reading_into(real: Callable[..., int]) -> Any:
 
 def _read(
     guard: Guard,
-    known: Descriptor,
+    known: RecordedDescriptor,
     call: str,
     fd: int,
     real: Callable[[], bytes],
     frame: FrameType,
 ) -> Any:
     if _get_blocking(fd) and guard.context.is_aside():
-        look = when_readable(fd, real)
-        return wait_recorded(guard, known.source, call, look, frame, of=known.number)
-    return guard.recorded(known.source, call, real, frame, known.number)
+        look = wait_readable(fd, real)
+        return wait_recorded(guard, known.source, call, look, frame, number=known.number)
+    return guard.record(known.source, call, real, frame, known.number)
 
 
 def _controlling(real: Callable[..., Any]) -> Any:
     def ioctl(fd: Any, request: int, arg: Any = 0, mutate_flag: bool = True, /) -> Any:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         if found is None:
             return real(fd, request, arg, mutate_flag)
         guard, known = found
@@ -212,7 +226,7 @@ def _controlling(real: Callable[..., Any]) -> Any:
             return [value, bytes(arg) if fills else None]
 
         frame = sys._getframe(1)
-        value, after = guard.recorded(
+        value, after = guard.record(
             known.source, f"fcntl.ioctl({request:#x})", control, frame, known.number
         )
         if fills and after is not None:
@@ -234,7 +248,7 @@ def _closing(real: Callable[[int], None]) -> Any:
 
 def _duplicating(real: Callable[..., int]) -> Any:
     def dup(fd: int, /) -> int:
-        found = tracked(fd)
+        found = recorded_descriptor(fd)
         copy = real(fd)
         if found is not None:
             found[0].descriptors.drop(copy)
@@ -244,8 +258,8 @@ def _duplicating(real: Callable[..., int]) -> Any:
     return dup
 
 
-def joining(real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function that makes two ends of something."""
+def connected_ends(real: Callable[..., Any]) -> Any:
+    """Return the replacement of a function that makes two connected descriptors."""
 
     def ends(*arguments: Any, **options: Any) -> Any:
         made = real(*arguments, **options)
@@ -258,7 +272,7 @@ def joining(real: Callable[..., Any]) -> Any:
 
 
 class RawDescriptor(io.RawIOBase):
-    """What ``open`` makes of a descriptor (or a device) whose answers are recorded."""
+    """A recorded descriptor or device as ``open`` returns it."""
 
     def __init__(self, fd: int, mode: str, *, name: object, closes: bool = True) -> None:
         self._fd = fd
@@ -299,7 +313,7 @@ class RawDescriptor(io.RawIOBase):
         return os.isatty(self.fileno())
 
     def readinto(self, buffer: Any, /) -> int | None:
-        """Read what there is, at most as much as fits."""
+        """Read what is there, at most as much as fits."""
         view = memoryview(buffer).cast("B")
         try:
             data = os.read(self.fileno(), len(view))
@@ -309,14 +323,14 @@ class RawDescriptor(io.RawIOBase):
         return len(data)
 
     def write(self, data: Any, /) -> int | None:
-        """Write as much as goes at once."""
+        """Write as much as possible at once."""
         try:
             return os.write(self.fileno(), data)
         except BlockingIOError:
             return None
 
     def close(self) -> None:
-        """Close the descriptor, unless it is somebody else's."""
+        """Close the descriptor, unless ``closefd`` was false."""
         if not self.closed:
             try:
                 super().close()
@@ -325,7 +339,7 @@ class RawDescriptor(io.RawIOBase):
                     os.close(self._fd)
 
 
-def opened(
+def open_raw(
     raw: RawDescriptor,
     mode: str,
     buffering: int = -1,
@@ -352,17 +366,17 @@ def opened(
 
 @contextmanager
 def recorded_descriptors() -> Iterator[None]:
-    """Let descriptors answer from the trace in a re-run."""
+    """Record the answers of descriptors; in a re-run, return them from the trace."""
     makers: list[tuple[Any, str, Callable[[Any], Any]]] = [
         (os, "open", _opening),
         (os, "read", _reading),
         (os, "readv", _reading_into),
-        (os, "fstat", _looking),
+        (os, "fstat", _recording_fstat),
         (os, "close", _closing),
         (os, "dup", _duplicating),
-        (os, "pipe", joining),
-        (os, "pipe2", joining),
-        (os, "openpty", joining),
+        (os, "pipe", connected_ends),
+        (os, "pipe2", connected_ends),
+        (os, "openpty", connected_ends),
         (fcntl, "ioctl", _controlling),
         *((os, name, partial(_on, "os", name)) for name in _PLAIN),
         *((termios, name, partial(_on, "termios", name)) for name in _TERMINAL),

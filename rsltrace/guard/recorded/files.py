@@ -1,4 +1,4 @@
-"""Files whose content and times are recorded (mode ``record``), and given again."""
+"""Files whose content and times are recorded (mode ``record``), and returned again."""
 
 from __future__ import annotations
 
@@ -12,17 +12,22 @@ from sys import _getframe
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.file_report_filter import NOT_NEWS, asking_module, is_installed, is_resolving
+from rsltrace.guard.file_report_filter import (
+    UNREPORTED_MODULES,
+    calling_module,
+    is_following_links,
+    is_installed_path,
+)
 from rsltrace.guard.frames import caller
-from rsltrace.guard.guard import Guard, at_least, engaged
-from rsltrace.guard.process_ids import meant_path
+from rsltrace.guard.guard import Guard, engaged, reporting_mode
+from rsltrace.guard.process_ids import real_path
 from rsltrace.guard.recorded.descriptors import (
     RawDescriptor,
-    opened,
+    open_raw,
+    recorded_descriptor,
     recorded_stat,
-    recording,
-    stand_in,
-    tracked,
+    recording_guard,
+    unconnected_descriptor,
 )
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.trace.model.finding import Mode, Source
@@ -33,14 +38,14 @@ BYTES_MAX = 64 << 20
 
 
 class _Content(io.BytesIO):
-    """What a file held when it was opened."""
+    """The content of a file when it was opened."""
 
     def __init__(self, content: bytes, name: str) -> None:
         super().__init__(content)
         self.name = name
 
     def writable(self) -> bool:
-        """Return False, as a file opened for reading does."""
+        """Return False, as for a file opened for reading."""
         return False
 
 
@@ -55,19 +60,19 @@ def _opening(real: Callable[..., Any]) -> Any:
         closefd: bool = True,
         opener: Any = None,
     ) -> Any:
-        file = meant_path(file)
+        file = real_path(file)
         frame = caller()
         text = (buffering, encoding, errors, newline)
         if isinstance(file, int):
             if frame.f_globals.get("__name__") == "subprocess":  # a pipe to a program to be started
-                by_program = recording(Source.PROCESS, frame)
+                by_program = recording_guard(Source.PROCESS, frame)
                 if by_program is not None:
                     by_program.descriptors.add(file, Source.PROCESS)
-            if tracked(file) is not None:
+            if recorded_descriptor(file) is not None:
                 raw = RawDescriptor(file, mode, name=file, closes=closefd)
-                return opened(raw, mode, *text)
+                return open_raw(raw, mode, *text)
         elif opener is None and isinstance(mode, str) and not set(mode) & set("wax"):
-            guard = recording(Source.FILE, frame)
+            guard = recording_guard(Source.FILE, frame)
             if guard is not None and ("+" not in mode or _is_device(file)):
                 return _recorded(guard, file, mode, text, real)
         return real(file, mode, *text, closefd, opener)
@@ -84,7 +89,7 @@ def _is_device(file: Any) -> bool:
 
 
 def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[..., Any]) -> Any:
-    """Return a file object of what is recorded: of a device piece by piece, of a file all of it."""
+    """Return a recorded file object: of a device piece by piece, of a file as a whole."""
     name = os.fsdecode(file)
     fd: list[int] = []
 
@@ -99,21 +104,21 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
             raise OSError(27, f"{name} is too large to be recorded")
         return data
 
-    data = guard.recorded(Source.FILE, f"open({name!r})", content, _getframe(2))
+    data = guard.record(Source.FILE, f"open({name!r})", content, _getframe(2))
     if data is not None:
         held = _Content(data, name)
         _, encoding, errors, newline = text
         return held if "b" in mode else io.TextIOWrapper(held, encoding, errors, newline)
-    number = fd[0] if fd else stand_in()
+    number = fd[0] if fd else unconnected_descriptor()
     guard.descriptors.drop(number)
     guard.descriptors.add(number, Source.FILE)
-    return opened(RawDescriptor(number, mode, name=file), mode, *text)
+    return open_raw(RawDescriptor(number, mode, name=file), mode, *text)
 
 
 _real_stat = copy_of(os.stat)  # type: ignore[arg-type]
 
 
-def _looking(name: str, real: Callable[..., Any]) -> Any:
+def _recording_stat(name: str, real: Callable[..., Any]) -> Any:
     def stat(path: Any, **options: Any) -> Any:
         guard = engaged()
         if guard is None:
@@ -122,10 +127,10 @@ def _looking(name: str, real: Callable[..., Any]) -> Any:
             frame = frames.next_caller()
         except frames.INTERRUPTED:
             frame = frames.lost_caller()
-        user = guard.user_of(frame)
+        user = guard.user_frame_of(frame)
         if user is None:
             return real(path, **options) if options else real(path)
-        path = meant_path(path)
+        path = real_path(path)
         mode = guard.mode(_FILE, frame)
         if mode is _RECORD and not isinstance(path, int):
             call = f"{name}({os.fsdecode(path)!r})"
@@ -133,37 +138,36 @@ def _looking(name: str, real: Callable[..., Any]) -> Any:
         value = real(path, **options) if options else real(path)
         if (
             mode is not _ALLOW
-            and asking_module(frame) not in NOT_NEWS
-            and not (S_ISDIR(value.st_mode) and is_resolving(frame))
+            and calling_module(frame) not in UNREPORTED_MODULES
+            and not (S_ISDIR(value.st_mode) and is_following_links(frame))
         ):
             is_plain = type(path) is str and path[:1] == "/"
-            call = _news_of_path(name, path) if is_plain else _news(name, path)
+            call = _report_name_of_path(name, path) if is_plain else _report_name(name, path)
             if call:
-                guard.found(_FILE, at_least(mode), call, value, frame, _told, user)
+                guard.report(_FILE, reporting_mode(mode), call, value, frame, _stat_text, user)
         return value
 
     return stat
 
 
-def _news(name: str, path: Any) -> str:
-    """Return what a look at a file is called, an empty text if it is none worth telling."""
-    return "" if is_installed(path) else f"{name}({repr(path)[:100]})"
+def _report_name(name: str, path: Any) -> str:
+    """Return the text of a call that accesses a file; empty if it is not reported."""
+    return "" if is_installed_path(path) else f"{name}({repr(path)[:100]})"
 
 
-_news_of_path = lru_cache(maxsize=4096)(_news)
-"""The same for an absolute path, which means the same whatever the working directory is."""
+_report_name_of_path = lru_cache(maxsize=4096)(_report_name)
+"""The same for an absolute path, which does not depend on the working directory."""
 
 
-def _told(found: os.stat_result) -> str:
+def _stat_text(found: os.stat_result) -> str:
     return f"{found.st_size} bytes, changed {found.st_mtime_ns}"
 
 
 @contextmanager
 def recorded_files() -> Iterator[None]:
-    """Let files that are read, and their times, answer from the trace in a re-run; report looks
-    at files that are not recorded."""
+    """Record contents and times of files; report accesses to files that are not recorded."""
     with ExitStack() as stack:
         redirect(stack, io.open, _opening)
         for name in ("stat", "lstat"):
-            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}"))
+            redirect(stack, getattr(os, name), partial(_recording_stat, f"os.{name}"))
         yield

@@ -1,7 +1,7 @@
 """Waiting for several descriptors: ``select``, ``poll``, ``epoll``, and so ``selectors``, asyncio.
 
-What was ready is kept by its place among what was waited for: the descriptors of a re-run have
-other numbers. Where all of them are the run's own, nothing is recorded.
+A ready descriptor is recorded by its position among those waited for: a re-run has other numbers.
+Nothing is recorded if all of them are the run's own.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 from rsltrace.guard.descriptor_table import number_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.recorded.descriptors import recording
+from rsltrace.guard.recorded.descriptors import recording_guard
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.waiting import NOT_YET, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Source
@@ -29,7 +29,7 @@ _real_epoll = select.epoll
 
 def _recording(frame: FrameType) -> tuple[Guard, Source] | None:
     for source in _RECORDED:
-        guard = recording(source, frame)
+        guard = recording_guard(source, frame)
         if guard is not None:
             return guard, source
     return None
@@ -42,18 +42,21 @@ def _answer(
     real: Callable[[float | None], list[Any]],
     frame: FrameType,
     timeout_s: float | None,
-    of: int,
+    number: int,
     step: Callable[[int], object] | None = None,
 ) -> list[Any]:
-    """Return what is ready; whoever can be set aside is, while nothing is."""
+    """Return what is ready; a thread lets others run while nothing is."""
     if timeout_s == 0 or (step is None and not guard.context.is_aside()):
-        return list(guard.recorded(source, call, lambda: real(timeout_s), frame, of) or ())
+        return list(guard.record(source, call, lambda: real(timeout_s), frame, number) or ())
 
     def look(seconds: float) -> Any:
         return real(seconds) or NOT_YET
 
     return (
-        wait_recorded(guard, source, call, look, frame, of=of, timeout_s=timeout_s, step=step) or []
+        wait_recorded(
+            guard, source, call, look, frame, number=number, timeout_s=timeout_s, step=step
+        )
+        or []
     )
 
 
@@ -79,35 +82,35 @@ class RecordedPoll:
         self._real.close()
 
     def register(self, fd: Any, eventmask: int | None = None) -> None:
-        """Wait for a descriptor, too."""
+        """Add a descriptor."""
         mask = self._mask if eventmask is None else eventmask
         self._real.register(fd, mask)
         self._registered[number_of(fd)] = mask
 
     def modify(self, fd: Any, eventmask: int) -> None:
-        """Wait for other events of a descriptor."""
+        """Change the events of a descriptor."""
         self._real.modify(fd, eventmask)
         self._registered[number_of(fd)] = eventmask
 
     def unregister(self, fd: Any) -> None:
-        """Wait for a descriptor no longer."""
+        """Remove a descriptor."""
         self._registered.pop(number_of(fd), None)
         self._real.unregister(fd)
 
     def has_outside(self) -> bool:
-        """Return whether it waits for somebody who is not part of the run."""
+        """Return whether a descriptor leads outside of the run."""
         guard = engaged()
         if guard is None or self._source is None:
             return False
         return any(map(guard.descriptors.is_outside, self._registered))
 
     def leads_out(self) -> bool:
-        """Return whether somebody else may make one of the descriptors ready, recorded or not."""
+        """Return whether something outside may make a descriptor ready, recorded or not."""
         guard = engaged()
         return guard is not None and any(map(guard.descriptors.leads_out, self._registered))
 
     def poll(self, timeout: float | None = None, maxevents: int = -1) -> list[tuple[int, int]]:
-        """Return what is ready, in what was registered."""
+        """Return the ready descriptors with their events."""
         limits = (maxevents,) if self._seconds else ()
         guard = engaged()
         frame = _past_selectors(sys._getframe(1))
@@ -149,7 +152,7 @@ class RecordedPoll:
 
 
 def _past_selectors(frame: FrameType) -> FrameType:
-    """Return the frame of whoever uses a selector."""
+    """Return the frame that uses a selector."""
     while frame.f_back is not None and frame.f_globals.get("__name__") == "selectors":
         frame = frame.f_back
     return frame
@@ -186,8 +189,8 @@ def _selecting(real: Callable[..., Any]) -> Any:
             return [], [], []
         frame = sys._getframe(1)
         found = _recording(frame)
-        things = [thing for kind in kinds for thing in kind]
-        if found is None or not any(map(guard.descriptors.is_outside, things)):
+        objects = [obj for kind in kinds for obj in kind]
+        if found is None or not any(map(guard.descriptors.is_outside, objects)):
             patient = None if timeout == 0 else waiting_guard(frame)
             if patient is None:
                 return real(*kinds, timeout)
@@ -201,13 +204,13 @@ def _selecting(real: Callable[..., Any]) -> Any:
         def places(seconds: float | None) -> list[Any]:
             chosen = real(*kinds, seconds)
             one_by_one = [
-                [place for place, thing in enumerate(kind) if any(thing is c for c in some)]
+                [place for place, obj in enumerate(kind) if any(obj is c for c in some)]
                 for kind, some in zip(kinds, chosen, strict=True)
             ]
             return one_by_one if any(one_by_one) else []
 
-        of = _number(guard, things)
-        answer = _answer(guard, found[1], "select.select()", places, frame, timeout, of)
+        number = _number(guard, objects)
+        answer = _answer(guard, found[1], "select.select()", places, frame, timeout, number)
         return tuple(
             [kind[place] for place in some if place < len(kind)]
             for kind, some in zip(kinds, answer or ([], [], []), strict=True)
@@ -216,20 +219,20 @@ def _selecting(real: Callable[..., Any]) -> Any:
     return ready
 
 
-def _number(guard: Guard, things: list[Any]) -> int:
-    """Return the number of the first descriptor outside: two threads rarely wait for the same."""
-    for thing in things:
-        known = guard.descriptors.find(thing)
+def _number(guard: Guard, objects: list[Any]) -> int:
+    """Return the number of the first outside descriptor: two threads rarely wait for the same."""
+    for obj in objects:
+        known = guard.descriptors.find(obj)
         if known is not None:
             return known.number
-        if guard.descriptors.is_outside(thing):
-            return 0 if isinstance(thing, int) else guard.descriptors.number(thing)
+        if guard.descriptors.is_outside(obj):
+            return 0 if isinstance(obj, int) else guard.descriptors.number(obj)
     return 0
 
 
 @contextmanager
 def recorded_polls() -> Iterator[None]:
-    """Let waiting for descriptors be answered from the trace in a re-run."""
+    """Record which descriptors become ready; in a re-run, return it from the trace."""
     with ExitStack() as stack:
         redirect(stack, select.poll, _polling)
         redirect(stack, select.select, _selecting)

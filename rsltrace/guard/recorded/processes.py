@@ -1,7 +1,7 @@
-"""Processes that are recorded: their number, their output, how they end. A re-run starts none.
+"""Recorded processes: their ids, output and end. A re-run starts none.
 
-``subprocess`` is Python but for a few functions below it. With those recorded, all of it (and
-``os.popen``, and asyncio's subprocesses) works in a re-run without the program being there.
+``subprocess`` is Python code above a few functions. With those recorded, all of it (and
+``os.popen`` and asyncio's subprocesses) works in a re-run without the program.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from typing import Any
 
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import engaged
-from rsltrace.guard.recorded.descriptors import recording, stand_in
+from rsltrace.guard.recorded.descriptors import recording_guard, unconnected_descriptor
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.waiting import (
     NOT_YET,
-    at_first_s,
-    polled,
+    initial_wait_s,
+    poll_until,
     wait_recorded,
     wait_unrecorded,
     waiting_guard,
@@ -34,16 +34,16 @@ from rsltrace.trace.model.finding import Source
 _KEPT_OPEN = 3
 _LOOKED = "_rsltrace_looked"
 _CHILDS_ENDS = (6, 9, 11, 13)
-"""Arguments of ``fork_exec``: which descriptors stay open in the child; its standard streams, and
-the pipe through which it tells that it cannot start the program."""
+"""Arguments of ``fork_exec``: descriptors that stay open in the child, its standard streams, and
+the pipe that reports a failed start."""
 
 
 def _starting(real: Callable[..., int]) -> Any:
     def fork_exec(*arguments: Any) -> int:
         frame = sys._getframe(1)
-        # multiprocessing shares memory and locks with its processes: that cannot be recorded
+        # multiprocessing shares memory and locks with its processes, which cannot be recorded
         by_subprocess = frame.f_globals.get("__name__") == "subprocess"
-        guard = recording(Source.PROCESS, frame) if by_subprocess else None
+        guard = recording_guard(Source.PROCESS, frame) if by_subprocess else None
         if guard is None:
             return real(*arguments)
         words = [os.fsdecode(word) for word in arguments[0]]
@@ -53,7 +53,7 @@ def _starting(real: Callable[..., int]) -> Any:
             far = descriptors.far_end(fd)
             if far is not None:
                 descriptors.add(far, Source.PROCESS)
-        process: int = guard.recorded(Source.PROCESS, call, lambda: real(*arguments), frame)
+        process: int = guard.record(Source.PROCESS, call, lambda: real(*arguments), frame)
         descriptors.processes.add(process)
         return process
 
@@ -72,29 +72,28 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
         if guard is None or process not in guard.descriptors.processes:
             patient = None if options & os.WNOHANG else waiting_guard(frame)
             if patient is not None:
-                return wait_unrecorded(patient, polled(ended), frame)
+                return wait_unrecorded(patient, poll_until(ended), frame)
             return real(process, options)
         if options & os.WNOHANG:
 
             def now_or_soon() -> Any:
-                found = polled(ended)(_looks_first(frame))
+                found = poll_until(ended)(_first_wait_s(frame))
                 return (0, 0) if found is NOT_YET else found
 
-            return guard.recorded(Source.PROCESS, call, now_or_soon, frame, process)
+            return guard.record(Source.PROCESS, call, now_or_soon, frame, process)
         if not guard.context.is_aside():
-            return guard.recorded(
+            return guard.record(
                 Source.PROCESS, call, lambda: real(process, options), frame, process
             )
-        return wait_recorded(guard, Source.PROCESS, call, polled(ended), frame, of=process)
+        return wait_recorded(guard, Source.PROCESS, call, poll_until(ended), frame, number=process)
 
     return waitpid
 
 
-def _looks_first(frame: FrameType) -> float:
-    """Return how long to wait for a program's end where ``subprocess`` looks again and again, in
-    real seconds: when it looks for the first time."""
+def _first_wait_s(frame: FrameType) -> float:
+    """Return how many real seconds ``subprocess`` waits at its first look for a program's end."""
     waiting = frame.f_back
-    first_s = at_first_s(frame, None)
+    first_s = initial_wait_s(frame, None)
     if not first_s or waiting is None or vars(waiting.f_locals["self"]).get(_LOOKED):
         return 0.0
     setattr(waiting.f_locals["self"], _LOOKED, True)
@@ -102,7 +101,7 @@ def _looks_first(frame: FrameType) -> float:
 
 
 def _of_process(name: str, real: Callable[..., Any]) -> Any:
-    """Return the stand-in for a function of a process that was started."""
+    """Return the replacement of a function that takes the id of a started process."""
 
     def function(process: int, *arguments: Any) -> Any:
         guard = engaged()
@@ -118,10 +117,10 @@ def _of_process(name: str, real: Callable[..., Any]) -> Any:
                 return None
             return value
 
-        value = guard.recorded(Source.PROCESS, f"os.{name}()", call, frame, process)
+        value = guard.record(Source.PROCESS, f"os.{name}()", call, frame, process)
         if name != "pidfd_open":
             return value
-        fd = opened[0] if opened else stand_in()
+        fd = opened[0] if opened else unconnected_descriptor()
         guard.descriptors.drop(fd)
         guard.descriptors.add(fd, Source.PROCESS)
         return fd
@@ -132,40 +131,40 @@ def _of_process(name: str, real: Callable[..., Any]) -> Any:
 def _running(real: Callable[..., int]) -> Any:
     def system(command: Any) -> Any:
         frame = sys._getframe(1)
-        guard = recording(Source.PROCESS, frame)
+        guard = recording_guard(Source.PROCESS, frame)
         if guard is None:
             return real(command)
         call = f"os.system({os.fsdecode(command)[:100]!r})"
-        return guard.recorded(Source.PROCESS, call, lambda: real(command), frame)
+        return guard.record(Source.PROCESS, call, lambda: real(command), frame)
 
     return system
 
 
 def sleep_for_process(seconds: float, real: Callable[[float], None], frame: FrameType) -> None:
-    """Let ``subprocess`` sleep until it looks again whether a process has ended: for real."""
-    guard = recording(Source.PROCESS, frame)
+    """Let ``subprocess`` sleep in real time until it looks again for a program's end."""
+    guard = recording_guard(Source.PROCESS, frame)
     if guard is None:
         real(seconds)
     elif guard.context.is_aside():
         call = "time.sleep() of subprocess"
-        # What is left of a timeout may be less than its clock can show: time must go on.
+        # The rest of a timeout may be less than its clock can show, but time must go on.
         timeout_s = max(seconds, 1e-6)
-        wait_recorded(guard, Source.PROCESS, call, _never, frame, of=0, timeout_s=timeout_s)
+        wait_recorded(guard, Source.PROCESS, call, _no_answer, frame, number=0, timeout_s=timeout_s)
     elif not guard.answers.replays:
         real(seconds)
 
 
-def _never(seconds: float) -> Any:
-    return polled(lambda: NOT_YET)(seconds)
+def _no_answer(seconds: float) -> Any:
+    return poll_until(lambda: NOT_YET)(seconds)
 
 
 def _acquiring(real: Callable[..., bool]) -> Any:
     def acquire(self: Any, block: bool = True, timeout: float | None = None) -> bool:
-        """Take a lock of multiprocessing, which a process may give back after others went on."""
+        """Take a lock of multiprocessing; a process may release it only after others went on."""
         guard = engaged()
         if guard is None or not block or not guard.context.can_step():
             return real(self, block, timeout)
-        look = polled(lambda: real(self, False) or NOT_YET)
+        look = poll_until(lambda: real(self, False) or NOT_YET)
         return wait_unrecorded(guard, look, sys._getframe(1), timeout) is True
 
     return acquire
@@ -173,7 +172,7 @@ def _acquiring(real: Callable[..., bool]) -> Any:
 
 @contextmanager
 def recorded_processes() -> Iterator[None]:
-    """Let processes answer from the trace in a re-run."""
+    """Record processes; in a re-run, return their answers from the trace."""
     with ExitStack() as stack:
         redirect(stack, _posixsubprocess.fork_exec, _starting)
         redirect(stack, os.system, _running)
@@ -183,6 +182,6 @@ def recorded_processes() -> Iterator[None]:
         acquire: Any = _multiprocessing.SemLock.acquire
         exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
         exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
-        # A second way to do the same, which is not recorded.
+        # posix_spawn is not recorded.
         replace_attribute(stack, subprocess, "_USE_POSIX_SPAWN", False)
         yield

@@ -1,7 +1,6 @@
-"""Sockets whose answers are recorded, TLS and all, and given again without anybody there.
+"""Sockets whose answers are recorded, TLS included, and returned again without a peer.
 
-Of TLS the plain text is recorded: the keys of a connection are drawn in C, so what goes over the
-wire differs each time.
+Of TLS the plain text is recorded: keys are drawn in C, so the encrypted bytes differ each time.
 """
 
 from __future__ import annotations
@@ -18,9 +17,9 @@ from typing import Any
 
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.guard import Guard
-from rsltrace.guard.recorded.descriptors import joining, recording
+from rsltrace.guard.recorded.descriptors import connected_ends, recording_call, recording_guard
 from rsltrace.guard.redirect import redirect
-from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
+from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.trace.model.finding import Source
 
 _RECEIVING = ("recv", "recvfrom", "recvmsg")
@@ -41,8 +40,8 @@ _BUFFERED = ("read", "write")
 
 
 def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
-    """Return the guard if what a socket answers is recorded: it leads outside of the run."""
-    guard = recording(Source.SOCKET, frame)
+    """Return the guard if a socket's answers are recorded: it leads outside of the run."""
+    guard = recording_guard(Source.SOCKET, frame)
     if guard is None or guard.descriptors.far_end(sock.fileno()) is not None:
         return None
     return guard
@@ -53,16 +52,16 @@ def _answer(
 ) -> Any:
     number = guard.descriptors.number(sock)
     if not waits or not guard.context.is_aside() or sock.gettimeout() == 0:
-        return guard.recorded(Source.SOCKET, call, real, frame, number)
+        return guard.record(Source.SOCKET, call, real, frame, number)
     timeout_s = sock.gettimeout()
-    look = when_readable(sock.fileno(), lambda: [real()])
+    look = wait_readable(sock.fileno(), lambda: [real()])
     found = wait_recorded(
         guard,
         Source.SOCKET,
         call,
         look,
         frame,
-        of=number,
+        number=number,
         timeout_s=timeout_s,
     )
     if found is None:
@@ -71,11 +70,11 @@ def _answer(
 
 
 def _wait_for(sock: Any, frame: FrameType) -> None:
-    """Let others go on until there is something to read; what it is is not recorded."""
+    """Let others go on until an unrecorded socket is readable."""
     guard, timeout_s = waiting_guard(frame), sock.gettimeout()
     if guard is None or timeout_s == 0 or sock.fileno() < 0:
         return
-    look = when_readable(sock.fileno(), lambda: True)
+    look = wait_readable(sock.fileno(), lambda: True)
     if wait_unrecorded(guard, look, frame, timeout_s) is None:
         raise TimeoutError("timed out")
 
@@ -142,39 +141,13 @@ def _accepting(real: Callable[[Any], Any]) -> Any:
     return accept
 
 
-def _resolving(name: str, real: Callable[..., Any]) -> Any:
-    def resolve(*arguments: Any, **options: Any) -> Any:
-        frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
-        if guard is None:
-            return real(*arguments, **options)
-        return guard.recorded(
-            Source.SOCKET, f"socket.{name}()", lambda: real(*arguments, **options), frame
-        )
-
-    return resolve
-
-
 # -- TLS ------------------------------------------------------------------------------------------
-
-
-def _of_tls(kind: str, name: str, real: Callable[..., Any]) -> Any:
-    def method(self: Any, *arguments: Any) -> Any:
-        frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
-        if guard is None:
-            return real(self, *arguments)
-        return guard.recorded(
-            Source.SOCKET, f"{kind}.{name}()", lambda: real(self, *arguments), frame
-        )
-
-    return method
 
 
 def _reading(real: Callable[..., Any]) -> Any:
     def read(self: Any, size: int, buffer: Any = None, /) -> Any:
         frame = sys._getframe(1)
-        guard = recording(Source.SOCKET, frame)
+        guard = recording_guard(Source.SOCKET, frame)
         if guard is None:
             return real(self, size) if buffer is None else real(self, size, buffer)
 
@@ -187,7 +160,7 @@ def _reading(real: Callable[..., Any]) -> Any:
         if isinstance(owner, socket.socket):
             data = _answer_tls(guard, self, owner, call, receive, frame)
         else:
-            data = guard.recorded(Source.SOCKET, call, receive, frame)
+            data = guard.record(Source.SOCKET, call, receive, frame)
         if buffer is None:
             return data
         memoryview(buffer).cast("B")[: len(data)] = data
@@ -204,17 +177,19 @@ def _answer_tls(
     receive: Callable[[], Any],
     frame: FrameType,
 ) -> Any:
-    """Wait for a TLS socket: what has been deciphered already makes it not readable."""
+    """Wait for a TLS socket, which is not readable while decrypted bytes are left."""
     number = guard.descriptors.number(sock)
     timeout_s = sock.gettimeout()
     if timeout_s == 0 or not guard.context.is_aside():
-        return guard.recorded(Source.SOCKET, call, receive, frame, number)
-    wire = when_readable(sock.fileno(), lambda: [receive()])
+        return guard.record(Source.SOCKET, call, receive, frame, number)
+    wire = wait_readable(sock.fileno(), lambda: [receive()])
 
     def look(seconds: float) -> Any:
         return [receive()] if tls.pending() else wire(seconds)
 
-    found = wait_recorded(guard, Source.SOCKET, call, look, frame, of=number, timeout_s=timeout_s)
+    found = wait_recorded(
+        guard, Source.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
+    )
     if found is None:
         raise TimeoutError("The read operation timed out")
     return found[0]
@@ -222,10 +197,10 @@ def _answer_tls(
 
 def _pending(real: Any) -> property:
     def pending(self: Any) -> Any:
-        guard = recording(Source.SOCKET, sys._getframe(1))
+        guard = recording_guard(Source.SOCKET, sys._getframe(1))
         if guard is None:
             return real.__get__(self)
-        return guard.recorded(
+        return guard.record(
             Source.SOCKET, "MemoryBIO.pending", lambda: real.__get__(self), sys._getframe(1)
         )
 
@@ -234,11 +209,15 @@ def _pending(real: Any) -> property:
 
 @contextmanager
 def recorded_sockets() -> Iterator[None]:
-    """Let sockets answer from the trace in a re-run."""
+    """Record the answers of sockets; in a re-run, return them from the trace."""
     with ExitStack() as stack:
         for name in _RESOLVING:
-            redirect(stack, getattr(_socket, name), partial(_resolving, name))
-        redirect(stack, _socket.socketpair, joining)
+            redirect(
+                stack,
+                getattr(_socket, name),
+                partial(recording_call, Source.SOCKET, f"socket.{name}()"),
+            )
+        redirect(stack, _socket.socketpair, connected_ends)
         kind: Any = socket.socket
         makers: list[tuple[str, Any]] = [
             *((name, partial(_of_socket, name)) for name in _PLAIN),
@@ -253,9 +232,11 @@ def recorded_sockets() -> Iterator[None]:
         tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
         memory = ssl.MemoryBIO
         for name in _TLS:
-            exchange(stack, tls, name, partial(_of_tls, "TLS", name))
+            exchange(stack, tls, name, partial(recording_call, Source.SOCKET, f"TLS.{name}()"))
         exchange(stack, tls, "read", _reading)
         for name in _BUFFERED:
-            exchange(stack, memory, name, partial(_of_tls, "MemoryBIO", name))
+            exchange(
+                stack, memory, name, partial(recording_call, Source.SOCKET, f"MemoryBIO.{name}()")
+            )
         exchange(stack, memory, "pending", _pending)
         yield

@@ -1,10 +1,9 @@
-"""A node's state as one number: equal for equal states, whatever addresses and orders there are.
+"""A hash of a node's state: equal for equal states, whatever the addresses and orders.
 
-What a node keeps is written as canonical bytes and hashed with XXH3-64. Values count, not objects:
-two equal lists hash alike, shared or not. -0.0 is 0.0, every NaN is the same, sets have no order
-(dicts have one that programs see, so it counts). An array's data is hashed where it is, at the
-speed of memory. What has no value to speak of (locks, generators, handles of the middleware) is
-left out and listed.
+The state is written as canonical bytes and hashed with XXH3-64. Values count, not objects: two
+equal lists hash equally, shared or not. -0.0 equals 0.0, every NaN is the same, sets have no order
+(dicts have one that programs see). Array data is hashed in place at the speed of memory. What has
+no value (locks, generators, handles of the middleware) is left out and listed.
 """
 
 from __future__ import annotations
@@ -27,16 +26,14 @@ from typing import Any
 import numpy as np
 import xxhash
 
-# Hashing the data of arrays in place: equal numbers count as equal, -0.0 and NaN included.
-
 _arrays_hash64: Callable[[Any], int] = xxhash.xxh3_64_intdigest
 
 
 def array_hash(value: Any, seen: dict[str, dict[int, int]]) -> int:
-    """Return the hash of an array's data, in which equal numbers count as equal.
+    """Return the hash of an array's data; equal numbers hash equally, -0.0 and NaN included.
 
-    It is done in blocks, and ``seen`` remembers, by type, the canonical hash of a block by its
-    plain one: what has not changed is read only once.
+    It works in blocks. ``seen`` maps, by type, the plain hash of a block to its canonical one, so
+    unchanged data is read once.
     """
     data = np.ascontiguousarray(value)
     dtype = data.dtype
@@ -81,7 +78,7 @@ def _canonical_hash(block: Any) -> int:
 
 
 def _has_several_forms(parts: Any, kind: str) -> bool:
-    """Return whether there is a -0.0 or a NaN among floats: two quick looks, rarely true."""
+    """Return whether floats contain a -0.0 or a NaN: two quick checks, rarely true."""
     smallest = float(_smallest(parts))
     if smallest > 0.0:
         return False
@@ -96,7 +93,7 @@ _INTEGERS = {
     for order in "<>"
     for size in (2, 4, 8)
 }
-"""Integers as wide as floats, and the smallest of them: it has the bit pattern of -0.0."""
+"""Integers as wide as floats, and the smallest of them, which has the bits of -0.0."""
 
 _smallest: Any = np.minimum.reduce
 _BLOCK_BYTES = 256 << 10
@@ -104,14 +101,14 @@ _SEEN_MAX = 1 << 14
 
 
 DEPTH_MAX = 200
-"""What lies deeper (a linked list of a million nodes) is left out and listed."""
+"""Deeper values (a linked list of a million nodes) are left out and listed."""
 
 _hash64: Callable[[Any], int] = xxhash.xxh3_64_intdigest
 _pack_double = struct.Struct("<d").pack
 _pack_count = struct.Struct("<Q").pack
 _NAN = b"fN"
 _identity: Callable[[object], int] = object.__hash__
-"""What tells objects apart, like ``id``, but no audit hook is told of it."""
+"""Identifies objects like ``id``, but raises no audit event."""
 
 _SKIPPED_MODULES = frozenset(
     "_thread threading _io io socket ssl _socket select selectors asyncio multiprocessing "
@@ -121,7 +118,7 @@ _SKIPPED_MODULES = frozenset(
 
 
 class StateHasher:
-    """Hashes values. ``skipped`` says what was left out: its type by where it was."""
+    """Hashes values. ``skipped`` maps what was left out to its type."""
 
     def __init__(self) -> None:
         self.skipped: dict[str, str] = {}
@@ -228,7 +225,7 @@ class StateHasher:
             self._add(item)
 
     def _reduced(self, value: Any) -> None:
-        """A value of a C type without attributes: what pickle would keep of it."""
+        """Hash a value of a C type without attributes by what pickle would keep."""
         try:
             parts = value.__reduce_ex__(4)
         except Exception:
@@ -289,7 +286,7 @@ def _slots_of(kind: type) -> tuple[str, ...]:
 
 
 def is_left_out(value: object) -> bool:
-    """Return whether an object has no value to speak of: a lock, a generator, a handle."""
+    """Return whether an object has no value: a lock, a generator, a handle."""
     kind = type(value)
     if kind in _PLAIN or hasattr(kind, "rsltrace_state"):
         return False
@@ -350,7 +347,7 @@ _PLAIN: dict[type, Callable[[Any], bytes]] = {
 }
 
 UNCHANGING = frozenset(_PLAIN) - {bytearray, memoryview, type, types.FunctionType}
-"""Types whose values stay as they are, and so does their hash."""
+"""Types whose values, and so hashes, never change."""
 
 _Handler = Callable[[StateHasher, Any], None]
 _HANDLERS: dict[type, _Handler] = {

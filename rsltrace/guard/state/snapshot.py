@@ -1,7 +1,6 @@
-"""A node's state written down: which attribute changed in which event, down to elements of arrays.
+"""Recorded states of a node: which attribute changed in which event, down to array elements.
 
-Only what changed since the node's last event is written: attributes by their hash, arrays in
-blocks.
+Only changes since the node's last event are written: attributes by their hash, arrays in blocks.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from rsltrace.guard.state.hashing import StateHasher, attributes_of, is_left_out
 
 LEAVES_MAX = 20_000
-"""An attribute with more values than this is known by its hash only."""
+"""An attribute with more values is recorded by its hash only."""
 
 BLOCK_BYTES = 4096
 
@@ -26,13 +25,12 @@ _Arrays = dict[str, tuple[str, list[bytes]]]
 
 
 class Snapshots:
-    """Writes the states of one node, each as what is new in it."""
+    """Records the states of one node as changes."""
 
     def __init__(self) -> None:
         self._attributes: dict[str, int] = {}
         self._arrays: dict[str, _Arrays] = {}
-        """By attribute, the arrays that were in it when it was written last: a reader knows those
-        and no others."""
+        """By attribute, its arrays when it was last written: a reader knows only those."""
 
     def changes(self, attributes: Mapping[str, Any], hashes: Mapping[str, int]) -> dict[str, Any]:
         """Return what changed: by attribute its values by path (None: it is gone)."""
@@ -57,7 +55,7 @@ class Snapshots:
 
 
 class _Leaves:
-    """The values of one attribute by their paths; of arrays, the blocks that are not as before."""
+    """The values of one attribute by path; of arrays, the blocks that changed."""
 
     def __init__(self, before: _Arrays) -> None:
         self._before = before
@@ -105,7 +103,7 @@ class _TooMany(Exception):
 
 
 def _children(value: Any, path: str) -> list[tuple[str, Any]] | None:
-    """Return the parts of a value with their paths, or None for a value without parts."""
+    """Return the parts of a value with their paths, or None if it has none."""
     if isinstance(value, (str, bytes, bytearray, enum.Enum, type)) or is_left_out(value):
         return None
     if isinstance(value, Mapping):

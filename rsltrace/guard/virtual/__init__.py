@@ -1,1 +1,1 @@
-"""What a run makes deterministic: clocks, chance, order, the environment."""
+"""What a run makes deterministic: clocks, randomness, order, the environment."""

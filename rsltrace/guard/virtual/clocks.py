@@ -1,8 +1,8 @@
-"""Every clock a node can read shows simulated time: ``time``, ``datetime``, also where it is bound.
+"""Every clock that a node can read shows simulated time: ``time``, ``datetime``, wherever bound.
 
-Built-in functions are redirected, ``datetime.now`` and ``utcnow`` (which belong to a type) are
-exchanged in the type. Clocks of processor time show what has passed of the simulation: computing
-takes no simulated time, looking at a clock again 1 us.
+Built-in functions are redirected; ``datetime.now`` and ``utcnow`` are replaced in their type.
+Clocks of processor time show simulated time, too: computing takes none of it, and each further read
+of a clock takes 1 us.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 
 from rsltrace.guard import frames
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.frames import caller, code_of, put_member
+from rsltrace.guard.frames import caller, code_of, set_member
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_read
+from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_reader
 from rsltrace.trace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
@@ -37,8 +37,8 @@ REAL_TIME_MODULES = {
     "socketserver",
     "subprocess",
 }
-"""Modules whose clocks measure how long the operating system takes: they wait for real, so what
-they read must go on. Their users get simulated time."""
+"""Modules that wait for the operating system in real time: their clocks must go on. Their users get
+simulated time."""
 
 
 _wall_ns = copy_of(time.time_ns)  # type: ignore[arg-type]
@@ -59,16 +59,14 @@ def clock_call(
     real: Callable[[], Any],
     real_ns: Callable[[], int] | None = None,
 ) -> Any:
-    """Answer the reading of a clock as the job says; ``real_ns`` is read if it is recorded."""
+    """Answer a read of a clock as the job says; ``real_ns`` is read if it is recorded."""
     module = frame.f_globals.get("__name__")
     if module in REAL_TIME_MODULES:
         if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
             return real()
         if guard.context.is_aside():
             return virtual(guard.context.now_ns())
-        return virtual(
-            guard.recorded(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame)
-        )
+        return virtual(guard.record(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame))
     mode = guard.mode(_CLOCK, frame)
     if mode is _VIRTUAL:
         kind = KINDS[code_of(frame).co_filename]
@@ -78,9 +76,9 @@ def clock_call(
     if mode is Mode.RECORD:
         if real_ns is None:
             real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
-        return virtual(guard.recorded(Source.CLOCK, call, real_ns, frame))
+        return virtual(guard.record(Source.CLOCK, call, real_ns, frame))
     value = real()
-    guard.found(Source.CLOCK, mode, call, value, frame)
+    guard.report(Source.CLOCK, mode, call, value, frame)
     return value
 
 
@@ -108,14 +106,14 @@ def _reading(name: str, real: Callable[[], Any]) -> Callable[[dict[str, Any]], A
             kind = guard.kinds[names["__file__"]]
         except (KeyError, TypeError):
             frame = caller()
-            kind = guard.whose(names, frame)
-        if kind > OURS or not guard.makes_clocks:
+            kind = guard.file_kind(names, frame)
+        if kind > OURS or not guard.answers_clocks:
             if frame is None:
                 try:
                     frame = frames.next_caller()
                 except frames.INTERRUPTED:
                     frame = frames.lost_caller()
-            if not guard.makes_clocks or names.get("__name__") in REAL_TIME_MODULES:
+            if not guard.answers_clocks or names.get("__name__") in REAL_TIME_MODULES:
                 return clock_call(guard, frame, call, virtual, real)
         now_ns = guard.clock_ns(call, kind, names, frame)
         return now_ns if in_ns else now_ns / _NS
@@ -142,7 +140,7 @@ def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[...,
 
 
 def _broken_down(name: str, real: Callable[..., Any]) -> Any:
-    """``localtime()`` and its like: without an argument, or with None, they mean now."""
+    """``localtime()`` and the like: without an argument, or with None, they mean now."""
 
     def read(*arguments: Any) -> Any:
         guard = engaged() if arguments in ((), (None,)) else None
@@ -177,44 +175,41 @@ def _formatting(
 
 def _now(real: Any) -> Any:
     def now(cls: type[datetime], tz: Any = None) -> datetime:
-        guard = engaged()
-
-        def virtual(now_ns: int) -> datetime:
-            whole = cls.fromtimestamp(now_ns // _NS, tz)
-            return whole.replace(microsecond=now_ns % _NS // 1000)
-
-        if guard is None:
-            return real.__get__(None, cls)(tz)  # type: ignore[no-any-return]
-        return clock_call(  # type: ignore[no-any-return]
-            guard,
-            caller(),
-            "datetime.now()",
-            virtual,
-            lambda: real.__get__(None, cls)(tz),
-        )
+        return _datetime(cls, real, "now", tz, (tz,), caller())
 
     return now
 
 
 def _utcnow(real: Any) -> Any:
     def utcnow(cls: type[datetime]) -> datetime:
-        guard = engaged()
-
-        def virtual(now_ns: int) -> datetime:
-            whole = cls.fromtimestamp(now_ns // _NS, timezone.utc).replace(tzinfo=None)
-            return whole.replace(microsecond=now_ns % _NS // 1000)
-
-        if guard is None:
-            return real.__get__(None, cls)()  # type: ignore[no-any-return]
-        return clock_call(  # type: ignore[no-any-return]
-            guard, caller(), "datetime.utcnow()", virtual, real.__get__(None, cls)
-        )
+        return _datetime(cls, real, "utcnow", timezone.utc, (), caller()).replace(tzinfo=None)
 
     return utcnow
 
 
+def _datetime(
+    cls: type[datetime],
+    real: Any,
+    name: str,
+    tz: Any,
+    arguments: tuple[Any, ...],
+    frame: FrameType,
+) -> datetime:
+    """Answer a class method of ``datetime`` that was called at ``frame``."""
+    guard, bound = engaged(), real.__get__(None, cls)
+
+    def virtual(now_ns: int) -> datetime:
+        whole = cls.fromtimestamp(now_ns // _NS, tz)
+        return whole.replace(microsecond=now_ns % _NS // 1000)
+
+    if guard is None:
+        return bound(*arguments)  # type: ignore[no-any-return]
+    call = f"datetime.{name}()"
+    return clock_call(guard, frame, call, virtual, lambda: bound(*arguments))  # type: ignore[no-any-return]
+
+
 def numpy_now(function: Any, text: str, *more: Any) -> Any:
-    """Do ``np.datetime64("now")``, which asks the C library: user modules come here instead."""
+    """Answer ``np.datetime64("now")`` in user modules; numpy itself asks the C library."""
     real = function(text, *more)
     guard = engaged()
     if guard is None:
@@ -245,7 +240,7 @@ def opencv_clock(stack: ExitStack) -> None:
 
 @contextmanager
 def virtual_clocks() -> Iterator[None]:
-    """Redirect every clock; which guard answers is asked at each call."""
+    """Redirect every clock."""
     with ExitStack() as stack:
 
         def redirect_time(name: str, make: Callable[[Any], Any], how: Any = redirect) -> None:
@@ -254,7 +249,7 @@ def virtual_clocks() -> Iterator[None]:
                 how(stack, function, make)
 
         for name in (*_READERS, *(f"{name}_ns" for name in _READERS)):
-            redirect_time(name, partial(_reading, name), redirect_read)
+            redirect_time(name, partial(_reading, name), redirect_reader)
         localtime = copy_of(time.localtime)  # type: ignore[arg-type]
         redirect_time(
             "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
@@ -268,33 +263,33 @@ def virtual_clocks() -> Iterator[None]:
         redirect_time("asctime", lambda real: _formatting("asctime", 0, real, localtime))
         bound_before = _bound_before("now", "utcnow")
         for name, make in (("now", _now), ("utcnow", _utcnow)):
-            _exchange(stack, name, make, bound_before[name])
+            _replace_method(stack, name, make, bound_before[name])
         yield
 
 
-def _exchange(
+def _replace_method(
     stack: ExitStack,
     name: str,
     make: Callable[[Any], Any],
     bound_before: list[BuiltinFunctionType],
 ) -> None:
-    """Exchange a class method of ``datetime``, in the type and where it was bound before."""
+    """Replace a class method of ``datetime``, in the type and where it was bound before."""
     real = datetime.__dict__[name]
     ours = make(real)
     for bound in bound_before:
         target = ours.__get__(bound.__self__)
         stack.callback(Redirected(bound, target).restore)
-    put_member(datetime, name, classmethod(ours))
-    stack.callback(put_member, datetime, name, real)
+    set_member(datetime, name, classmethod(ours))
+    stack.callback(set_member, datetime, name, real)
 
 
 def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:
-    """Return the bound class methods that somebody keeps (``now = datetime.now``), by name."""
+    """Return the bound class methods that code keeps (``now = datetime.now``), by name."""
     found: dict[str, list[BuiltinFunctionType]] = {name: [] for name in names}
     owners = [datetime]
     for owner in owners:
         owners += type.__subclasses__(owner)
-    for thing in gc.get_referrers(*owners):
-        if type(thing) is BuiltinFunctionType and thing.__name__ in found:
-            found[thing.__name__].append(thing)
+    for obj in gc.get_referrers(*owners):
+        if type(obj) is BuiltinFunctionType and obj.__name__ in found:
+            found[obj.__name__].append(obj)
     return found

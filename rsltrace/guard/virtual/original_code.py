@@ -1,7 +1,7 @@
-"""Gives code that was compiled with calls of ours as it would be without, to those who read code.
+"""The original code of user modules, for libraries that read code.
 
-numba compiles the instructions of a function, dill and cloudpickle send them to other processes:
-none of them can do with calls of ours. Whoever reads the source file sees the original anyway.
+User modules are compiled with calls of the guard. numba compiles the instructions of a function,
+dill and cloudpickle send them to other processes: these calls must not be in them.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from rsltrace.guard.guard import engage, engaged
 from rsltrace.trace.model.finding import Mode, Source
 
 _sources: dict[str, bytes] = {}
-"""What was compiled, by file: a file may change while a run lasts."""
+"""The compiled sources by file: a file may change during a run."""
 _MARK = "__rsltrace_"
 _SETS = frozenset(("set", "frozenset"))
 
 
 def keep_source(path: str, source: bytes) -> None:
-    """Remember the source of a module of user code."""
+    """Keep the source of a module of user code."""
     _sources[path] = source
 
 
 def original_of(code: CodeType) -> CodeType:
-    """Return code as Python compiles it: itself, unless it has calls of ours."""
+    """Return code as Python compiles it, without calls of the guard."""
     source = _sources.get(code.co_filename)
     if source is None or not any(
         name.startswith(_MARK) for part in _all_in(code) for name in part.co_names
@@ -51,23 +51,23 @@ def _all_in(code: CodeType) -> Iterator[CodeType]:
 
 
 def _original_for_numba(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    def get_code_object(thing: Any) -> Any:
-        code = real(thing)
-        if isinstance(thing, FunctionType) and isinstance(code, CodeType):
+    def get_code_object(obj: Any) -> Any:
+        code = real(obj)
+        if isinstance(obj, FunctionType) and isinstance(code, CodeType):
             with engage(None):
                 original = original_of(code)
             if original is not code:
-                thing.__code__ = original
+                obj.__code__ = original
             if code.co_filename in _sources:
-                _tell_of_sets(original)
+                _report_sets(original)
             return original
         return code
 
     return get_code_object
 
 
-def _tell_of_sets(code: CodeType) -> None:
-    """Report a function that has sets: they keep the order that they have."""
+def _report_sets(code: CodeType) -> None:
+    """Report a compiled function that uses sets: they keep Python's order."""
     if not any(_SETS & set(part.co_names) or _makes_set(part) for part in _all_in(code)):
         return
     guard = engaged()
@@ -77,7 +77,7 @@ def _tell_of_sets(code: CodeType) -> None:
     if guard.mode(Source.ORDER, frame) is not Mode.ALLOW:
         call = f"order of sets in {code.co_name}, which numba compiles"
         line = f"{code.co_filename.rpartition('/')[2]}:{code.co_firstlineno}"
-        guard.found(Source.ORDER, Mode.WARN, call, line, frame)
+        guard.report(Source.ORDER, Mode.WARN, call, line, frame)
 
 
 def _makes_set(code: CodeType) -> bool:
@@ -116,15 +116,12 @@ _READERS: dict[str, Callable[[str, ExitStack], None]] = {
     "joblib.externals.cloudpickle.cloudpickle": _for_cloudpickle,
 }
 READERS = tuple(_READERS)
-"""Modules that read code, to be prepared as soon as they are loaded."""
+"""Modules that read code, to be prepared when they are loaded."""
 
 
 def show_original(name: str, stack: ExitStack) -> None:
-    """Let one of the ``READERS``, which is loaded, see code as it was, until ``stack`` ends."""
+    """Let one of the ``READERS``, which is loaded, see original code until ``stack`` ends."""
     try:
         _READERS[name](name, stack)
     except (AttributeError, KeyError):
-        pass  # a version that does it otherwise
-
-
-__all__ = ["READERS", "keep_source", "original_of", "show_original"]
+        pass  # another version

@@ -1,7 +1,7 @@
-"""How many processors there are: four in every run, whatever the machine has.
+"""The processors that user code sees: the same in every run, whatever the machine has.
 
-Pools get as many workers as that, and data as many parts, which a run would otherwise owe to the
-machine. Processes of the run (``rsltrace.adapters.processes``) are told the same.
+Pools make as many workers, and programs divide their data by it. Processes of the run
+(``rsltrace.adapters.processes``) see the same number. ``rules.RULES`` answers ``os.cpu_count``.
 """
 
 from __future__ import annotations
@@ -18,40 +18,31 @@ from weakref import WeakKeyDictionary
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.process_ids import meant_id
 from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.guard.rules import PROCESSOR_NAMES, PROCESSORS
 from rsltrace.trace.model.finding import Mode, Source
 
-PROCESSORS = 4
-_OF_SYSCONF = frozenset(("SC_NPROCESSORS_CONF", "SC_NPROCESSORS_ONLN"))
 _getpid = copy_of(os.getpid)  # type: ignore[arg-type]
 _affinities: WeakKeyDictionary[Guard, frozenset[int]] = WeakKeyDictionary()
-"""Which processors user code has chosen, where it has chosen some."""
+"""The processors that user code has set."""
 
 
-def _in_charge(call: str, frame: FrameType) -> Guard | None:
-    """Return the guard if user code asks and the job leaves the answer to the run."""
+def _answering_guard(call: str, frame: FrameType) -> Guard | None:
+    """Return the guard if user code calls and the run answers."""
     guard = engaged()
-    if guard is None or not guard.is_for_user(frame):
+    if guard is None or not guard.is_user_call(frame):
         return None
     if guard.mode(Source.ENVIRONMENT, frame) is Mode.ALLOW:
         return None
-    guard.count(Source.ENVIRONMENT, call, frame)
+    guard.count_call(Source.ENVIRONMENT, call, frame)
     return guard
 
 
-def _counting(real: Callable[[], int | None]) -> Callable[[], int | None]:
-    def cpu_count() -> int | None:
-        guard = _in_charge("os.cpu_count()", sys._getframe(1))
-        return real() if guard is None else PROCESSORS
-
-    return cpu_count
-
-
 def _configured(real: Callable[[Any], int]) -> Callable[[Any], int]:
-    numbers = {os.sysconf_names[name] for name in _OF_SYSCONF}
+    numbers = {os.sysconf_names[name] for name in PROCESSOR_NAMES}
 
     def sysconf(name: Any, /) -> int:
-        if name in _OF_SYSCONF or name in numbers:
-            guard = _in_charge("os.sysconf()", sys._getframe(1))
+        if name in PROCESSOR_NAMES or name in numbers:
+            guard = _answering_guard("os.sysconf()", sys._getframe(1))
             if guard is not None:
                 return PROCESSORS
         return real(name)
@@ -65,7 +56,9 @@ def _is_own(pid: Any) -> bool:
 
 def _affinity(real: Callable[[Any], set[int]]) -> Callable[[Any], set[int]]:
     def sched_getaffinity(pid: Any, /) -> set[int]:
-        guard = _in_charge("os.sched_getaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        guard = (
+            _answering_guard("os.sched_getaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        )
         if guard is None:
             return real(meant_id(pid))
         return set(_affinities.get(guard, range(PROCESSORS)))
@@ -75,7 +68,9 @@ def _affinity(real: Callable[[Any], set[int]]) -> Callable[[Any], set[int]]:
 
 def _setting(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
     def sched_setaffinity(pid: Any, mask: Iterable[int], /) -> None:
-        guard = _in_charge("os.sched_setaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        guard = (
+            _answering_guard("os.sched_setaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        )
         if guard is None:
             real(meant_id(pid), mask)
             return
@@ -88,11 +83,10 @@ def _setting(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
 
 
 @contextmanager
-def same_processors() -> Iterator[None]:
-    """Tell user code of as many processors on every machine."""
+def virtual_processors() -> Iterator[None]:
+    """Show user code the same processors on every machine."""
     with ExitStack() as stack:
         for name, make in (
-            ("cpu_count", _counting),
             ("sysconf", _configured),
             ("sched_getaffinity", _affinity),
             ("sched_setaffinity", _setting),
@@ -101,4 +95,4 @@ def same_processors() -> Iterator[None]:
         yield
 
 
-__all__ = ["PROCESSORS", "same_processors"]
+__all__ = ["PROCESSORS", "virtual_processors"]

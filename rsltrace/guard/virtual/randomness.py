@@ -1,9 +1,9 @@
-"""Chance, made of seeds: every node draws from streams of its own, named after it.
+"""Random numbers from seeds: every node draws from its own streams.
 
-``random``'s and numpy's module functions share one generator per process; here each node has its
-own, as if it were a process of its own, so adding a node changes nothing for the others. Whatever
-else asks for entropy (``Random()``, ``secrets``, ``uuid4``, ``default_rng()``) gets it through
-``os.urandom`` or ``Random.seed``, and so from the node's stream, too.
+The module functions of ``random`` and numpy share one generator per process; here each node has its
+own, so adding a node does not change the others. Everything else that needs entropy (``Random()``,
+``secrets``, ``uuid4``, ``default_rng()``) gets it through ``os.urandom`` or ``Random.seed``, and so
+from the node's stream, too.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import (
     Redirected,
     RedirectedMethod,
-    RedirectedRead,
+    RedirectedReader,
     copy_of,
+    has_no_arguments,
     redirect,
     replace_attribute,
-    takes_nothing,
 )
 from rsltrace.trace.model.finding import Mode, Source
 
@@ -43,13 +43,13 @@ _real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
 
 
 _Virtual = Callable[[Guard, str], Callable[..., Any]]
-"""Returns what draws from the stream of that name."""
+"""Returns the function that draws from the stream of that name."""
 
 
-def _drawn(
+def _drawing(
     call: str, real: Callable[..., Any], virtual: _Virtual, *, is_method: bool = False
 ) -> Any:
-    """Return the stand-in for a function that answers by chance; a method's owner is dropped."""
+    """Return the replacement of a random function; of a method the object is dropped."""
 
     def draw(*arguments: Any, **options: Any) -> Any:
         if is_method:
@@ -61,19 +61,19 @@ def _drawn(
             frame = frames.next_caller()
         except frames.INTERRUPTED:
             frame = frames.lost_caller()
-        if guard.makes_chance:
+        if guard.answers_random:
             kind = KINDS[code_of(frame).co_filename]
-            drawing = guard.known_draw(call, kind) if kind <= OURS else None
-            return (drawing or guard.draw(call, virtual, frame))(*arguments, **options)
+            drawing = guard.known_random_function(call, kind) if kind <= OURS else None
+            return (drawing or guard.random_function(call, virtual, frame))(*arguments, **options)
         return _answer(guard, frame, call, virtual, partial(real, *arguments, **options))
 
     return draw
 
 
-def _drawn_plainly(
+def _drawing_without_arguments(
     call: str, real: Callable[[], Any], virtual: _Virtual
 ) -> Callable[[dict[str, Any]], Any]:
-    """Return the same for a function without arguments, for ``RedirectedRead``."""
+    """Return the replacement of a function without arguments, for ``RedirectedReader``."""
 
     def draw(names: dict[str, Any]) -> Any:
         guard = engaged()
@@ -84,10 +84,10 @@ def _drawn_plainly(
             kind = guard.kinds[names["__file__"]]
         except (KeyError, TypeError):
             frame = caller()
-            kind = guard.whose(names, frame)
-        if guard.makes_chance:
-            drawing = guard.known_draw(call, kind) if kind <= OURS else None
-            return (drawing or guard.draw(call, virtual, frame or caller()))()
+            kind = guard.file_kind(names, frame)
+        if guard.answers_random:
+            drawing = guard.known_random_function(call, kind) if kind <= OURS else None
+            return (drawing or guard.random_function(call, virtual, frame or caller()))()
         return _answer(guard, frame or caller(), call, virtual, partial(real))
 
     return draw
@@ -99,17 +99,17 @@ def _answer(
     """Draw as the job says."""
     mode = guard.mode(_RANDOM, frame)
     if mode is Mode.VIRTUAL:
-        return guard.draw(call, virtual, frame)(*real.args, **real.keywords)
+        return guard.random_function(call, virtual, frame)(*real.args, **real.keywords)
     if mode is Mode.RECORD:
         stream = guard.stream(frame)
         guard.streams.begin(
             stream,
-            lambda: guard.recorded(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
+            lambda: guard.record(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
         )
         return virtual(guard, stream)(*real.args, **real.keywords)
     value = real()
     if mode is not Mode.ALLOW:
-        guard.found(_RANDOM, mode, call, value, frame, _shown)
+        guard.report(_RANDOM, mode, call, value, frame, _shown)
     return value
 
 
@@ -120,10 +120,10 @@ def _shown(value: object) -> str:
 
 @contextmanager
 def virtual_randomness() -> Iterator[None]:
-    """Redirect what answers by chance; which guard answers is asked at each call."""
+    """Redirect all random functions."""
     with ExitStack() as stack:
         _module_functions(stack, random, random._inst, "random", _random_of)
-        replace_attribute(stack, random, "_inst", _Shared())
+        replace_attribute(stack, random, "_inst", _SharedGenerator())
         _entropy(stack)
         _unseeded(stack)
         _uuids(stack)
@@ -132,18 +132,18 @@ def virtual_randomness() -> Iterator[None]:
 
             _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
             _shared_numpy(stack, np.random)
-            redirect(stack, np.empty, _emptying)
+            redirect(stack, np.empty, _zeroing)
         yield
 
 
-class _Shared(random.Random):
-    """What libraries (networkx) take for the generator behind ``random``'s functions."""
+class _SharedGenerator(random.Random):
+    """What libraries (networkx) use as the generator behind ``random``'s functions."""
 
     def __init__(self) -> None:
-        """Seed nothing: that would seed the module."""
+        """Do not seed: that would seed the module."""
 
     def __getattribute__(self, name: str) -> Any:
-        """Return the module's function of that name, which asks whose code it is."""
+        """Return the module's function of that name, which finds the caller's stream."""
         if name.startswith("_"):
             return super().__getattribute__(name)
         return vars(random).get(name) or super().__getattribute__(name)
@@ -175,12 +175,14 @@ def _module_functions(
 
         call = f"{prefix}.{name}()"
         if isinstance(function, MethodType):
-            draw = _drawn(call, real, virtual, is_method=True)
+            draw = _drawing(call, real, virtual, is_method=True)
             stack.callback(RedirectedMethod(function, draw).restore)
-        elif takes_nothing(function):
-            stack.callback(RedirectedRead(function, _drawn_plainly(call, real, virtual)).restore)
+        elif has_no_arguments(function):
+            stack.callback(
+                RedirectedReader(function, _drawing_without_arguments(call, real, virtual)).restore
+            )
         else:
-            stack.callback(Redirected(function, _drawn(call, real, virtual)).restore)
+            stack.callback(Redirected(function, _drawing(call, real, virtual)).restore)
 
 
 def _entropy(stack: ExitStack) -> None:
@@ -195,11 +197,11 @@ def _entropy(stack: ExitStack) -> None:
     for name in ("urandom", "getrandom"):
         function = getattr(os, name, None)
         if isinstance(function, BuiltinFunctionType):
-            redirect(stack, function, partial(_drawn, f"os.{name}()", virtual=bytes_of))
+            redirect(stack, function, partial(_drawing, f"os.{name}()", virtual=bytes_of))
 
 
 def _unseeded(stack: ExitStack) -> None:
-    """``Random()`` without a seed takes entropy in C, past any redirected function."""
+    """``Random()`` without a seed takes entropy in C, past redirected functions."""
     real = random.Random.seed
 
     def seed(self: random.Random, a: Any = None, version: int = 2) -> None:
@@ -213,7 +215,7 @@ def _unseeded(stack: ExitStack) -> None:
 
 
 def _uuids(stack: ExitStack) -> None:
-    """``uuid1`` then asks ``time`` and ``random``; the machine's address is replaced, too."""
+    """Replace what ``uuid1`` uses besides ``time`` and ``random``: the machine's address."""
     for name, value in (
         ("_generate_time_safe", None),
         ("_node", _NODE_ID),
@@ -236,7 +238,7 @@ def _uuid1_code(node=None, clock_seq=None):  # type: ignore[no-untyped-def]
 
 
 def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
-    """Do ``uuid.uuid1``, which never gives a time twice, for each node as if it were alone."""
+    """Call ``uuid.uuid1``, which never returns a time twice, with a state per node."""
     real, guard = _real_uuid1[0], engaged()
     if guard is None:
         return real(node, clock_seq)
@@ -249,7 +251,7 @@ def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
 
 
 def _shared_numpy(stack: ExitStack, module: Any) -> None:
-    """Libraries (scipy.stats) use numpy's shared generator itself: give it its state back."""
+    """Restore the state of numpy's shared generator afterwards: scipy.stats uses it directly."""
     shared = module.mtrand._rand
     stack.callback(shared.set_state, shared.get_state())
     real = module.seed  # a function of its own that goes past the redirected methods
@@ -258,13 +260,13 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
         seed: Callable[..., Any] = _numpy_of(guard, stream).seed
         return seed
 
-    draw = _drawn("numpy.random.seed()", real, seeding)
+    draw = _drawing("numpy.random.seed()", real, seeding)
     for place in (module, module.mtrand):
         replace_attribute(stack, place, "seed", draw)
 
 
-def _emptying(real: Callable[..., Any]) -> Any:
-    """``np.empty`` shows what was in the memory before; in user code, it shows zeros."""
+def _zeroing(real: Callable[..., Any]) -> Any:
+    """``np.empty`` shows old memory; in user code it shows zeros."""
 
     def empty(*arguments: Any, **options: Any) -> Any:
         made = real(*arguments, **options)
@@ -279,7 +281,7 @@ def _emptying(real: Callable[..., Any]) -> Any:
 
 
 def begin_shared(seed: int) -> None:
-    """Seed what cannot be divided into streams: numpy's shared generator."""
+    """Seed numpy's shared generator, which cannot be divided into streams."""
     if "numpy" in sys.modules:
         import numpy as np
 

@@ -1,14 +1,13 @@
-"""Sets in an order of their own, whoever goes through them.
+"""Iteration over sets in a deterministic order.
 
-A set of texts is in the order of their hashes, which differ from process to process; a set of
-objects in that of their addresses. Whatever goes through a set, a loop as well as ``sorted``,
-``Counter`` or ``itertools.chain``, asks its type for an iterator. So the types are told for the
-time of a run to ask ``__iter__`` by name (as every class does that has one of its own), and find
-one of ours there. What walks the table of a set itself is told in the same way: ``pop``,
-``dict.fromkeys``, pickling, and, from Python 3.13 on, lists that are made of sets.
+A set of strings is in the order of their hashes, a set of objects in that of their addresses; both
+differ from process to process. Every iteration (loops, ``sorted``, ``Counter``,
+``itertools.chain``) asks the type for an iterator. So during a run the set types look up
+``__iter__`` by name, like any class with its own, and find a replacement. The same goes for code
+that walks the set's table: ``pop``, ``dict.fromkeys``, pickling, and lists made of sets from Python
+3.13 on.
 
-Rejected: compiling user modules with a call of ours at each loop. A function that goes through a
-set in C, or in a library, was none the wiser.
+Rejected: compile user modules with a call at each loop. It misses functions in C and in libraries.
 """
 
 from __future__ import annotations
@@ -26,9 +25,9 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.addresses import is_by_address
+from rsltrace.guard.addresses import has_address_hash
 from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.frames import caller, code_of, exchange, exchange_special
+from rsltrace.guard.frames import caller, code_of, exchange, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import Mode, Source
@@ -36,17 +35,17 @@ from rsltrace.trace.model.finding import Mode, Source
 _ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
 _TYPES: tuple[type, ...] = (set, frozenset)
 _NUMBERS = frozenset((int, float, bool))
-"""Their places in a set are the same in every process."""
+"""Their positions in a set are the same in every process."""
 _TEXTS = frozenset((str,))
 _TUPLES = frozenset((tuple,))
 _PLAIN = (str, bytes, int, float, bool, type(None))
 _PICKLED_SETS = (pickle.EMPTY_SET, b"__builtin__\nset\n", b"builtins\nset\n")
-"""What stands for a set in what is pickled, by protocol; elsewhere it may mean anything."""
+"""The bytes that stand for a set in a pickle, by protocol; elsewhere they may mean anything."""
 LISTS_READ_SETS = sys.version_info >= (3, 13)
-"""Whether Python makes lists of sets without asking these for an iterator."""
+"""Whether Python makes lists of sets without asking for an iterator."""
 
 _through_set, _through_frozen = set.__iter__, frozenset.__iter__
-"""What goes through a set, and a frozen one, as Python does."""
+"""Python's own iteration over a set and a frozenset."""
 
 
 def _iterating(real: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator[Any]]:
@@ -60,44 +59,48 @@ def _iterating(real: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator
                     frame = frames.lost_caller()
                 in_order = _order(guard, self, frame)
                 if in_order is not None:
-                    return _through(self, in_order)
+                    return _iterate(self, in_order)
         return real(self)
 
     return __iter__
 
 
-def _ordered(thing: Any) -> list[Any] | None:
-    """Return the elements of a set in an order that stays, or None if they are left as they are."""
-    if len(thing) < 2 or _NUMBERS.issuperset(map(type, _plainly(thing))):
+def _elements_in_order(obj: Any) -> list[Any] | None:
+    """Return the elements of a set in a fixed order, or None if Python's order stays."""
+    if len(obj) < 2 or _NUMBERS.issuperset(map(type, _unordered(obj))):
         return None
     guard = engaged()
-    return None if guard is None else _order(guard, thing, caller())
+    return None if guard is None else _order(guard, obj, caller())
 
 
-def _plainly(thing: Any) -> Iterator[Any]:
-    """Go through a set as Python does."""
-    return _through_frozen(thing) if isinstance(thing, frozenset) else _through_set(thing)
+def _unordered(obj: Any) -> Iterator[Any]:
+    """Iterate over a set as Python does."""
+    return _through_frozen(obj) if isinstance(obj, frozenset) else _through_set(obj)
 
 
-def _order(guard: Guard, thing: Any, frame: FrameType | None) -> list[Any] | None:
-    """Do ``_ordered`` for code of the user and what that calls: ``frame`` is where it is asked."""
-    if frame is None or KINDS[code_of(frame).co_filename] == OURS or guard.user_of(frame) is None:
+def _order(guard: Guard, obj: Any, frame: FrameType | None) -> list[Any] | None:
+    """Return the elements in order if user code, or what it calls at ``frame``, iterates."""
+    if (
+        frame is None
+        or KINDS[code_of(frame).co_filename] == OURS
+        or guard.user_frame_of(frame) is None
+    ):
         return None
     mode = guard.mode(_ORDER, frame)
     if mode is _ALLOW:
         return None
-    items = [*_plainly(thing)]
+    items = [*_unordered(obj)]
     are_texts = _TEXTS.issuperset(map(type, items))
     if not are_texts and (_are_tuples_of_numbers(items) or not any(map(_has_no_order, items))):
         return None
     if mode is _VIRTUAL:
         in_order = sorted(items) if are_texts else _in_order(guard, items)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
-            guard.count(_ORDER, "order of a set", frame)
+            guard.count_call(_ORDER, "order of a set", frame)
             return in_order
-    kinds = ", ".join(sorted(dict.fromkeys(type(_meant(one)).__qualname__ for one in items)))
-    guard.watched(
-        _ORDER, f"order of a {type(thing).__name__} of {kinds}", f"{len(items)} elements", frame
+    kinds = ", ".join(sorted(dict.fromkeys(type(_referent(one)).__qualname__ for one in items)))
+    guard.report_user_call(
+        _ORDER, f"order of a {type(obj).__name__} of {kinds}", f"{len(items)} elements", frame
     )
     return None
 
@@ -117,8 +120,8 @@ def _in_order(guard: Guard, items: list[Any]) -> list[Any] | None:
 
 
 def _has_no_order(item: object) -> bool:
-    """Whether an element's place in a set differs from process to process, pinned or not."""
-    return isinstance(item, (str, bytes)) or is_by_address(item)
+    """Whether an element's position in a set differs from process to process, pinned or not."""
+    return isinstance(item, (str, bytes)) or has_address_hash(item)
 
 
 def _key(item: Any) -> tuple[str, Any]:
@@ -130,22 +133,22 @@ def _key(item: Any) -> tuple[str, Any]:
     raise TypeError
 
 
-def _meant(item: Any) -> Any:
+def _referent(item: Any) -> Any:
     return item() if isinstance(item, weakref.ref) else item
 
 
-def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
-    """Go through elements in order; like a set, notice when it changes on the way."""
-    size = len(thing)
+def _iterate(obj: Any, in_order: list[Any]) -> Iterator[Any]:
+    """Iterate in order; like a set, raise if its size changes meanwhile."""
+    size = len(obj)
     for item in in_order:
-        if len(thing) != size:
+        if len(obj) != size:
             raise RuntimeError("Set changed size during iteration")
         yield item
 
 
 def _popping(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def pop(self: Any, /) -> Any:
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         if in_order is None:
             return real(self)
         self.remove(in_order[0])
@@ -156,7 +159,7 @@ def _popping(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 def _from_keys(real: Any) -> Any:
     def fromkeys(cls: Any, iterable: Iterable[Any], value: Any = None, /) -> Any:
-        return real.__get__(None, cls)(ordered(iterable), value)
+        return real.__get__(None, cls)(in_set_order(iterable), value)
 
     return classmethod(fromkeys)
 
@@ -167,7 +170,7 @@ def _dumping(real: Callable[..., bytes]) -> Callable[..., bytes]:
         guard = engaged()
         if guard is None or not any(mark in data for mark in _PICKLED_SETS):
             return data
-        if guard.user_of(caller()) is None:
+        if guard.user_frame_of(caller()) is None:
             return data
         file = io.BytesIO()
         pickle._Pickler(file, *arguments, **options).dump(obj)
@@ -186,9 +189,9 @@ def _dumping_into(real: Callable[..., None]) -> Callable[..., None]:
     return dump
 
 
-def ordered(thing: Any) -> Any:
-    """Return what stands for ``thing`` for those who would go through a set without asking it."""
-    return [*iter(thing)] if type(thing) in _TYPES else thing
+def in_set_order(obj: Any) -> Any:
+    """Return a list in order in place of a set, for code that would not ask it for an iterator."""
+    return [*iter(obj)] if type(obj) in _TYPES else obj
 
 
 # -- from Python 3.13 on -------------------------------------------------------------------------
@@ -197,7 +200,7 @@ def ordered(thing: Any) -> Any:
 def _making(real: Callable[..., Any]) -> Callable[..., Any]:
     def make(*arguments: Any, **options: Any) -> Any:
         if arguments and type(arguments[-1]) in _TYPES:
-            arguments = (*arguments[:-1], ordered(arguments[-1]))
+            arguments = (*arguments[:-1], in_set_order(arguments[-1]))
         return real(*arguments, **options)
 
     return make
@@ -206,7 +209,7 @@ def _making(real: Callable[..., Any]) -> Callable[..., Any]:
 def _reducing(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def __reduce__(self: Any, /) -> Any:  # noqa: N807
         kind, elements, state = real(self)
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         return kind, elements if in_order is None else (in_order,), state
 
     return __reduce__
@@ -215,7 +218,7 @@ def _reducing(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
 def _showing(real: Callable[[Any], str]) -> Callable[[Any], str]:
     @reprlib.recursive_repr("set(...)")
     def __repr__(self: Any, /) -> str:  # noqa: N807
-        in_order = _ordered(self)
+        in_order = _elements_in_order(self)
         if in_order is None:
             return real(self)
         inside = "{" + ", ".join(map(repr, in_order)) + "}"
@@ -226,10 +229,10 @@ def _showing(real: Callable[[Any], str]) -> Callable[[Any], str]:
 
 @contextmanager
 def ordered_sets() -> Iterator[None]:
-    """Let sets be gone through in order; which guard wants it is asked at each."""
+    """Let user code iterate over sets in order."""
     with ExitStack() as stack:
         for kind in _TYPES:
-            exchange_special(stack, kind, "__iter__", _iterating)
+            replace_special_method(stack, kind, "__iter__", _iterating)
         exchange(stack, set, "pop", _popping)
         exchange(stack, dict, "fromkeys", _from_keys)
         redirect(stack, pickle.dumps, _dumping)
@@ -237,13 +240,10 @@ def ordered_sets() -> Iterator[None]:
         if LISTS_READ_SETS:
             for function in (sorted, operator.iadd):
                 redirect(stack, function, _making)
-            exchange_special(stack, list, "__init__", _making)
+            replace_special_method(stack, list, "__init__", _making)
             for name in ("extend", "__iadd__"):
                 exchange(stack, list, name, _making)
             for kind in _TYPES:
-                exchange_special(stack, kind, "__repr__", _showing)
+                replace_special_method(stack, kind, "__repr__", _showing)
                 exchange(stack, kind, "__reduce__", _reducing)
         yield
-
-
-__all__ = ["LISTS_READ_SETS", "ordered", "ordered_sets"]

@@ -1,4 +1,4 @@
-"""Libraries that need care in a run: TBB, PyTorch, pygame and pytest."""
+"""Libraries that need support in a run: PyTorch, pytest, pygame and TBB."""
 
 from __future__ import annotations
 
@@ -18,24 +18,21 @@ from importlib.machinery import EXTENSION_SUFFIXES
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.frames import caller, exchange
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
-from rsltrace.guard.virtual.object_hashes import hash_method
-from rsltrace.guard.virtual.set_order import ordered
+from rsltrace.guard.virtual.set_order import in_set_order
 from rsltrace.guard.virtual.user_modules import rewrite
 
-# PyTorch's generator, for each node as if it were alone in the process.
-#
-# Torch draws in C++ from one generator, and offers no place to ask who is calling. So the
-# generator's state is exchanged whenever another node's code begins to run: some 10 microseconds
-# each time, in jobs that have loaded torch and in no others.
+# PyTorch draws in C++ from one generator and offers no hook. So the generator's state is switched
+# whenever another node's code runs: some 10 microseconds each, only in jobs that have loaded torch.
 
 
 class TorchStreams:
-    """The states of torch's generator, by the name of the node (or of the entry) that draws."""
+    """The states of torch's generator, by the name of the node (or entry point) that draws."""
 
     def __init__(self, generator: Any, seed: int) -> None:
         self._generator = generator
@@ -44,7 +41,7 @@ class TorchStreams:
         self._name: str | None = None
 
     def enter(self, name: str) -> None:
-        """Go on where a node's code has stopped drawing."""
+        """Switch to a node's state."""
         if name == self._name:
             return
         self._keep()
@@ -56,7 +53,7 @@ class TorchStreams:
             self._generator.manual_seed(random.Random(f"torch {self._seed} {name}").getrandbits(63))
 
     def rename(self, name: str) -> None:
-        """Go on under another name: an entry has made its node, and may have seeded before."""
+        """Continue under another name: an entry point made its node, and may have seeded before."""
         self._keep()
         self._name = name
 
@@ -67,7 +64,7 @@ class TorchStreams:
 
 def _seeding(real: Any) -> Any:
     def seed(self: Any) -> int:
-        """Do ``Generator.seed``, which would take entropy in C++."""
+        """Replace ``Generator.seed``, which takes entropy in C++."""
         value = int.from_bytes(os.urandom(8), "big") >> 1
         self.manual_seed(value)
         return value
@@ -84,18 +81,15 @@ def torch_streams(stack: ExitStack, guard: Guard) -> TorchStreams:
     return TorchStreams(generator, guard.streams.seed)
 
 
-# ``torch.compile`` reads the code that runs, our calls included: it may take them for nothing.
-#
-# It would follow them into the guard, and could go no further where a set of texts is gone
-# through. In a graph sets are in the order that Python gives them, which is that of all pinned
-# processes.
+# ``torch.compile`` reads the running code, and would follow the guard's calls and fail at sets of
+# strings. In a graph, sets are in Python's order, which is the same in all pinned processes.
 
 COMPILES = "torch._dynamo"
 """The module of torch that reads code."""
 
 
-def _as_it_is(thing: Any) -> Any:
-    return thing
+def _as_it_is(obj: Any) -> Any:
+    return obj
 
 
 def _hash_method(owner: Any) -> Any:
@@ -106,8 +100,8 @@ def _call(function: Any, text: str, *more: Any) -> Any:
     return function(text, *more)
 
 
-_MEANT = {
-    ordered: _as_it_is,
+_PLAIN_FUNCTIONS = {
+    in_set_order: _as_it_is,
     hash_method: _hash_method,
     numpy_now: _call,
 }
@@ -115,30 +109,29 @@ _known: list[object] = []
 
 
 def plain_in_graphs() -> None:
-    """Let torch, whose compiler is loaded, see plain Python where modules call the guard."""
+    """Let torch's compiler, which is loaded, see plain Python where modules call the guard."""
     substitute = getattr(sys.modules[COMPILES], "substitute_in_graph", None)
     if substitute is None or substitute in _known:
-        return  # a torch that does it otherwise; or it is told already, and for good
+        return  # another version of torch, or done already
     _known.append(substitute)
-    for function, meant in _MEANT.items():
+    for function, meant in _PLAIN_FUNCTIONS.items():
         substitute(function)(meant)
 
 
-# Our calls in test modules, too: those that pytest compiles itself when it runs in a node.
-#
-# Its import hook comes before all others, and keeps what it compiled in a cache of its own. While
-# a run lasts that cache is neither read nor written: plain pytest shall not find our calls there.
+# pytest compiles test modules itself, with an import hook before all others and a cache. During a
+# run that cache is neither read nor written, so that plain pytest does not find the guard's calls
+# in it.
 
 REWRITES = "_pytest.assertion.rewrite"
 """The module of pytest that compiles test modules."""
 
 
 def rewritten_in_pytest(stack: ExitStack) -> None:
-    """Put our calls into what pytest compiles from now on, until ``stack`` ends."""
+    """Put the guard's calls into what pytest compiles from now on, until ``stack`` ends."""
     module: Any = sys.modules[REWRITES]
     names = ("rewrite_asserts", "_read_pyc", "_write_pyc")
     if not all(hasattr(module, name) for name in names):
-        return  # a pytest that does it otherwise
+        return  # another version of pytest
     real = module.rewrite_asserts
 
     def rewrite_asserts(tree: ast.Module, source: bytes, path: Any = None, *more: Any) -> None:
@@ -152,10 +145,10 @@ def rewritten_in_pytest(stack: ExitStack) -> None:
         setattr(module, name, function)
 
 
-# pygame's clock and waits: it asks SDL in C, and here they take simulated time as Python's do.
+# pygame asks SDL in C for its clock and waits; here both use simulated time.
 
 _FRAMES = 10
-"""After how many frames pygame counts anew how many there are in a second."""
+"""pygame counts the frames per second anew after this many frames."""
 
 
 def _ticks_of(real: Callable[[], int]) -> Callable[[], int]:
@@ -239,16 +232,15 @@ def pygame_clock(stack: ExitStack) -> None:
             replace_attribute(stack, owner, "Clock", clock)
 
 
-# One thread for Intel's TBB, in ``libtbb`` and wherever it is linked into an extension module.
+# Intel's TBB, in ``libtbb`` and linked into extension modules, gets one thread.
 #
-# TBB has no environment variable. It asks once, when it is first used, for how many processors the
-# calling thread may run on, and divides loops by that number even where a single thread then runs
-# them: sums of floating-point numbers would differ between machines, too. So each copy of TBB is
-# made to ask while this thread may use one processor, and is held to one thread until the run is
-# over.
+# TBB has no environment variable. When first used, it asks how many processors the calling thread
+# may use, and divides loops by that number even with a single thread: sums of floating-point
+# numbers would differ between machines. So each copy of TBB asks while this thread may use one
+# processor, and stays limited to one thread until the run ends.
 
 
-class _Names(NamedTuple):
+class _TbbFunctions(NamedTuple):
     """Functions of a generation of TBB, as the linker knows them."""
 
     processors: str
@@ -257,19 +249,19 @@ class _Names(NamedTuple):
 
 
 _GENERATIONS = (
-    _Names(  # oneTBB, from 2021 on
+    _TbbFunctions(  # oneTBB, from 2021 on
         "_ZN3tbb6detail2r115max_concurrencyEPKNS0_2d115task_arena_baseE",
         "_ZN3tbb6detail2r16createERNS0_2d114global_controlE",
         "_ZN3tbb6detail2r17destroyERNS0_2d114global_controlE",
     ),
-    _Names(
+    _TbbFunctions(
         "_ZN3tbb19task_scheduler_init19default_num_threadsEv",
         "_ZN3tbb10interface914global_control15internal_createEv",
         "_ZN3tbb10interface914global_control16internal_destroyEv",
     ),
 )
 _TRACES = (b"N3tbb6detail2r1", b"N3tbb8internal")
-"""Names of types of TBB's scheduler; they stay where its functions are hidden."""
+"""Names of types of TBB's scheduler; they remain where its functions are hidden."""
 _LOOKED_THROUGH_MAX = 64 << 20
 _SUFFIXES = tuple(EXTENSION_SUFFIXES)
 
@@ -282,8 +274,8 @@ _without: set[str] = set()
 """Files of this process that are known to have no TBB."""
 
 
-class _Control(ctypes.Structure):
-    """TBB's ``global_control``: ``kind`` 0 is how many threads may run at most."""
+class _TbbControl(ctypes.Structure):
+    """TBB's ``global_control``: ``kind`` 0 limits the number of threads."""
 
     _fields_ = (
         ("value", ctypes.c_size_t),
@@ -292,30 +284,30 @@ class _Control(ctypes.Structure):
     )
 
 
-class _Threads:
-    """The copies of TBB that were met in a run. ``told`` takes a library and what is wrong."""
+class _TbbThreads:
+    """The copies of TBB found in a run. ``report`` takes a library and what is wrong."""
 
-    def __init__(self, stack: ExitStack, told: Callable[[str, str], None]) -> None:
+    def __init__(self, stack: ExitStack, report: Callable[[str, str], None]) -> None:
         self._stack = stack
-        self._told = told
+        self._report = report
         self._held: set[int] = set()
 
     def look_at_all(self) -> None:
-        """Look at every extension module that this process has loaded so far."""
+        """Limit every extension module that this process has loaded."""
         for module in list(sys.modules.values()):
             file = vars(module).get("__file__") if isinstance(module, ModuleType) else None
             if isinstance(file, str) and file.endswith(_SUFFIXES):
                 self.look_at(file)
 
     def look_at(self, file: str, handle: int | None = None) -> None:
-        """Hold the TBB that a library has, or is linked with, to one thread."""
+        """Limit the TBB that a library contains, or is linked with, to one thread."""
         with engage(None):
             if file in _without or self._finds(file, handle):
                 return
             if not is_user_file(file) or not _has_traces(file):
                 _without.add(file)
                 return
-        self._told(os.path.basename(file), "its functions are hidden, so its threads stay many")
+        self._report(os.path.basename(file), "its functions are hidden, so its threads stay many")
 
     def _finds(self, file: str, handle: int | None) -> bool:
         with suppress(OSError):  # a file that is gone, or that is not for opening: the linker's own
@@ -332,17 +324,17 @@ class _Threads:
             return
         self._held.add(processors)
         count = _asked_on_one_processor(ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p)(processors))
-        control = _Control(1, None, 0)
+        control = _TbbControl(1, None, 0)
         act = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
         act(hold)(ctypes.byref(control))
         self._stack.callback(act(release), ctypes.byref(control))
         if count != 1:
             said = f"it was in use before the run and divides its work as for {count} threads"
-            self._told(os.path.basename(file), said)
+            self._report(os.path.basename(file), said)
 
 
 def _asked_on_one_processor(processors: Callable[[None], int]) -> int:
-    """Let TBB find out how many processors there are; return how many it knows of."""
+    """Let TBB ask for the number of processors; return the number it knows."""
     before = _may_use(0)
     try:
         _use(0, {min(before)})
@@ -355,7 +347,7 @@ def _asked_on_one_processor(processors: Callable[[None], int]) -> int:
 
 
 def _has_traces(file: str) -> bool:
-    """Return whether a file has TBB's scheduler within it."""
+    """Return whether a file contains TBB's scheduler."""
     with suppress(OSError), open(file, "rb") as opened:
         if 0 < os.fstat(opened.fileno()).st_size <= _LOOKED_THROUGH_MAX:
             with mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as content:
@@ -364,13 +356,13 @@ def _has_traces(file: str) -> bool:
 
 
 @contextmanager
-def one_tbb_thread(told: Callable[[str, str], None]) -> Iterator[None]:
-    """Hold every TBB that this process has, or loads in the meantime, to one thread.
+def one_tbb_thread(report: Callable[[str, str], None]) -> Iterator[None]:
+    """Limit every TBB that this process has, or loads meanwhile, to one thread.
 
-    ``told`` is called for a library where that cannot be done, with its name and why.
+    ``report`` is called for a library where that fails, with its name and the reason.
     """
     with ExitStack() as stack:
-        threads = _Threads(stack, told)
+        threads = _TbbThreads(stack, report)
         threads.look_at_all()
 
         def importing(real: Callable[..., Any]) -> Callable[..., Any]:
@@ -393,13 +385,3 @@ def one_tbb_thread(told: Callable[[str, str], None]) -> Iterator[None]:
         redirect(stack, _imp.create_dynamic, importing)
         redirect(stack, _ctypes.dlopen, opening)
         yield
-
-
-__all__ = [
-    "COMPILES",
-    "REWRITES",
-    "one_tbb_thread",
-    "plain_in_graphs",
-    "pygame_clock",
-    "rewritten_in_pytest",
-]

@@ -1,7 +1,7 @@
-"""User modules are compiled with calls of ours where Python offers nothing else to take hold of.
+"""User modules, compiled with calls of the guard where Python offers no other hook.
 
-They are few: ``np.datetime64("now")``, the method ``__hash__``, and, from Python 3.13 on, ``[*s]``
-and ``r += s`` (``set_order`` sees to all else that goes through a set). Line numbers stay.
+These are ``np.datetime64("now")``, the method ``__hash__`` and, from Python 3.13 on, ``[*s]`` and
+``r += s`` (``set_order`` handles all other iterations over sets). Line numbers stay.
 """
 
 from __future__ import annotations
@@ -11,22 +11,24 @@ import builtins
 import importlib.machinery
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import CodeType, ModuleType
 from typing import Any
 
+from rsltrace.guard.addresses import hash_method
+from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
 from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
-from rsltrace.guard.virtual.object_hashes import hash_method
 from rsltrace.guard.virtual.original_code import keep_source
-from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, ordered
+from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
 
 _ORDERED = "__rsltrace_ordered__"
 _HASH = "__rsltrace_hash__"
 _NOW = "__rsltrace_now__"
 _WORDS = (b"datetime64", b"__hash__")
-"""A module that has none of these stays as it is (before Python 3.13)."""
+"""A module without these words stays unchanged (before Python 3.13)."""
 _NEVER_SETS = (
     *(ast.Constant, ast.JoinedStr, ast.Compare, ast.Lambda),
     *(ast.List, ast.Tuple, ast.Dict, ast.ListComp, ast.DictComp, ast.GeneratorExp),
@@ -91,12 +93,12 @@ def _says_now(node: ast.expr) -> bool:
 
 
 def rewrite(tree: ast.Module) -> None:
-    """Put our calls into the code of a module."""
+    """Put the guard's calls into the code of a module."""
     (_ListRewriter if LISTS_READ_SETS else _Rewriter)().visit(tree)
 
 
 def rewritten(source: bytes, path: str) -> CodeType:
-    """Return a module's code with our calls."""
+    """Return a module's code with the guard's calls."""
     keep_source(path, source)
     if not LISTS_READ_SETS and not any(word in source for word in _WORDS):
         plain: CodeType = compile(source, path, "exec", dont_inherit=True)
@@ -108,18 +110,18 @@ def rewritten(source: bytes, path: str) -> CodeType:
 
 
 def code_of_script(source: bytes, path: str) -> CodeType:
-    """Return the code of a program that is not imported, compiled as modules are at present.
+    """Return the code of a program, compiled as modules are at present.
 
     :raises SyntaxError, ValueError: if it is not Python.
     """
-    if any(type(finder) is _Finder and finder.rewrites for finder in sys.meta_path):
+    if any(type(finder) is _ModuleFinder and finder.rewrites for finder in sys.meta_path):
         return rewritten(source, path)
     code: CodeType = compile(source, path, "exec", dont_inherit=True)
     return code
 
 
 class _Loader(importlib.machinery.SourceFileLoader):
-    """Loads a module of user code (``rewrites``: with our calls) or of what is installed."""
+    """Loads a user module (``rewrites``: with the guard's calls) or an installed one."""
 
     def __init__(self, instead_of: Any, *, rewrites: bool, library: bool) -> None:
         super().__init__(instead_of.name, instead_of.path)
@@ -137,23 +139,25 @@ class _Loader(importlib.machinery.SourceFileLoader):
             super().exec_module(module)
 
 
-class _Finder:
-    """Finds modules of user code, and those of libraries, which have their own import time."""
+class _ModuleFinder:
+    """Finds user modules, and those of libraries, which have their own import time."""
 
     def __init__(
         self,
         packages: frozenset[str],
         on_loaded: Mapping[str, Callable[[], None]],
         rewrites: bool,
+        stack: ExitStack,
     ) -> None:
         self._packages = packages
         self._on_loaded = on_loaded
         self.rewrites = rewrites
+        self._stack = stack
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return a module's spec, with a loader of ours if it is not one of Python's or ROS's."""
+        """Return a module's spec, with its own loader unless it is one of Python's or ROS's."""
         if name in sys.builtin_module_names or is_own(name):
             return None
         spec = self._found_otherwise(name, path, target)
@@ -166,14 +170,16 @@ class _Finder:
             spec.loader = _Loader(spec.loader, rewrites=self.rewrites, library=library)
         elif is_library(file):
             spec.loader = _Loader(spec.loader, rewrites=False, library=True)
+        if name in REPORTED_MODULES:
+            _call_when_loaded(spec.loader, partial(report_functions, self._stack, name))
         if name in self._on_loaded:
-            _tell(spec.loader, self._on_loaded[name])
+            _call_when_loaded(spec.loader, self._on_loaded[name])
         return spec
 
     def _found_otherwise(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Ask those who would be asked without us: editable packages have finders of their own."""
+        """Ask the other finders: editable packages have their own."""
         for finder in sys.meta_path:
             find_spec = getattr(finder, "find_spec", None)
             if finder is not self and find_spec is not None:
@@ -183,8 +189,8 @@ class _Finder:
         return None
 
 
-def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
-    """Have a loader say when it has loaded its module."""
+def _call_when_loaded(loader: Any, on_loaded: Callable[[], None]) -> None:
+    """Call a function when a loader has loaded its module."""
     real = loader.exec_module
 
     def exec_module(module: ModuleType) -> None:
@@ -201,20 +207,19 @@ def user_modules(
     *,
     rewrites: bool = True,
 ) -> Iterator[None]:
-    """Compile user modules that are imported from now on with our calls, if ``rewrites``.
+    """Compile user modules imported from now on with the guard's calls, if ``rewrites``.
 
-    ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
+    ``on_loaded`` maps libraries to functions that are called when they are loaded.
     """
     helpers: dict[str, Callable[..., Any]] = {
-        _ORDERED: ordered,
+        _ORDERED: in_set_order,
         _HASH: hash_method,
         _NOW: numpy_now,
     }
-    finder = _Finder(packages, on_loaded, rewrites)
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
-    sys.meta_path.insert(0, finder)
-    try:
+    with ExitStack() as stack:
+        finder = _ModuleFinder(packages, on_loaded, rewrites, stack)
+        sys.meta_path.insert(0, finder)
+        stack.callback(sys.meta_path.remove, finder)
         yield
-    finally:
-        sys.meta_path.remove(finder)

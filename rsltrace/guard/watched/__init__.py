@@ -1,1 +1,1 @@
-"""What can only be watched: calls whose answers the run cannot make, reported as findings."""
+"""Libraries whose calls the guard can only report."""

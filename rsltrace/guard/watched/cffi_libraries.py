@@ -1,4 +1,4 @@
-"""Functions of the C library that nodes call through cffi, reported as those through ctypes."""
+"""Functions of the C library that nodes load through cffi, reported like those through ctypes."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import replace_attribute
-from rsltrace.guard.watched.audit_hook import FOREIGN
+from rsltrace.guard.rules import C_FUNCTIONS
 
 LOADS_LIBRARIES = "cffi.api"
 """The module of cffi that opens libraries (``ffi.dlopen``)."""
 
 
 class _Library:
-    """A library as cffi has it, which tells what is taken from it."""
+    """A library of cffi that reports the functions taken from it."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -25,20 +25,17 @@ class _Library:
         return getattr(self._real, name)
 
     def load_function(self, kind: Any, name: str) -> Any:
-        """Return a function; cffi keeps it and asks once."""
+        """Return a function; cffi keeps it and calls this once."""
         guard = engaged()
-        source = FOREIGN.get(name)
+        source = C_FUNCTIONS.get(name)
         if guard is not None and source is not None:
-            guard.watched(source, f"C library: {name}()", "", caller())
+            guard.report_user_call(source, f"C library: {name}()", "", caller())
         return self._real.load_function(kind, name)
 
 
 def watched_libraries(stack: ExitStack) -> None:
-    """Report what nodes take from libraries that they open from now on, until ``stack`` ends."""
+    """Report functions of libraries that nodes open from now on, until ``stack`` ends."""
     module = sys.modules[LOADS_LIBRARIES]
     real = getattr(module, "_load_backend_lib", None)
     if real is not None:
         replace_attribute(stack, module, "_load_backend_lib", lambda *given: _Library(real(*given)))
-
-
-__all__ = ["LOADS_LIBRARIES", "watched_libraries"]

@@ -155,7 +155,7 @@ class RunGuard:
         mode = guard.mode(Source.THREAD, frame)
         if mode is not Mode.ALLOW:
             call = f"the threads of TBB in {library}"
-            guard.found(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
+            guard.report(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
         """Write down what was found before there was a trace: when modules were imported."""

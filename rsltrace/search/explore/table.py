@@ -23,7 +23,7 @@ from typing import Any
 
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.trial import TrialResult, result_of
-from rsltrace.trace.model.regular_file import read_regular
+from rsltrace.trace.model.regular_file import read_regular, replacement_of
 
 RESULTS, SEARCH, LEARNED, TRACES = "results.jsonl", "search.json", "learned.jsonl", "traces"
 PAGE, PARQUET, SMALL = "report.html", "results.parquet", "small"
@@ -180,9 +180,8 @@ def _whole_rows(path: Path) -> list[TrialResult]:
 
 
 def _replace(path: Path, text: str) -> None:
-    other = path.with_name(f".{path.name}.new")
-    other.write_text(text)
-    os.replace(other, path)
+    with replacement_of(path) as work:
+        work.write_text(text)
 
 
 def _cannot_write(folder: Path, error: OSError) -> ExploreError:

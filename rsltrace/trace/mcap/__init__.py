@@ -1,1 +1,1 @@
-"""MCAP files, read with distrust and written in bulk. Traces and bags stand on this layer."""
+"""Reading and writing MCAP files, also damaged or hostile ones. Traces and bags use this layer."""

@@ -1,4 +1,4 @@
-"""CRC-32: as fast as the processor can, and of bytes whose parts have been summed already."""
+"""CRC-32: as fast as the processor allows, and of joined pieces with known checksums."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ except ImportError:  # a sourced ROS 2 with its own Python may not have it
 _POLYNOMIAL = 0xEDB88320
 
 _Matrix = tuple[int, ...]
-"""What appending zeros does to a CRC: linear over GF(2), a column per bit."""
+"""The effect of appended zeros on a CRC: linear over GF(2), a column per bit."""
 
 
 def joined_crc(first: int, second: int, length: int) -> int:
-    """Return the CRC-32 of two pieces one after the other; the second has ``length`` bytes.
+    """Return the CRC-32 of two pieces in sequence; the second has ``length`` bytes.
 
-    Takes some 20 microseconds for each of the length's bits that is set, whatever its size.
+    Takes some 20 microseconds per set bit of the length.
     """
     power = 0
     while length:
@@ -30,7 +30,7 @@ def joined_crc(first: int, second: int, length: int) -> int:
 
 
 def crc_of(parts: tuple[bytes, ...]) -> int:
-    """Return the CRC-32 of all parts, one after the other."""
+    """Return the CRC-32 of all parts in sequence."""
     crc = 0
     for part in parts:
         crc = crc32(part, crc)
@@ -39,7 +39,7 @@ def crc_of(parts: tuple[bytes, ...]) -> int:
 
 @cache
 def _zeros(power: int) -> _Matrix:
-    """Return what 2 ** power bytes of zeros do."""
+    """Return the effect of 2 ** power zero bytes."""
     if power == 0:
         bit = (_POLYNOMIAL, *(1 << n for n in range(31)))
         two = _squared(bit)

@@ -1,4 +1,4 @@
-"""The inside of a chunk: decompressed within limits, checked, and cut into messages."""
+"""Read chunks of MCAP messages: decompressed within limits and checked."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rsltrace.trace.mcap.records import (
     MESSAGE_HEAD,
     RECORD_HEAD,
     Damaged,
-    Span,
+    RecordSpan,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource
@@ -31,8 +31,8 @@ _HEAD_BYTES = RECORD_HEAD.size
 _MESSAGE_BYTES_MIN = MESSAGE_HEAD.size
 
 
-class MessageView(NamedTuple):
-    """A message in a chunk: header fields, and where its data lies in the chunk's records."""
+class ChunkMessage(NamedTuple):
+    """A message in a chunk: header fields, and the position of its data in the records."""
 
     channel_id: int
     sequence: int
@@ -42,12 +42,12 @@ class MessageView(NamedTuple):
 
 
 def read_chunk(
-    source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
+    source: ByteSource, span: RecordSpan, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
 ) -> bytes:
     """Return the records of the chunk at ``span``. Raises Damaged.
 
-    What is larger than ``size_max`` is refused before anything is unpacked. MCAP lets a writer
-    leave the CRC out by writing 0, and add fields to the end of a record; ``strict`` does not.
+    Chunks larger than ``size_max`` are refused before decompression. MCAP allows a CRC of 0 (none)
+    and extra fields at the end of a record; ``strict`` does not.
     """
     if span.length < _CHUNK_HEAD.size:
         raise Damaged(f"its length is given as {span.length}")
@@ -87,7 +87,7 @@ def _unzstd(data: memoryview, size: int) -> bytes:
     import zstandard
 
     try:
-        # The frame may claim any size; it must not be believed before memory is taken.
+        # The frame may claim any size, so check it before allocating memory.
         claimed = zstandard.frame_content_size(data)
         if claimed > size:
             raise Damaged(f"the chunk holds {claimed} bytes where {size} are promised")
@@ -107,9 +107,9 @@ def _unlz4(data: memoryview, size: int) -> bytes:
         raise Damaged(f"the chunk cannot be decompressed ({error})") from None
 
 
-def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
-    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none, or if it
-    is of another channel."""
+def message_at(records: bytes, offset: int, of_channel: int) -> ChunkMessage:
+    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none of that
+    channel."""
     if offset + _MESSAGE_BYTES_MIN > len(records):
         raise Damaged(f"no message fits at {offset} of the chunk")
     opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
@@ -118,17 +118,16 @@ def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
         raise Damaged(f"there is no whole message at {offset} of the chunk")
     if channel_id != of_channel:
         raise Damaged(f"the message at {offset} is of another channel than the index says")
-    return MessageView(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
+    return ChunkMessage(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
 
 
 def cut_messages(
     records: bytes, wanted: Mapping[int, int], first_ns: int, *, with_publish_time: bool = False
 ) -> list[tuple[int, int, bytes]]:
-    """Return (log time, number, data) of the wanted messages of a chunk by time, equal times as
-    they stand.
+    """Return (log time, number, data) of the wanted messages of a chunk, by time and then position.
 
-    ``wanted`` maps channel ids to numbers; ``with_publish_time`` puts it in front of the data,
-    8 bytes, little-endian. Raises Damaged when a record is cut off.
+    ``wanted`` maps channel ids to numbers. ``with_publish_time`` puts it before the data (8 bytes,
+    little-endian). Raises Damaged when a record is cut off.
     """
     # The publish time is the last field before the data.
     data_at = _MESSAGE_BYTES_MIN - (PUBLISH_TIME_BYTES if with_publish_time else 0)
@@ -150,7 +149,7 @@ def cut_messages(
                 ordered = False
             previous_ns = stamp_ns
         at = following
-    # What is left can only be records of other kinds, shorter than any message.
+    # The rest can only be other records, shorter than any message.
     if at > end or any(opcode == MESSAGE for opcode, _, _ in records_in(records[at:])):
         raise Damaged("a record runs past the end of its chunk")
     if not ordered:

@@ -1,7 +1,7 @@
-"""Descriptors of ours where user code does not come across them.
+"""File descriptors of rsltrace, out of the way of user code.
 
-A node may close every descriptor it can count to, or put files of its own in their place. So ours
-have high numbers, are asked who they are before they are used, and are gone in every other process.
+A node may close every descriptor by number, or replace it by a file of its own. So these have high
+numbers, are checked before use, and are closed in every child process.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ class Descriptor:
     """A descriptor that belongs to this process alone."""
 
     def __init__(self, fd: int) -> None:
-        """Take an open descriptor over, and move it out of the way."""
+        """Take over an open descriptor, and give it a high number."""
         status = os.fstat(fd)
         self.identity = (status.st_dev, status.st_ino)
-        """Which file it is of, whatever that is called."""
+        """The file, whatever its name."""
         self.number = _moved(fd)
         _all.add(self)
 
     @classmethod
     def copy_of(cls, fd: int) -> Descriptor:
-        """Return a descriptor of what ``fd`` is of, which stays as it is."""
+        """Return a descriptor of the file of ``fd``, which stays open."""
         return cls(os.dup(fd))
 
     def status(self) -> os.stat_result | None:
-        """Return the file's status, or None if the descriptor is no longer of that file."""
+        """Return the file's status, or None if the descriptor now belongs to another file."""
         try:
             status = os.fstat(self.number)
         except OSError:
@@ -45,7 +45,7 @@ class Descriptor:
         return status if (status.st_dev, status.st_ino) == self.identity else None
 
     def restore(self, number: int) -> None:
-        """Make ``number`` a descriptor of the same file again, unless it is one."""
+        """Make ``number`` a descriptor of the same file again, if it is not."""
         try:
             there = os.fstat(number)
         except OSError:
@@ -55,9 +55,9 @@ class Descriptor:
             os.dup2(self.number, number)
 
     def close(self) -> None:
-        """Close it; harmless when it is closed, or another file has its number now.
+        """Close it; harmless if it is closed or belongs to another file.
 
-        :raises OSError: if what was written did not reach the disk (network file systems).
+        :raises OSError: if written data did not reach the disk (network file systems).
         """
         ours = self.number >= 0 and self.status() is not None
         number, self.number = self.number, -1
@@ -66,7 +66,7 @@ class Descriptor:
 
 
 def _moved(fd: int) -> int:
-    """Return a copy of ``fd`` with a high number and close it; or ``fd``, where that fails."""
+    """Return a copy of ``fd`` with a high number and close it; ``fd`` if that fails."""
     if sys.platform == "win32":
         return fd
     limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]

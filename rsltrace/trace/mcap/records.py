@@ -1,7 +1,7 @@
-"""The records of MCAP, taken from bytes that may be damaged or hostile.
+"""The records of MCAP, parsed from bytes that may be damaged or hostile.
 
-The ``mcap`` package trusts lengths and loads what they say, and importing its records takes longer
-than opening a trace. Here every length is checked against what is there before it is used.
+The ``mcap`` package trusts lengths and loads that much, and importing its records takes longer than
+opening a trace. Here every length is checked before it is used.
 """
 
 from __future__ import annotations
@@ -12,53 +12,51 @@ from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
-# How much of anything is read from a file or a server before it is refused.
-#
-# What is in a file was written by anybody. These limits hold for traces and for bags; they are far
-# above what either has, and keep memory and time within what the file is asked for.
-# ``docs/trace-format.md`` states them for people.
+# Limits on what is read from a file or a server. Anybody may have written it. The limits hold for
+# traces and bags, are far above real ones, and bound memory and time. ``docs/trace-format.md``
+# lists them.
 
 MESSAGE_BYTES_MAX = 512 << 20
-"""The largest message that is recorded in a trace, and taken from a bag."""
+"""The largest message of a trace or a bag."""
 
 CHUNK_BYTES_MAX = MESSAGE_BYTES_MAX + (1 << 20)
-"""What a chunk may unpack to: one such message, and what was gathered before it."""
+"""The largest chunk after decompression: one such message and the messages before it."""
 
 RECORD_BYTES_MAX = CHUNK_BYTES_MAX + (1 << 20)
-"""The largest record that is read at once, as it stands in the file."""
+"""The largest record that is read at once."""
 
 SUMMARY_BYTES_MAX = 256 << 20
-"""The summary of a trace of a thousand million events has a quarter of this."""
+"""Four times the summary of a trace of a thousand million events."""
 
 ENTITY_ID_MAX = 1 << 24
-"""Ids count up, but not all that have one are in the trace. A diff makes a table by id."""
+"""Ids count up, but not every entity with one is in the trace. A diff makes a table by id."""
 
 FILE_GROWTH_MAX = 1000
 FILE_BYTES_MIN = 1 << 30
-"""A compressed bag file may unpack to so many times its size, and always to so much."""
+"""A compressed bag file may grow by the first factor, and always to the second size."""
 
 METADATA_YAML_BYTES_MAX = 4 << 20
-"""Some 4000 topics and their QoS; parsing takes 60 times as much memory, and 3 µs per byte."""
+"""Some 4000 topics with QoS; parsing takes 60 times the memory, and 3 µs per byte."""
 
 SCHEMA_BYTES_MAX = 256 << 10
-"""Of one type with all it depends on; parsing takes some 8 µs per character."""
+"""For one type and its dependencies; parsing takes some 8 µs per character."""
 
 SCHEMAS_BYTES_MAX = 4 << 20
-"""Of all types that are decoded of one trace."""
+"""For all types decoded from one trace."""
 
 SCHEMA_ITEMS_MAX = 4096
 SCHEMAS_ITEMS_MAX = 16384
-"""Items of all fixed arrays of strings or messages, in a schema and in all that are decoded of one
-trace: each becomes lines of code, and a thousand of them take a second."""
+"""Items of all fixed arrays of strings or messages, in a schema and in all decoded ones: each
+becomes lines of code, and a thousand take a second."""
 
 RESPONSE_BYTES_MAX = 64 << 20
-"""A server may know no ranges and send all; what is larger has to be downloaded by its owner."""
+"""A server without ranges sends the whole file; larger files must be downloaded first."""
 
 REQUEST_SECONDS_MAX = 60.0
-"""For one request to a server, however it spends them."""
+"""For one request to a server."""
 
 REMOTE_SECONDS_MAX = 600.0
-"""For all requests of one open file together."""
+"""For all requests of one open file."""
 
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -66,7 +64,7 @@ SCHEMA_ENCODING = "ros2msg"
 MESSAGE_ENCODING = "cdr"
 
 RECORD_HEAD = struct.Struct("<BQ")
-"""Opcode and length of the body, in front of every record."""
+"""Opcode and body length, before every record."""
 
 MESSAGE_HEAD = struct.Struct("<BQHIQQ")
 """A message up to its data: opcode, length, channel, sequence, log time, publish time."""
@@ -82,15 +80,15 @@ _CHANNEL_NUMBER = struct.Struct("<HQ")
 
 
 class Damaged(ValueError):
-    """The bytes are not what they should be. Who knows the file makes an error of it."""
+    """The bytes are not what they should be. Callers that know the file add its name."""
 
 
-class CutOff(Damaged):
-    """There is less of the file than of what should be in it."""
+class TruncatedFile(Damaged):
+    """The file ends too early."""
 
 
-class Span(NamedTuple):
-    """A whole record in the file, opcode and length included: where it is, and its bytes."""
+class RecordSpan(NamedTuple):
+    """The place of a whole record in the file, opcode and length included."""
 
     offset: int
     length: int
@@ -102,7 +100,7 @@ class Span(NamedTuple):
 
 
 class Fields:
-    """Takes fields off the front of a record's body. Every method raises Damaged at its end."""
+    """Reads fields from the front of a record's body. Every method raises Damaged at its end."""
 
     __slots__ = ("_data", "position")
 
@@ -112,7 +110,7 @@ class Fields:
 
     @property
     def at_end(self) -> bool:
-        """Whether everything was taken."""
+        """Whether everything was read."""
         return self.position == len(self._data)
 
     def take(self, length: int) -> bytes:
@@ -158,7 +156,7 @@ class Fields:
         return result
 
     def numbers(self) -> list[tuple[int, int]]:
-        """Return the next map of a number by channel."""
+        """Return the next map from channels to numbers."""
         data = self.take(self.u32())
         if len(data) % _CHANNEL_NUMBER.size:
             raise Damaged("a map is cut off")
@@ -177,14 +175,14 @@ class Fields:
         return Damaged(f"{length} bytes are expected where {left} are left")
 
 
-class Header(NamedTuple):
-    """The first record of the file: the profile (``ros2``) and what wrote it."""
+class McapHeader(NamedTuple):
+    """The first record of the file: the profile (``ros2``) and the writing library."""
 
     profile: str
     library: str
 
 
-class Schema(NamedTuple):
+class McapSchema(NamedTuple):
     """The definition of a type."""
 
     id: int
@@ -193,7 +191,7 @@ class Schema(NamedTuple):
     text: str
 
 
-class Channel(NamedTuple):
+class McapChannel(NamedTuple):
     """A topic with its encoding and metadata."""
 
     id: int
@@ -203,7 +201,7 @@ class Channel(NamedTuple):
     metadata: dict[str, str]
 
 
-class Statistics(NamedTuple):
+class McapStatistics(NamedTuple):
     """Totals of the file; ``counts`` are messages by channel."""
 
     messages: int
@@ -213,46 +211,46 @@ class Statistics(NamedTuple):
     counts: dict[int, int]
 
 
-class ChunkIndex(NamedTuple):
-    """Where a chunk is and the times in it. ``indexes`` says where its channels' indexes begin (of
-    none, if it has none), and ``end`` where the last of them is over."""
+class ChunkIndexEntry(NamedTuple):
+    """The place and times of a chunk. ``indexes`` are the offsets of its message indexes by
+    channel, ``end`` is behind the last of them."""
 
     start_ns: int
     end_ns: int
-    span: Span
+    span: RecordSpan
     indexes: list[tuple[int, int]]
     end: int
 
 
-def parse_header(body: bytes) -> Header:
-    """Parse a Header record. Raises Damaged, as all of these do."""
+def parse_header(body: bytes) -> McapHeader:
+    """Parse a Header record. All parsers raise Damaged."""
     fields = Fields(body)
-    return Header(fields.text(), fields.text())
+    return McapHeader(fields.text(), fields.text())
 
 
-def parse_schema(body: bytes) -> Schema:
+def parse_schema(body: bytes) -> McapSchema:
     """Parse a Schema record."""
     fields = Fields(body)
-    return Schema(fields.u16(), fields.text(), fields.text(), fields.text())
+    return McapSchema(fields.u16(), fields.text(), fields.text(), fields.text())
 
 
-def parse_channel(body: bytes) -> Channel:
+def parse_channel(body: bytes) -> McapChannel:
     """Parse a Channel record."""
     fields = Fields(body)
     channel_id, schema_id = fields.u16(), fields.u16()
-    return Channel(channel_id, schema_id, fields.text(), fields.text(), fields.mapping())
+    return McapChannel(channel_id, schema_id, fields.text(), fields.text(), fields.mapping())
 
 
-def parse_statistics(body: bytes) -> Statistics:
+def parse_statistics(body: bytes) -> McapStatistics:
     """Parse a Statistics record."""
     fields = Fields(body)
     messages = fields.u64()
     fields.take(14)  # how many schemas, channels, attachments and metadata records there are
     chunks, start_ns, end_ns = fields.u32(), fields.u64(), fields.u64()
-    return Statistics(messages, chunks, start_ns, end_ns, dict(fields.numbers()))
+    return McapStatistics(messages, chunks, start_ns, end_ns, dict(fields.numbers()))
 
 
-def parse_chunk_index(body: bytes) -> ChunkIndex:
+def parse_chunk_index(body: bytes) -> ChunkIndexEntry:
     """Parse a ChunkIndex record."""
     if len(body) < _CHUNK_INDEX_HEAD.size:
         raise Damaged("an entry of the list of chunks is cut off")
@@ -262,11 +260,11 @@ def parse_chunk_index(body: bytes) -> ChunkIndex:
         raise Damaged("an entry of the list of chunks is cut off")
     indexes = list(_CHANNEL_NUMBER.iter_unpack(body[_CHUNK_INDEX_HEAD.size : entries_end]))
     end = offset + length + _U64.unpack_from(body, entries_end)[0]
-    return ChunkIndex(start_ns, end_ns, Span(offset, length), indexes, end)
+    return ChunkIndexEntry(start_ns, end_ns, RecordSpan(offset, length), indexes, end)
 
 
 def channels_of_chunk_index(body: bytes) -> list[int]:
-    """Return the channels of a ChunkIndex, and nothing else of it: of thousands few are wanted."""
+    """Return only the channels of a ChunkIndex: of thousands few are needed."""
     if len(body) > _CHUNK_INDEX_HEAD.size + _CHANNEL_NUMBER.size:
         (size,) = _U32.unpack_from(body, _CHUNK_INDEX_HEAD.size - _U32.size)
         if size == _CHANNEL_NUMBER.size:  # events or outputs: most chunks

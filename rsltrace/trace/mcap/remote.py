@@ -1,8 +1,8 @@
-"""Traces that lie elsewhere: ranges fetched through fsspec, as few and as small as will do.
+"""Remote traces: byte ranges fetched through fsspec, as few and as small as possible.
 
-A request costs a round trip however little it brings, and a trace is read in many small pieces that
-lie close together. So whole blocks are fetched and kept, several at once when they follow each
-other, and a reader that goes through the file from front to back gets ever larger pieces.
+A request costs a round trip whatever its size, and a trace is read in many small pieces close
+together. So whole blocks are fetched and cached, neighbours together, and sequential reading
+fetches ever larger pieces.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from typing import Any, TypeVar
 
 from rsltrace.errors import SetupError, TraceError
 from rsltrace.trace.mcap import records as limits
-from rsltrace.trace.mcap.source import beyond_end, public, without_secrets
+from rsltrace.trace.mcap.source import public_address, range_problem, redacted
 
 T = TypeVar("T")
 
 BLOCK_BYTES = 32 << 10
-"""Small: what is fetched around a piece for nothing is half a block on either side."""
+"""Small: on average half a block is fetched in vain on either side."""
 
 CACHE_BYTES = 24 << 20
-"""Of a file that is diffed with another, all that matters fits in here."""
+"""Enough for everything that a diff reads of one file."""
 
 _AHEAD_BYTES_MAX = 4 << 20
 _IN_A_ROW = 4
-"""After so many fetches that follow each other the reader is taken to go on like that."""
+"""After this many neighbouring fetches, reading counts as sequential."""
 
 Fetch = Callable[[int, int], bytes]
 """``fetch(begin, end)`` returns the bytes ``begin <= offset < end``; may raise anything."""
 
 
 class RemoteSource:
-    """A ByteSource in blocks over ``fetch``. ``requests`` counts the calls of it."""
+    """A ByteSource of blocks from ``fetch``. ``requests`` counts its calls."""
 
     is_remote = True
 
@@ -52,22 +52,22 @@ class RemoteSource:
 
     @property
     def name(self) -> str:
-        """The address, without what is secret in it."""
+        """The address without secrets."""
         return self._name
 
     @property
     def size(self) -> int:
-        """Length in bytes when it was opened."""
+        """Length in bytes when opened."""
         return self._size
 
     @property
     def bytes_read(self) -> int:
-        """How many bytes were fetched so far."""
+        """The number of bytes fetched so far."""
         return self._bytes_read
 
     def read_at(self, offset: int, length: int) -> bytes:
-        """Return ``length`` bytes from ``offset``. Raises TraceError if they cannot be had."""
-        if problem := beyond_end(self, offset, length):
+        """Return ``length`` bytes from ``offset``. Raises TraceError if that fails."""
+        if problem := range_problem(self, offset, length):
             raise TraceError(problem)
         end = offset + length
         if self._whole is not None:
@@ -80,12 +80,12 @@ class RemoteSource:
         return b"".join(pieces)[offset - begin : end - begin]
 
     def close(self) -> None:
-        """Forget what was fetched."""
+        """Drop the cache."""
         self._blocks.clear()
         self._whole = None
 
     def _collect(self, first: int, last: int) -> list[bytes]:
-        """Return the blocks ``first <= number < last``; those that are missing are fetched."""
+        """Return the blocks ``first <= number < last``; fetch those that are missing."""
         pieces: dict[int, bytes] = {}
         missing: list[int] = []
         for number in range(first, last):
@@ -150,9 +150,9 @@ class RemoteSource:
 def open_remote(address: str) -> RemoteSource:
     """Open an address that fsspec knows. Raises TraceError if it is not there.
 
-    Raises SetupError if fsspec, or what it needs for this kind of address, is not installed.
+    Raises SetupError if fsspec, or a package for this kind of address, is not installed.
     """
-    name = public(address)
+    name = public_address(address)
     scheme = address.partition("://")[0]
     try:
         import fsspec
@@ -168,9 +168,9 @@ def open_remote(address: str) -> RemoteSource:
             "download the file"
         ) from error
     except ValueError as error:
-        reason = without_secrets(str(error), address)
+        reason = redacted(str(error), address)
         raise TraceError(f"{name} is no address that can be read: {reason}") from None
-    clock = _Clock(address)
+    clock = _RequestTimer(address)
     try:
         size = clock.within(lambda: filesystem.info(path)["size"])
     except FileNotFoundError:
@@ -193,8 +193,10 @@ def open_remote(address: str) -> RemoteSource:
 
 
 def _http_fetch(filesystem: Any, address: str) -> Fetch:
-    """Return what fetches a range over HTTP, and no more than a limit whatever the server sends:
-    fsspec's own takes all there is, of a server without end until there is no memory left."""
+    """Return a function that fetches a range over HTTP, with a limit on what it accepts.
+
+    fsspec itself reads all that a server sends, until memory is exhausted.
+    """
     from aiohttp import ClientTimeout
     from fsspec.asyn import sync
 
@@ -221,21 +223,21 @@ def _http_fetch(filesystem: Any, address: str) -> Fetch:
 
 
 class _FetchError(Exception):
-    """A range that could not be fetched, in words without secrets."""
+    """A failed fetch, described without secrets."""
 
 
-class _Clock:
-    """Bounds the time that is spent waiting for the server of one address."""
+class _RequestTimer:
+    """Limits the time spent waiting for one address."""
 
     def __init__(self, address: str) -> None:
         self._address = address
         self._left_s = limits.REMOTE_SECONDS_MAX
 
     def within(self, call: Callable[[], T]) -> T:
-        """Return what ``call`` does, or raise _FetchError when it takes too long.
+        """Return the result of ``call``, or raise _FetchError if it takes too long.
 
-        It goes on in a thread then, which ends with the process: a library that waits, for a name
-        server or for one byte after the other, cannot be stopped.
+        The call then continues in a daemon thread: a library that waits for a server cannot be
+        stopped.
         """
         answer: list[T | Exception] = []
 
@@ -264,5 +266,5 @@ class _Clock:
         return answer[0]
 
     def reason(self, error: Exception) -> str:
-        """Return an error of a library in words, without what is secret in the address."""
-        return without_secrets(str(error) or type(error).__name__, self._address)
+        """Return the text of a library's error without the secrets of the address."""
+        return redacted(str(error) or type(error).__name__, self._address)

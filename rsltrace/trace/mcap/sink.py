@@ -1,11 +1,10 @@
-"""The file a trace is written to: opened so that nothing is lost by mistake, every byte accounted.
+"""The file of a trace: opened so that nothing is overwritten by mistake, every byte checked.
 
-User code runs in the same process, and may close, delete, cut or rename whatever it likes. So who
-writes, to which file and where is checked before each write, and before a trace is said to be there
-the file is looked at once more. A trace that is replaced stays until the new one is whole: that is
-written beside it, and takes its name at the end.
+User code in the same process may close, delete, truncate or rename files. So each write first
+checks process, file and offset, and the finished file is checked once more. A replaced trace stays
+until the new one is complete: the new one is written beside it and renamed at the end.
 
-Errors here are the user's (no room, no permission, a file in the way), so each says what to do.
+Errors here are the user's (no space, no permission, a file in the way), so each says what to do.
 """
 
 from __future__ import annotations
@@ -28,29 +27,29 @@ if sys.platform != "win32":
 _OPEN = os.O_RDWR | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
 _OPEN |= getattr(os, "O_NOFOLLOW", 0)
 _READ_BACK_BYTES = 32 << 20
-"""Files up to this size are read back at the end, larger ones if somebody else has touched them."""
+"""Files up to this size are read back at the end, larger ones if something else touched them."""
 _PIECE_BYTES = 1 << 20
 _PARTS_MAX = 512
-"""How many parts one call writes; Linux takes 1024."""
+"""The number of parts in one call; Linux allows 1024."""
 
 
 def unfinished(path: Path) -> Path:
-    """Return where the trace that is to replace the one at ``path`` is, until it is whole."""
+    """Return the path of the trace that will replace the one at ``path``, while it is written."""
     real = Path(os.path.realpath(path)) if path.is_symlink() else path
     return real.with_name(f"{real.stem}.unfinished{real.suffix}")
 
 
 class Sink:
-    """An append-only file. ``offset`` is the bytes written, ``crc`` their CRC-32.
+    """An append-only file. ``offset`` is the number of bytes written, ``crc`` their CRC-32.
 
-    ``place`` is where they are: ``path``, or beside it as long as they replace a file.
+    ``place`` is the written file: ``path``, or beside it while that is to be replaced.
     """
 
     def __init__(self, path: Path, *, force: bool) -> None:
-        """Create the file; with ``force``, a trace (or other MCAP file) may be there.
+        """Create the file; with ``force``, a trace or other MCAP file may be there.
 
-        A killed run must leave a readable file under a name that the user knows, so the file has
-        no other name while it is written. Raises OutputError when it cannot be created.
+        A killed run must leave a readable file where the user expects it, so a new file has its
+        final name from the start. Raises OutputError when it cannot be created.
         """
         self.path = self.place = path
         self.offset = 0
@@ -58,14 +57,14 @@ class Sink:
         self._process = os.getpid()
         self._written_ns = -1
         self._touched = False
-        replaced = self._replaced = _to_be_replaced(path) if force else None
+        replaced = self._replaced = _replaceable_status(path) if force else None
         flags = _OPEN | os.O_CREAT
         if replaced is None:
             flags |= os.O_EXCL
         else:
             self.place = unfinished(path)
-            _check_free(self.place)
-        # A node may go to another folder.
+            _check_replaceable(self.place)
+        # A node may change the working directory.
         self._final = os.path.realpath(path)
         self._absolute = self._final
         if replaced is not None:
@@ -82,12 +81,12 @@ class Sink:
 
     @property
     def closed(self) -> bool:
-        """Whether the file was closed."""
+        """Whether the file is closed."""
         return self._descriptor.number < 0
 
     @property
     def kept(self) -> str:
-        """What to say of the file that was to be replaced, as long as it is not; else ""."""
+        """What to say about a file that should have been replaced and was not; else ""."""
         if self._replaced is None or self.place == self.path:
             return ""
         with suppress(OSError):
@@ -96,12 +95,11 @@ class Sink:
         return f"{self.path} was changed or deleted while the run went on, but not by rsltrace"
 
     def write(self, *parts: bytes, crc: int | None = None) -> None:
-        """Append ``parts``, which need not be joined before: they may be large.
+        """Append ``parts`` without joining them: they may be large.
 
-        ``crc`` is the CRC-32 of all of them, if it is known. Raises OSError; ``offset`` then counts
-        what reached the file.
+        ``crc`` is their CRC-32, if known. Raises OSError; ``offset`` then counts the written bytes.
 
-        :raises OutputError: if the file is not as it was left.
+        :raises OutputError: if the file was changed.
         """
         self._check()
         number = self._descriptor.number
@@ -112,7 +110,7 @@ class Sink:
             self.crc = joined_crc(self.crc, crc, sum(map(len, parts)))
         rest = [memoryview(part) for part in parts if part]
         while rest:
-            # A disk that fills up takes a part first and refuses the rest at the next call.
+            # A full disk first writes a part, and fails at the next call.
             count = os.pwritev(number, rest[:_PARTS_MAX], self.offset)
             self.offset += count
             while rest and count >= len(rest[0]):
@@ -122,9 +120,9 @@ class Sink:
         self._written_ns = os.fstat(number).st_mtime_ns
 
     def finish(self, *, replace: bool = True) -> None:
-        """Make sure that the file is what was written, close it and give it its name.
+        """Check the file against what was written, close it and give it its final name.
 
-        Without ``replace``, a trace that was there stays, and the new one where it is.
+        Without ``replace``, an older trace stays, and so does the new one beside it.
 
         :raises OSError: if the rest does not reach the disk.
         :raises OutputError: if the file is not what was written.
@@ -154,7 +152,7 @@ class Sink:
     # -- checks ------------------------------------------------------------------------------------
 
     def _check(self) -> os.stat_result:
-        """Make sure that it is us who write, and where we left off; return the file's status."""
+        """Check the process, the file and its size; return the file's status."""
         if os.getpid() != self._process:
             raise OutputError(
                 f"a process that was forked in the run has come back into it; the trace "
@@ -169,7 +167,7 @@ class Sink:
         return status
 
     def _opened_again(self) -> os.stat_result:
-        """Open the file once more: a node has closed our descriptor, or used its number."""
+        """Open the file again: a node closed the descriptor or used its number."""
         if self.closed:
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))
         again = Descriptor(os.open(self._absolute, _OPEN))
@@ -195,24 +193,24 @@ class Sink:
         )
 
     def _lock(self) -> None:
-        """Say to other runs that this file is being written; gone with the descriptor."""
+        """Lock the file against other runs; closing the descriptor unlocks it."""
         if not _locked(self._descriptor.number):
             self._descriptor.close()
-            raise _busy(self.place)
+            raise _busy_error(self.place)
         with suppress(OSError):
             if os.path.samestat(os.lstat(self._absolute), os.fstat(self._descriptor.number)):
                 return
         self._descriptor.close()  # renamed by who had the lock before us, or deleted
-        raise _busy(self.place)
+        raise _busy_error(self.place)
 
 
 def _version(status: os.stat_result) -> tuple[int, ...]:
-    """Return what tells a file from another one, or from itself with other bytes."""
+    """Return values that differ for another file, or for changed content."""
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _locked(fd: int) -> bool:
-    """Lock a file for writing; False if somebody else has. Some file systems have no locks."""
+    """Lock a file for writing; False if another process has. Some file systems have no locks."""
     if sys.platform == "win32":
         return True
     try:
@@ -224,28 +222,28 @@ def _locked(fd: int) -> bool:
     return True
 
 
-def _busy(path: Path) -> OutputError:
+def _busy_error(path: Path) -> OutputError:
     return OutputError(
         f"cannot write the trace {path}: another run is writing it; wait, or choose another place "
         "with -o"
     )
 
 
-def _to_be_replaced(path: Path) -> os.stat_result | None:
-    """Return the status of the trace that is there, None if nothing is.
+def _replaceable_status(path: Path) -> os.stat_result | None:
+    """Return the status of the existing trace, None if there is none.
 
-    :raises OutputError: if it is no trace (``-o job.yaml`` is a slip of the pen), or in the making.
+    :raises OutputError: if it is no trace (``-o job.yaml`` is a slip), or is being written.
     """
     try:
         status = path.stat()
     except OSError:
         return None  # creating it says what is wrong
-    _check_free(path)
+    _check_replaceable(path)
     return status
 
 
-def _check_free(path: Path) -> None:
-    """Make sure that what is there, if anything, is a trace that nobody writes."""
+def _check_replaceable(path: Path) -> None:
+    """Raise OutputError unless the existing file, if any, is a trace that nobody is writing."""
     try:
         kind = path.stat().st_mode
         if not stat.S_ISREG(kind):
@@ -257,11 +255,11 @@ def _check_free(path: Path) -> None:
         return  # creating it says what is wrong
     if not MAGIC.startswith(begin):
         raise OutputError(
-            f"cannot write the trace {path}: what is there is no trace (it is not MCAP); "
+            f"cannot write the trace {path}: the existing file is not a trace (not MCAP); "
             "remove it yourself, or choose another place with -o"
         )
     if not free:
-        raise _busy(path)
+        raise _busy_error(path)
 
 
 def _kind(mode: int) -> str:

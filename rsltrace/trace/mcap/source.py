@@ -1,8 +1,4 @@
-"""Where the bytes of a file come from: the one narrow place between readers and storage.
-
-Readers ask for ranges and nothing else, so a source that fetches ranges over the network can take
-the file's place.
-"""
+"""Sources of bytes: readers ask for ranges, whether of a file or over the network."""
 
 from __future__ import annotations
 
@@ -17,27 +13,48 @@ from urllib.parse import unquote, urlsplit
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.model.regular_file import not_regular
 
-# Addresses of files elsewhere, and what of them may be said in errors and reports.
+_ADDRESS_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""A path has one slash where an address has two; drives of Windows have one letter."""
+
+
+def open_source(place: Path | str) -> ByteSource:
+    """Open a file, or an address such as ``https://…`` or ``s3://…``. Raises TraceError.
+
+    Raises SetupError for an address if fsspec is not installed.
+    """
+    if isinstance(place, str) and "://" in place:
+        from rsltrace.trace.mcap.remote import open_remote  # a library that local files do not need
+
+        return open_remote(place)
+    if _ADDRESS_AS_PATH.match(str(place)) and not Path(place).exists():
+        address = public_address(str(place).replace(":/", "://", 1))
+        raise TraceError(f"{address} is an address, which only `rsltrace diff` reads; download it")
+    return FileSource(Path(place))
+
+
+# Secrets in addresses, kept out of errors and reports.
 
 _SIGNS_MIN = 3
-"""Shorter pieces of an address are not taken out of texts: they would be found in any word."""
+"""Shorter pieces of an address are kept in texts: they occur in any word."""
 
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"<>)\]}]+")
 
 
-def public(address: str) -> str:
-    """Return an address without user name, password, query (signed ones give access) and fragment.
+def public_address(address: str) -> str:
+    """Return an address without user name, password, query (which may grant access) and fragment.
 
-    An ellipsis stands for a query, so that nobody takes what is shown for the whole.
+    An ellipsis replaces a query, so that the result is not mistaken for the whole.
     """
     address = re.sub(r"(?<=://)[^/?#]*@", "", address.partition("#")[0])
     plain, query, _ = address.partition("?")
     return f"{plain}?…" if query else plain
 
 
-def without_secrets(text: str, address: str) -> str:
-    """Return ``text``, which a library may have made of ``address``, with what is public of it."""
-    text = _ADDRESS.sub(lambda found: public(found[0]), text.replace(address, public(address)))
+def redacted(text: str, address: str) -> str:
+    """Return a library's text about ``address`` without the secrets in it."""
+    text = _ADDRESS.sub(
+        lambda found: public_address(found[0]), text.replace(address, public_address(address))
+    )
     try:
         parts = urlsplit(address)
     except ValueError:  # no address at all
@@ -50,11 +67,11 @@ def without_secrets(text: str, address: str) -> str:
 
 
 class ByteSource(Protocol):
-    """Random access to bytes that do not change. ``name`` is what error messages call it."""
+    """Random access to unchanging bytes. ``name`` is used in error messages."""
 
     @property
     def name(self) -> str:
-        """A path, or an address without what is secret in it."""
+        """A path, or an address without secrets."""
         ...
 
     @property
@@ -64,24 +81,24 @@ class ByteSource(Protocol):
 
     @property
     def bytes_read(self) -> int:
-        """How many bytes were fetched from the storage so far."""
+        """The number of bytes fetched from storage so far."""
         ...
 
     @property
     def is_remote(self) -> bool:
-        """Whether reading all of it would take long."""
+        """Whether reading all of it takes long."""
         ...
 
     def read_at(self, offset: int, length: int) -> bytes:
-        """Return exactly ``length`` bytes from ``offset``. Raises an error if it cannot."""
+        """Return exactly ``length`` bytes from ``offset``, or raise an error."""
         ...
 
     def close(self) -> None:
-        """Let go of the storage; a second call does nothing."""
+        """Close the storage; a second call does nothing."""
         ...
 
 
-def beyond_end(source: ByteSource, offset: int, length: int) -> str:
+def range_problem(source: ByteSource, offset: int, length: int) -> str:
     """Return what is wrong with a range that is not in the file, "" if it is."""
     if offset + length <= source.size:
         return ""
@@ -97,7 +114,7 @@ class FileSource:
     is_remote = False
 
     def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
-        """Open ``path``. Raises ``error``, as all methods do, if it cannot be read as a file."""
+        """Open ``path``. Raises ``error``, as all methods do, if it cannot be read."""
         self._path = path
         self._error = error
         self._lock = threading.Lock()
@@ -124,17 +141,17 @@ class FileSource:
 
     @property
     def size(self) -> int:
-        """Length in bytes when the file was opened."""
+        """Length in bytes when opened."""
         return self._size
 
     @property
     def bytes_read(self) -> int:
-        """How many bytes were read from the file so far."""
+        """The number of bytes read so far."""
         return self._bytes_read
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``."""
-        if problem := beyond_end(self, offset, length):
+        if problem := range_problem(self, offset, length):
             raise self._error(problem)
         try:
             data = self._read(offset, length)
@@ -159,7 +176,7 @@ class FileSource:
                     self._file.seek(offset)
                     piece = self._file.read(length)
             else:
-                # Does not move a file position, which a forked process would share.
+                # pread does not move the file position, which a forked process would share.
                 piece = os.pread(self._file.fileno(), length, offset)
             if not piece:
                 break

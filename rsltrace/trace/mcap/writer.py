@@ -1,6 +1,6 @@
-"""An MCAP file being written, record by record, with its summary at the end.
+"""Write an MCAP file record by record, with its summary at the end.
 
-This layer knows MCAP and the disk but not what a trace is: that is ``writer``.
+This layer knows MCAP and the disk but not what a trace is: see ``rsltrace.trace.writer``.
 """
 
 from __future__ import annotations
@@ -8,44 +8,179 @@ from __future__ import annotations
 import errno
 import os
 import struct
+import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import zstandard
-from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Attachment,
+    AttachmentIndex,
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
 
 from rsltrace.errors import OutputError
 from rsltrace.trace.mcap.checksum import crc32, crc_of, joined_crc
-from rsltrace.trace.mcap.chunk_body import ChunkBody
+from rsltrace.trace.mcap.chunk_builder import ChunkBody
 from rsltrace.trace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
 from rsltrace.trace.mcap.sink import Sink
-from rsltrace.trace.mcap.summary_writer import SummaryBuilder, record_bytes
+
+# The end of an MCAP file, where readers look first. The writer reports each record, and the summary
+# keeps what it needs in its final form.
+
+_FOOTER_BEFORE_CRC = struct.Struct("<BQQQ")
+_FOOTER_BYTES = 20
+
+
+def record_bytes(record: McapRecord) -> bytes:
+    """Return ``record`` as in the file, opcode and length included."""
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]  # mcap leaves it bare
+
+
+class SummaryBuilder:
+    """Collects the summary section. Memory: about 100 bytes per chunk."""
+
+    def __init__(self) -> None:
+        self.schemas: list[Schema] = []
+        self.channels: list[Channel] = []
+        self.message_counts: dict[int, int] = {}
+        self.start_ns = 0
+        self.end_ns = 0
+        self._chunk_count = 0
+        self._chunk_indexes = bytearray()
+        self._attachment_indexes: list[AttachmentIndex] = []
+        self._metadata_indexes: list[MetadataIndex] = []
+
+    @property
+    def message_count(self) -> int:
+        """The number of messages in all chunks so far."""
+        return sum(self.message_counts.values())
+
+    def add_chunk(
+        self, body: ChunkBody, *, offset: int, length: int, compression: str, compressed_size: int
+    ) -> None:
+        """Add a chunk at ``offset`` with ``length`` bytes, directly followed by its indexes."""
+        if not self._chunk_count:
+            self.start_ns, self.end_ns = body.start_ns, body.end_ns
+        self.start_ns = min(self.start_ns, body.start_ns)
+        self.end_ns = max(self.end_ns, body.end_ns)
+        self._chunk_count += 1
+        index_offsets = {}
+        position = offset + length
+        for channel_id, count, record in body.indexes:
+            index_offsets[channel_id] = position
+            position += len(record)
+            self.message_counts[channel_id] = self.message_counts.get(channel_id, 0) + count
+        index = ChunkIndex(
+            chunk_length=length,
+            chunk_start_offset=offset,
+            compression=compression,
+            compressed_size=compressed_size,
+            message_end_time=body.end_ns,
+            message_index_length=position - offset - length,
+            message_index_offsets=index_offsets,
+            message_start_time=body.start_ns,
+            uncompressed_size=body.size,
+        )
+        # Kept as bytes: a long run has a million chunks, and objects would be ten times as large.
+        self._chunk_indexes += record_bytes(index)
+
+    def add_attachment(
+        self, name: str, media_type: str, *, size: int, offset: int, length: int
+    ) -> None:
+        """Add an attachment of ``size`` bytes whose record is at ``offset``."""
+        self._attachment_indexes.append(
+            AttachmentIndex(
+                offset=offset,
+                length=length,
+                log_time=0,
+                create_time=0,
+                data_size=size,
+                name=name,
+                media_type=media_type,
+            )
+        )
+
+    def add_metadata(self, name: str, *, offset: int, length: int) -> None:
+        """Add a metadata record at ``offset``."""
+        self._metadata_indexes.append(MetadataIndex(offset=offset, length=length, name=name))
+
+    def tail(self, summary_start: int) -> bytes:
+        """Return summary section and footer of a file whose data section ends here."""
+        statistics = Statistics(
+            attachment_count=len(self._attachment_indexes),
+            channel_count=len(self.channels),
+            channel_message_counts=dict(sorted(self.message_counts.items())),
+            chunk_count=self._chunk_count,
+            message_count=self.message_count,
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns,
+            metadata_count=len(self._metadata_indexes),
+            schema_count=len(self.schemas),
+        )
+        groups = (
+            (Opcode.SCHEMA, b"".join(map(record_bytes, self.schemas))),
+            (Opcode.CHANNEL, b"".join(map(record_bytes, self.channels))),
+            (Opcode.STATISTICS, record_bytes(statistics)),
+            (Opcode.CHUNK_INDEX, bytes(self._chunk_indexes)),
+            (Opcode.ATTACHMENT_INDEX, b"".join(map(record_bytes, self._attachment_indexes))),
+            (Opcode.METADATA_INDEX, b"".join(map(record_bytes, self._metadata_indexes))),
+        )
+        summary = bytearray()
+        offsets = bytearray()
+        for opcode, group in groups:
+            if group:
+                start = summary_start + len(summary)
+                offsets += record_bytes(SummaryOffset(opcode, start, len(group)))
+                summary += group
+        offsets_start = summary_start + len(summary)
+        summary += offsets
+        covered = _FOOTER_BEFORE_CRC.pack(
+            Opcode.FOOTER, _FOOTER_BYTES, summary_start, offsets_start
+        )
+        crc = zlib.crc32(covered, zlib.crc32(summary))
+        return bytes(summary) + record_bytes(Footer(summary_start, offsets_start, crc))
+
 
 CHANNELS_MAX = 2**16 - 1
 _U64 = struct.Struct("<Q")
 _ZSTD_LEVEL = 1
-"""Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
+"""Level 3 saves little space for ten times the time."""
 
 _SAMPLES = 32
 _SAMPLE_BYTES = 16 << 10
 _PAYS = 0.8
-"""Of each large message so many pieces are compressed to see what it gives."""
+"""A large message is compressed only if samples shrink to this factor."""
 
 _TRUSTED = 15
-"""So many large messages of a topic are not looked at after one that did not get smaller."""
+"""The number of a topic's large messages stored without a test after one that did not shrink."""
 
 _ROWS = zstandard.ZstdCompressionParameters.from_level(
     _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
 )
-"""For rows of one size, which resemble the rows just before them: with a small table of what was
-seen, which stays in the processor's nearest cache, they take four fifths of the time and no more
-room."""
+"""For rows of one size, which resemble those just before: a small table, which stays in the nearest
+cache, takes four fifths of the time and no more space."""
 
 
 class McapWriter:
     """Writes records in order. Every method raises OutputError when the disk refuses.
 
-    ``progress`` says in words what was written so far, for that message.
+    ``progress`` describes what was written so far, for that error.
     """
 
     def __init__(
@@ -78,19 +213,18 @@ class McapWriter:
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._failure: OutputError | None = None
 
-    def trust_as(self, other: McapWriter) -> None:
-        """Know of the topics' large messages what another writer knows: what has been packed by it
-        comes before what is packed here."""
+    def copy_compressibility(self, other: McapWriter) -> None:
+        """Take over what another writer, whose chunks come first, knows of large messages."""
         self._trusted = dict(other._trusted)
 
     @property
     def place(self) -> Path:
-        """Where the file is: beside the one that it replaces, until it is finished."""
+        """The written file: beside the one that it replaces, until it is finished."""
         return self._sink.place
 
     @property
     def kept(self) -> str:
-        """What to say of the file that it should have replaced and has not; else ""."""
+        """What to say about a file that should have been replaced and was not; else ""."""
         return self._sink.kept
 
     @property
@@ -100,7 +234,7 @@ class McapWriter:
 
     @property
     def closed(self) -> bool:
-        """Whether the file was finished or given up."""
+        """Whether the file was finished or aborted."""
         return self._sink.closed
 
     @property
@@ -127,7 +261,7 @@ class McapWriter:
         channel_id = len(self._summary.channels) + 1
         if channel_id > CHANNELS_MAX:
             raise OutputError(
-                f"{self._sink.path}: {topic} is one topic too many: a trace has room for "
+                f"{self._sink.path}: {topic} is one topic too many: a trace can hold "
                 f"{CHANNELS_MAX}; leave topics out (record: in the job)"
             )
         schema_id = self._schema_ids.get((type_name, schema_text))
@@ -166,7 +300,7 @@ class McapWriter:
     def packed_chunk(
         self, body: ChunkBody, compression: str, data: tuple[bytes, ...], crc: int
     ) -> tuple[int, int]:
-        """Write a chunk whose data are there as ``packed`` returns them."""
+        """Write a chunk whose data was made by ``packed``."""
         size = sum(map(len, data))
         head = record_bytes(
             Chunk(
@@ -178,7 +312,7 @@ class McapWriter:
                 uncompressed_size=body.size,
             )
         )
-        # The data are written as they are, not copied behind their head first.
+        # The data is not copied behind its head.
         head = head[:1] + _U64.pack(len(head) - 9 + size) + head[9:-8] + _U64.pack(size)
         offset, length = self._sink.offset, len(head) + size
         indexes = b"".join(index for _, _, index in body.indexes)
@@ -197,15 +331,15 @@ class McapWriter:
         return offset, length
 
     def packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...], int]:
-        """Return the compression of a chunk, its data in parts, and their CRC-32 as they were."""
+        """Return a chunk's compression, its data in parts, and the CRC-32 before compression."""
         return *self._packed(body), crc_of(body.parts)
 
     def _packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...]]:
         """Return the compression of a chunk, and its data in parts.
 
-        Compressing what does not get smaller takes as long as writing it; of large messages a
-        sample tells, and of its topic's next ones too. It is a function of their bytes, so equal
-        runs give equal files.
+        Compressing what does not shrink takes as long as writing it, so samples of large messages
+        decide, for the topic's next ones, too. Only the bytes matter, so equal runs give equal
+        files.
         """
         if not self._compression:
             return "", body.parts
@@ -229,9 +363,9 @@ class McapWriter:
         return packed < _PAYS * total
 
     def finish(self, *, replace: bool = True) -> None:
-        """Write the end of the file, make sure that it is there, and close it.
+        """Write the end of the file, check the file, and close it.
 
-        With ``replace``, it takes the place of the file that was there.
+        With ``replace``, it replaces the file that was there.
         """
         self._write(record_bytes(DataEnd(self._sink.crc)))
         self._write(self._summary.tail(self._sink.offset) + MAGIC)
@@ -248,10 +382,10 @@ class McapWriter:
             pass  # there is nothing left to save, and the error that led here is the one to show
 
     def poison(self) -> None:
-        """Refuse all further records, because one was left half written or half noted.
+        """Refuse all further records, because one may be incomplete.
 
-        An exception out of a signal handler (KeyboardInterrupt) can come between any two steps of
-        a write. Going on would put a whole record after a half one; an interrupted file is better.
+        KeyboardInterrupt can occur between any two steps of a write. Appending a whole record to
+        half a one would be worse than an interrupted file.
         """
         if self._failure is None:
             self._failure = OutputError(

@@ -1,1 +1,1 @@
-"""Frozen values that every layer shares: times, entities, events. No behaviour, no imports."""
+"""Frozen values that every layer shares: times, entities, events."""

@@ -1,4 +1,4 @@
-"""What full queues dropped in a run, as a trace keeps it."""
+"""Messages that full queues dropped in a run, as a trace records them."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ _KEPT = 10_000
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """How many arrivals a queue of ``depth`` dropped because it was full: that of the receiver with
-    an id in the trace or, ``in_outage``, that of a publisher which could not reach it."""
+    """How many messages a full queue of ``depth`` dropped: that of the receiving entity or,
+    ``in_outage``, that of a publisher that could not reach it."""
 
     entity: int
     depth: int
@@ -21,13 +21,13 @@ class Drop:
 
 
 def kept_drops(drops: Iterable[Drop]) -> dict[str, str]:
-    """Return what the result of a run says of its drops."""
+    """Return the entry of a run's result for its drops."""
     kept = [astuple(one) for one in drops][:_KEPT]
     return {"drops": json.dumps(kept)} if kept else {}
 
 
 def drops_of(result: Mapping[str, str]) -> list[Drop]:
-    """Return the drops of a result; none if they were not written by us."""
+    """Return the drops of a result; none if another program wrote them."""
     try:
         return [
             Drop(int(entity), int(depth), int(count), bool(in_outage))

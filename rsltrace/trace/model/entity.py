@@ -1,4 +1,4 @@
-"""What can run a callback or produce an output: the entities of a ROS graph."""
+"""The entities of a ROS graph: what can run a callback or produce an output."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ class EntityKind(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name used on screens: ``guard condition``."""
+        """The displayed name: ``guard condition``."""
         return self.name.lower().replace("_", " ")
 
 
 WITH_TOPIC = frozenset(
     (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
 )
-"""Kinds of entities whose name is that of a topic or service."""
+"""Kinds of entities named after a topic or service."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entity:
-    """One entity of the graph as the trace knows it.
+    """One entity of the graph.
 
-    ``id`` counts up in creation order and is never reused. ``node`` is the id of the owning node
-    (a node owns itself; 0 is the run). ``name`` is the fully qualified topic, service or node
-    name; a timer, guard condition or task is named after its callback. ``type`` is the interface
-    (``std_msgs/msg/UInt64``) or empty. ``detail`` holds what only one kind has (QoS, period_ns,
+    ``id`` counts up in creation order and is never reused. ``node`` is the id of the owning node (a
+    node owns itself; 0 is the run). ``name`` is the fully qualified topic, service or node name; a
+    timer, guard condition or task is named after its callback. ``type`` is the interface
+    (``std_msgs/msg/UInt64``) or empty. ``detail`` has what only some kinds have (QoS, period_ns,
     callback, source) as JSON-compatible values.
     """
 
@@ -57,6 +57,6 @@ class Entity:
 
     @property
     def source(self) -> str:
-        """Where the function that its events run is defined, ``module.py:24``; "" if unknown."""
+        """Where the function of its events is defined, ``module.py:24``; "" if unknown."""
         source = self.detail.get("source")
         return source if isinstance(source, str) else ""

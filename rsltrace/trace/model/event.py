@@ -1,4 +1,4 @@
-"""What the loop does (events) and what an event does that others can see (outputs)."""
+"""Events: what the loop runs. Outputs: what an event does that others can see."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from enum import IntEnum, IntFlag
 
 from rsltrace.trace.model.texts import format_duration
 
-# A place in user code, as far as a run has met it: where outputs come from, what callbacks run.
-
 
 @dataclass(frozen=True, slots=True)
 class CodeLine:
-    """``place`` is ``package/module.py:24``, ``function`` the name of the function it is in.
+    """A line of user code that a run noted: where outputs come from, or what callbacks run.
 
-    ``event`` is the first, of the callback that ran in it, from which output number ``output`` of
-    ``entity`` came from there; with ``NO_SEQUENCE`` as output, the first event of ``entity`` that
-    ran the function defined there. Without a place, it says that what the same callback sends
-    through ``entity`` after that output is looked at now and then only.
+    ``place`` is ``package/module.py:24``, ``function`` the surrounding function. ``event`` is the
+    first whose output number ``output`` of ``entity`` came from there; with ``NO_SEQUENCE`` as
+    output, the first event of ``entity`` that ran the function defined there. Without a place, only
+    some later outputs of the same callback through ``entity`` are noted.
     """
 
     event: int
@@ -27,18 +25,16 @@ class CodeLine:
     function: str
 
 
-# What chance, or a fault of the job, decided, as one number that a trace holds in place of an
-# output's hash.
-#
-# The upper 8 bits say what, the lower 56 how many nanoseconds (of a switch between threads: before
-# which line). It is no hash: a reader gets the value back, so that a diff can name it.
+# A random decision, or a fault of the job, as one number in place of an output's hash. The upper 8
+# bits are the kind, the lower 56 a duration in nanoseconds (for a switch between threads: the
+# line). It is no hash, so a diff can show it.
 
 _SHIFT = 56
 _VALUE_MAX = (1 << _SHIFT) - 1
 
 
 class Draw(IntEnum):
-    """What was decided. The numbers are part of the trace format."""
+    """Kinds of decisions. The numbers are part of the trace format."""
 
     DELAY = 1
     DROP = 2
@@ -77,18 +73,18 @@ def encode_draw(kind: int, value_ns: int = 0) -> int:
 
 
 def encode_clock(by_ns: int) -> int:
-    """Return the number for a clock that has been set by this much."""
+    """Return the number for a clock that was set by this much."""
     return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
 
 
 def kind_of(number: int) -> Draw | None:
-    """Return what was decided, None where a later version knows it."""
+    """Return the kind of a decision, None if a newer version wrote it."""
     kind = number >> _SHIFT
     return Draw(kind) if kind in {int(one) for one in Draw} else None
 
 
 def is_switch(number: int) -> bool:
-    """Whether a decision lets another thread go on in the middle of a callback."""
+    """Whether a decision lets another thread continue in the middle of a callback."""
     return number >> _SHIFT == Draw.SWITCH
 
 
@@ -98,12 +94,12 @@ def is_second_copy(number: int) -> bool:
 
 
 def duration_of(number: int, kind: Draw) -> int | None:
-    """Return how many nanoseconds a decision of that kind says, None if it is of another kind."""
+    """Return the duration of a decision of that kind in nanoseconds, None for another kind."""
     return number & _VALUE_MAX if number >> _SHIFT == kind else None
 
 
 def draw_text(number: int, digits: int = 6) -> str:
-    """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``; times with some digits."""
+    """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
     draw, value_ns = kind_of(number), number & _VALUE_MAX
     duration = format_duration(value_ns, digits)
     if draw is None:
@@ -129,11 +125,11 @@ NO_SEQUENCE = 2**32 - 1
 
 
 SEGMENT_EVENTS = 4096
-"""How many events are written to a trace together, unless a job says fewer."""
+"""The number of events written to a trace together, unless a job sets fewer."""
 
 
 class EventKind(IntEnum):
-    """Kinds of dispatches by the loop. The numbers are part of the trace format."""
+    """Kinds of events. The numbers are part of the trace format."""
 
     CONSTRUCT = 1
     TIMER = 2
@@ -153,7 +149,7 @@ class EventKind(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name used on screens and in ``--json``: ``guard_condition``."""
+        """The name shown, also with ``--json``: ``guard_condition``."""
         return self.name.lower()
 
 
@@ -182,16 +178,16 @@ class OutputKind(IntEnum):
 
     @property
     def label(self) -> str:
-        """The name used on screens and in ``--json``."""
+        """The name shown, also with ``--json``."""
         return self.name.lower()
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """One dispatch by the loop, as the trace holds it. Hashes are unsigned 64-bit integers.
+    """One event of the loop. Hashes are unsigned 64-bit integers.
 
-    ``stamp_ns`` is simulated time. ``cause_event`` and ``cause_output`` name the event (and which
-    of its outputs) that produced the input, or ``NO_EVENT``.
+    ``stamp_ns`` is simulated time. ``cause_event`` and ``cause_output`` name the event, and its
+    output, that produced the input; or ``NO_EVENT``.
     """
 
     index: int
@@ -210,10 +206,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """One thing an event did that others can see.
+    """Something that an event did and others can see.
 
     ``event`` is the index of the event, ``entity`` what did it, ``hash`` covers the content.
-    ``sequence`` finds the payload among the messages of its channel, or is ``NO_SEQUENCE``.
+    ``sequence`` is the number of the payload in its channel, or ``NO_SEQUENCE``.
     """
 
     event: int

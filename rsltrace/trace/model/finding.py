@@ -1,4 +1,4 @@
-"""Sources of nondeterminism, what is done about each, and what was seen of them in a run."""
+"""Sources of nondeterminism, the policy for each, and the findings of a run."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from enum import Enum
 
 from rsltrace.trace.model.texts import printable
 
-# Functions of rclpy that no simulation calls, because the loop does their work itself.
-#
-# Whoever replaces one (a monitoring library, say) waits in vain: a run tells of it, and so does
-# ``audit``.
+# Functions of rclpy that no simulation calls, because the loop does their work. Code that replaces
+# one (a monitoring library) is never called; ``record`` and ``audit`` report it.
 
 _TAKES = (
     *("_take_timer", "_take_subscription", "_take_client", "_take_service"),
@@ -34,11 +32,9 @@ NEVER_CALLED: dict[str, tuple[str, ...]] = {
     "rclpy.callback_groups.MutuallyExclusiveCallbackGroup": _GROUP,
     "rclpy.callback_groups.ReentrantCallbackGroup": _GROUP,
 }
-"""The methods by the names of their classes. A subclass of a callback group is asked, and so is an
-executor's ``wait_for_ready_callbacks``."""
+"""Method names by class. Subclasses of callback groups are called, and so is an executor's
+``wait_for_ready_callbacks``."""
 
-
-# Calls that waited until the end of a run, as a trace keeps them.
 
 _KEPT = 10
 _HELD_KEPT = 1000
@@ -46,8 +42,8 @@ _HELD_KEPT = 1000
 
 @dataclass(frozen=True, slots=True)
 class EndlessWait:
-    """A call that waited until the end of a run and that no time would have ended: since when (ns),
-    who waited for what, and the ids of the entities it ``held`` back meanwhile."""
+    """A call that still waited at the end of a run and could not time out: since when (ns), who
+    waits for what, and the ids of the entities it ``held`` back."""
 
     since_ns: int
     text: str
@@ -55,13 +51,13 @@ class EndlessWait:
 
 
 def kept_waits(waits: Iterable[EndlessWait]) -> dict[str, str]:
-    """Return what the result of a run says of its waits."""
+    """Return the entry of a run's result for its endless waits."""
     kept = [(one.since_ns, one.text, one.held[:_HELD_KEPT]) for one in waits][:_KEPT]
     return {"waits": json.dumps(kept)} if kept else {}
 
 
 def waits_of(result: Mapping[str, str]) -> list[EndlessWait]:
-    """Return the waits of a result, each in one line; none if they were not written by us."""
+    """Return the endless waits of a result, one line each; none if another program wrote them."""
     try:
         return [
             EndlessWait(
@@ -74,7 +70,7 @@ def waits_of(result: Mapping[str, str]) -> list[EndlessWait]:
 
 
 class Source(str, Enum):
-    """Kinds of calls whose answer comes from outside of the run, or from chance."""
+    """Sources of nondeterminism: kinds of calls with answers from outside, or random ones."""
 
     CLOCK = "clock"
     RANDOM = "random"
@@ -90,10 +86,10 @@ class Source(str, Enum):
 
 
 class Mode(str, Enum):
-    """What is done about a source.
+    """What the guard does about a source.
 
-    ``virtual``: the answer is made by the run; ``record``: the real answer is kept in the trace, to
-    be given again; ``warn``: the call is a finding; ``error``: it ends the run; ``allow``: nothing.
+    ``virtual``: the run answers; ``record``: the trace keeps the real answer for a re-run;
+    ``warn``: the call is a finding; ``error``: it ends the run; ``allow``: nothing.
     """
 
     VIRTUAL = "virtual"
@@ -104,7 +100,7 @@ class Mode(str, Enum):
 
 
 READ_BY = ", read by "
-"""Stands between an environment variable and the library that reads it, in what was called."""
+"""Separates an environment variable and the library that reads it, in the text of a call."""
 
 _ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
 MODES: Mapping[Source, tuple[Mode, ...]] = {
@@ -120,7 +116,7 @@ MODES: Mapping[Source, tuple[Mode, ...]] = {
     Source.ADDRESS: _ALWAYS,
     Source.ORDER: (Mode.VIRTUAL, *_ALWAYS),
 }
-"""What can be done about each source."""
+"""The possible modes of each source."""
 
 DEFAULT_MODES: Mapping[Source, Mode] = {
     source: Mode.VIRTUAL if Mode.VIRTUAL in modes else Mode.WARN for source, modes in MODES.items()
@@ -129,10 +125,10 @@ DEFAULT_MODES: Mapping[Source, Mode] = {
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """What is done about each source in the code of one node, and which modules are exempt.
+    """The mode of each source in the code of one node, and the exempt modules.
 
-    ``allowed`` holds globs of module names by source. ``state`` is empty, ``true`` (hashed after
-    each callback) or ``record`` (its attributes are kept, too).
+    ``allowed`` has globs of module names by source. ``state`` is empty, ``true`` (hashed after each
+    callback) or ``record`` (attributes are recorded, too).
     """
 
     modes: Mapping[Source, Mode] = field(default_factory=lambda: DEFAULT_MODES)
@@ -144,8 +140,8 @@ class Policy:
 class Finding:
     """A call that could make runs differ.
 
-    ``event`` is the index of the event it happened in, ``entity`` what ran. ``call`` names the call
-    (``os.environ['HOME']``), ``value`` is what it gave, as text; ``stack`` the lines of user code
+    ``event`` is the index of its event, ``entity`` what ran. ``call`` is the call
+    (``os.environ['HOME']``), ``value`` its answer as text; ``stack`` has the lines of user code
     that led to it, innermost first, one per line.
     """
 
@@ -171,5 +167,5 @@ class GuardCount:
 
     @property
     def is_finding(self) -> bool:
-        """Whether runs may differ because of it: it was not made by the run itself."""
+        """Whether runs may differ because of it: the run did not answer it."""
         return self.mode is not Mode.VIRTUAL

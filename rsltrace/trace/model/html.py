@@ -1,6 +1,7 @@
-"""What a notebook shows of an object: small tables of HTML, in which every text is only a text.
+"""HTML for notebooks: small tables in which every text is plain text.
 
-Names come from traces, and a trace may come from anybody: nothing is markup, and all is bounded.
+Names come from traces, and a trace may come from anybody: nothing is markup, and everything is
+bounded.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ _LEFT = {"style": "text-align: left; vertical-align: top"}
 
 
 class Sheet:
-    """A title with tables and texts below it, put together from the top to the bottom."""
+    """A title with tables and texts, built from top to bottom."""
 
     def __init__(self, title: str) -> None:
         self._box = Element("div", {"class": "rsltrace"})
@@ -35,7 +36,7 @@ class Sheet:
         self.table((), rows)
 
     def table(self, header: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-        """Add a table of ``_ROWS_MAX`` rows at most; none if there are no rows."""
+        """Add a table of at most ``_ROWS_MAX`` rows; nothing without rows."""
         left = iter(rows)
         shown = list(islice(left, _ROWS_MAX))
         more = sum(1 for _ in left)
@@ -51,7 +52,7 @@ class Sheet:
             self.line(f"… {more} more")
 
     def text(self, text: str, *, summary: str) -> None:
-        """Add a text of several lines, folded away below ``summary``."""
+        """Add a text of several lines, folded below ``summary``."""
         lines = text.splitlines()
         kept = [_cut(line, _LINE_MAX) for line in lines[:_LINES_MAX]]
         if len(lines) > len(kept):
@@ -61,7 +62,7 @@ class Sheet:
         SubElement(folded, "pre").text = "\n".join(kept)
 
     def html(self) -> str:
-        """Return it all."""
+        """Return the HTML."""
         return tostring(self._box, encoding="unicode", method="html")
 
     def _paragraph(self, kind: str, text: str) -> None:

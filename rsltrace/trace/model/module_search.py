@@ -1,7 +1,6 @@
-"""Where a module is, found without importing anything: neither it nor the packages that it is in.
+"""Find a module without importing anything, not even its packages.
 
-``importlib``'s own search of a package without ``__init__.py`` asks ``sys.modules`` for what is
-around it, which is not there.
+``importlib`` looks up the parents of a namespace package in ``sys.modules``.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ def find_module(
     path: Sequence[str],
     otherwise: Callable[[str], ModuleSpec | None] = lambda name: None,
 ) -> ModuleSpec | None:
-    """Return the spec of a module that is looked for in the folders ``path``, None if there is
-    none; ``otherwise`` is asked for what is not in them.
+    """Return the spec of a module in the folders ``path`` or by ``otherwise``, None if there is
+    none.
 
-    The folder of a ROS package that has an ``__init__.py`` beside its ``package.xml`` is taken for
-    a module only if there is no other of its name: installed, it is none.
+    The folder of a ROS package with an ``__init__.py`` beside its ``package.xml`` counts as a
+    module only if there is no other of that name: installed, it is none.
     """
     spec: ModuleSpec | None = None
     places: Sequence[str] | None = path

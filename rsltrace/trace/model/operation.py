@@ -1,4 +1,4 @@
-"""Small outputs of an event (a timer was changed, a task made): what a trace has the hash of."""
+"""Small outputs of an event, recorded only as a hash: a timer was changed, a task made."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import struct
 
 from rsltrace.trace.model.entity import Entity, EntityKind
 
-# What rclpy makes for every node: most entities of most runs, and hardly ever of interest.
+# Entities that rclpy makes for every node: most of a run's, hardly ever of interest.
 
 NODE_TOPICS = frozenset(("/rosout", "/parameter_events"))
 NODE_SERVICES = frozenset(
@@ -24,14 +24,14 @@ NODE_SERVICES = frozenset(
 
 
 def is_built_in(entity: Entity) -> bool:
-    """Whether rclpy made ``entity`` without being asked: publishers of log and parameter events,
-    and the parameter services."""
+    """Whether rclpy made ``entity`` by itself: publishers of logs and parameter events, parameter
+    services."""
     if entity.kind is EntityKind.PUBLISHER:
         return entity.name in NODE_TOPICS
     return entity.kind is EntityKind.SERVICE and entity.name.rpartition("/")[2] in NODE_SERVICES
 
 
-# How deep brackets are nested in a text: YAML parsers take time with the square of it.
+# YAML parsers take quadratic time for nested brackets.
 
 NESTING_MAX = 100
 _BRACKETS = re.compile(r"[][{}]")
@@ -52,4 +52,4 @@ TIMER_RESET = 2
 TIMER_PERIOD = 3
 
 pack_operation = struct.Struct("<Bq").pack
-"""Packs what was done and a value in ns: of a timer its next deadline, or its new period."""
+"""Packs an operation and a value in ns: a timer's next deadline, or its new period."""

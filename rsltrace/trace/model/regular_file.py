@@ -1,20 +1,22 @@
-"""Files that are read as a whole: named pipes and devices are refused before they are opened.
+"""Files that are read or written as a whole.
 
-Opening a named pipe waits for a writer, and a device may never end.
+Reading refuses named pipes and devices before opening them: a pipe waits for a writer, and a device
+may never end.
 """
 
 from __future__ import annotations
 
 import errno
+import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
 def not_regular(path: Path) -> str:
-    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if it is nothing.
-
-    To be asked before it is opened.
-    """
+    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if nothing is
+    there."""
     mode = path.stat().st_mode
     if stat.S_ISREG(mode):
         return ""
@@ -24,7 +26,7 @@ def not_regular(path: Path) -> str:
 
 
 def read_regular(path: Path, size_max: int = -1) -> bytes:
-    """Return what is in a file, at most ``size_max`` bytes of it.
+    """Return the content of a file, at most ``size_max`` bytes.
 
     :raises OSError: if it cannot be read, or is no file; ``strerror`` says what it is.
     """
@@ -38,9 +40,30 @@ def read_regular(path: Path, size_max: int = -1) -> bytes:
 def in_the_way(path: Path) -> str:
     """Return what is at ``path`` if a file must not replace it, "" for a file or nothing.
 
-    Renaming replaces whatever has the name: for root, /dev/null, too.
+    A rename replaces anything: for root even /dev/null.
     """
     try:
         return not_regular(path)
     except OSError:
         return ""
+
+
+@contextmanager
+def replacement_of(path: Path) -> Iterator[Path]:
+    """Give a path to write to; its file takes the place of ``path`` when the block ends well.
+
+    So nobody sees half a file, and what was there stays if writing fails. It keeps its mode, and a
+    symbolic link still points to it.
+
+    :raises OSError: if the file cannot take the place.
+    """
+    final = Path(os.path.realpath(path))
+    work = final.with_name(f".{final.name}.part-{os.getpid()}")
+    try:
+        yield work
+        with suppress(FileNotFoundError):
+            work.chmod(stat.S_IMODE(final.stat().st_mode))
+        work.replace(final)
+    finally:
+        with suppress(OSError):
+            work.unlink()

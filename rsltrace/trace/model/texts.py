@@ -1,10 +1,8 @@
-"""Names and texts out of a file that anybody may have made, safe to show on a terminal."""
+"""Times and texts for people. Texts come from files that anybody may have made."""
 
 from __future__ import annotations
 
 import re
-
-# Simulated time is an integer number of nanoseconds; this module only reads and prints it.
 
 NS_PER_S = 1_000_000_000
 _IN_FULL_NS = 1_000_000 * NS_PER_S
@@ -13,25 +11,25 @@ _DIGITS_MAX = 17
 
 
 def format_seconds(stamp_ns: int) -> str:
-    """Return ``stamp_ns`` as seconds, exactly, with nine decimals: ``1.500000000``."""
+    """Return ``stamp_ns`` as exact seconds with nine decimals: ``1.500000000``."""
     sign = "-" if stamp_ns < 0 else ""
     whole, fraction = divmod(abs(stamp_ns), NS_PER_S)
     return f"{sign}{whole}.{fraction:09d}"
 
 
 def patience_ns(seconds: float) -> int:
-    """Return how long to wait for ``seconds``: a nanosecond at least, if it is more than nothing.
+    """Return ``seconds`` in nanoseconds, at least one if it is more than 0.
 
-    Who waits for what is left until a time (``Semaphore.acquire``, ``Condition.wait_for``) may find
-    that 1e-17 s are left: it would ask for ever, and never would any time pass.
+    Code that waits for the rest of a timeout (``Semaphore.acquire``, ``Condition.wait_for``) may
+    find 1e-17 s left: rounded to 0, it would ask forever and time would never pass.
     """
     return int(seconds * NS_PER_S) or int(seconds > 0)
 
 
 def format_duration(duration_ns: int, digits: int = _DIGITS) -> str:
-    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``, rounded to some digits.
+    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``, rounded.
 
-    A million seconds and more are told in full: they are times since 1970.
+    From a million seconds on it is exact: these are times since 1970.
     """
     size = abs(duration_ns)
     if size >= _IN_FULL_NS:
@@ -43,7 +41,7 @@ def format_duration(duration_ns: int, digits: int = _DIGITS) -> str:
 
 
 def durations_apart(a_ns: int, b_ns: int) -> tuple[str, str]:
-    """Return two durations for people, with as many digits as it takes to tell them apart."""
+    """Return two durations for people, with enough digits to differ."""
     for digits in range(_DIGITS, _DIGITS_MAX):
         a, b = format_duration(a_ns, digits), format_duration(b_ns, digits)
         if _told_ns(a) != _told_ns(b) or a_ns == b_ns:
@@ -56,12 +54,12 @@ def _told_ns(text: str) -> float:
     return float(number) * {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1}[unit]
 
 
-# Fields of message classes that nobody has written into a message.
+# Fields of message classes that no message definition contains.
 
 NO_FIELD = "structure_needs_at_least_one_member"
-"""What rosidl puts into messages without fields."""
+"""rosidl adds it to messages without fields."""
 PLACEHOLDERS = frozenset((NO_FIELD, "__msgtype__"))
-"""That, and where rosbags' classes keep the name of the type."""
+"""Also the field in which rosbags' classes keep the type's name."""
 
 
 _NOT_PRINTABLE = re.compile(
@@ -72,7 +70,7 @@ _SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
 def printable(text: str) -> str:
-    """Return ``text`` on one line, with what could steer a terminal written as escapes.
+    """Return ``text`` on one line, with control characters escaped.
 
     Names and log texts come from the trace, and a trace may come from anybody.
     """
@@ -80,18 +78,18 @@ def printable(text: str) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """Return ``text`` with what could steer a terminal written as escapes; its lines stay."""
+    """Return ``text`` with control characters escaped, except line breaks and tabs."""
     return _NOT_IN_LINES.sub(_escaped, text)
 
 
 def shortened(text: str, width: int) -> str:
-    """Return ``text`` with at most ``width`` characters; an ellipsis stands for what is cut."""
+    """Return ``text`` cut to ``width`` characters, with an ellipsis if it was longer."""
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
 
 
 def told_apart(a: str, b: str, width: int = 40, before: int = 20) -> tuple[str, str]:
-    """Return two different texts, printable, in at most ``width`` characters in which they differ:
-    of long ones from ``before`` characters before the place where they do."""
+    """Return two different texts, printable and cut to ``width`` characters in which they differ:
+    long ones from ``before`` characters before the difference."""
     a, b = printable(a), printable(b)
     at = next(
         (i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b))

@@ -1,6 +1,6 @@
-"""A trace's messages as a plain rosbag2 recording: a folder with metadata.yaml and one MCAP file.
+"""Export a trace's messages as a plain rosbag2 recording: metadata.yaml and one MCAP file.
 
-A trace is a bag already, one that carries more; some tools, and some people, want just the bag.
+A trace is a bag already, with more in it; some tools and people want only the bag.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings.metadata import NAME
 from rsltrace.trace.recordings.reader import open_bag
-from rsltrace.trace.rosbag2 import BagTopic, bag_metadata_yaml
+from rsltrace.trace.rosbag2 import BagTopicMetadata, bag_metadata_yaml
 
-_TOLD_EVERY = 1000
+_PROGRESS_EVERY = 1000
 _QOS, _HASH = "offered_qos_profiles", "topic_type_hash"
 
 
 def check_bag_folder(folder: Path, *, force: bool) -> None:
     """Raise OutputError if a bag cannot be written to ``folder``.
 
-    ``force`` allows to replace a bag, but never a folder of anything else.
+    ``force`` allows to replace a bag, but no other folder.
     """
     if not folder.parent.is_dir():
         raise OutputError(
@@ -45,8 +45,8 @@ def check_bag_folder(folder: Path, *, force: bool) -> None:
         raise OutputError(f"cannot write the bag {folder}: it exists; use {force_it} to replace it")
     if not folder.is_dir() or (any(folder.iterdir()) and not (folder / NAME).is_file()):
         raise OutputError(
-            f"cannot write the bag {folder}: what is there is no bag (it has no {NAME}), so "
-            "--force does not replace it; choose another name"
+            f"cannot write the bag {folder}: the existing folder is not a bag (no {NAME} in it), "
+            "so --force does not replace it; choose another name"
         )
 
 
@@ -59,12 +59,11 @@ def export_bag(
     force: bool = False,
     progress: Callable[[int, int], None] = lambda written, total: None,
 ) -> int:
-    """Write the messages of a trace as the bag ``folder``; return how many there are.
+    """Write the messages of a trace as the bag ``folder``; return their number.
 
-    ``progress`` is told now and then how many it has written, and of how many.
-
-    ``topics`` and ``exclude`` are globs, in which ``*`` matches ``/`` too. The folder appears when
-    it is complete: a failure leaves nothing, and what was there before.
+    ``progress`` is called now and then with the numbers written and in total. ``topics`` and
+    ``exclude`` are globs, in which ``*`` matches ``/`` too. The folder appears when it is complete:
+    a failure leaves nothing, and keeps what was there.
 
     :raises TraceError: if the trace cannot be read.
     :raises OutputError: if the bag cannot be written.
@@ -88,7 +87,7 @@ def export_bag(
             trace, work / name, channels, kept, lambda done: progress(done, sum(counts.values()))
         )
         listed = [
-            BagTopic(
+            BagTopicMetadata(
                 name=channel.topic,
                 type=channel.type,
                 type_hash=channel.metadata.get(_HASH, ""),
@@ -136,7 +135,7 @@ def _write(
                 sequences = dict.fromkeys(ids, 0)
                 start_ns = bag.start_ns
                 for written, (end_ns, number, data) in enumerate(bag.messages()):
-                    if written % _TOLD_EVERY == 0:
+                    if written % _PROGRESS_EVERY == 0:
                         progress(written)
                     topic = bag.topics[number].name
                     sequences[topic] += 1
@@ -148,13 +147,13 @@ def _write(
 
 
 def _literal(topic: str) -> str:
-    """Return the glob that fits a topic alone; a trace made elsewhere may have any name in it."""
+    """Return the glob that matches only a topic; traces from elsewhere may have any name."""
     return re.sub(r"[*?[]", r"[\g<0>]", topic)
 
 
 @contextmanager
 def _replacing(folder: Path) -> Iterator[Path]:
-    """Give a folder to work in, which takes the place of ``folder`` when the block ends well."""
+    """Give a folder to work in, which replaces ``folder`` when the block ends well."""
     work = folder.parent / f".{folder.name}.part-{os.getpid()}"
     old = folder.parent / f".{folder.name}.old-{os.getpid()}"
     try:

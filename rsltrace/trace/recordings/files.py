@@ -1,4 +1,4 @@
-"""From the path of a bag to its open storage files, decompressed first where a file is zstd."""
+"""Open the storage files of a bag, decompressed first if they are zstd."""
 
 from __future__ import annotations
 
@@ -20,20 +20,19 @@ from rsltrace.trace.recordings.sqlite_file import MAGIC as SQLITE_MAGIC
 from rsltrace.trace.recordings.sqlite_file import SqliteFile
 from rsltrace.trace.recordings.topic import BagQos, Storage
 
-# What can be read of a database that was cut off: copied, row by row, into a whole one.
-#
-# Rows are taken in the order they were written, so what is lost is the end of the recording.
+# Recovery of a truncated database: its readable rows are copied into a new one, in the order they
+# were written, so the end of the recording is lost.
 
 _TABLES = ("schema", "metadata", "topics", "message_definitions", "messages")
 
 
 def recover_database(path: Path, target: Path) -> str:
-    """Copy what is readable of ``path`` to ``target``; return how much it is, or nothing."""
+    """Copy the readable rows of ``path`` to ``target``; return how many in words, or nothing."""
     messages, end_ns = 0, 0
     source = sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
     copy = sqlite3.connect(target)
     try:
-        # Without this, sqlite refuses a file that is shorter than its header says.
+        # Otherwise sqlite refuses a file that is shorter than its header says.
         source.execute("PRAGMA writable_schema = ON")
         for table in _TABLES:
             row = source.execute(
@@ -69,8 +68,8 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 class BagFiles:
     """The open storage files of a bag, in order; ``close`` closes them.
 
-    ``compressed_messages`` is ``None`` when only the messages themselves can tell; ``topics`` is
-    what metadata.yaml, if there is one, says about them.
+    ``compressed_messages`` is None if only the messages can tell; ``topics`` has the QoS and type
+    hashes from metadata.yaml.
     """
 
     storage_id: str = ""
@@ -78,18 +77,18 @@ class BagFiles:
     compressed_messages: bool | None = None
     topics: dict[tuple[str, str], tuple[tuple[BagQos, ...], str]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
-    """What is missing from a bag that is read all the same."""
+    """What is missing from an incomplete bag."""
     _stack: ExitStack = field(default_factory=ExitStack)
 
     def close(self) -> None:
-        """Close all files and remove what was decompressed."""
+        """Close all files and remove decompressed copies."""
         self._stack.close()
 
 
 def open_files(path: Path, *, recover: bool = False) -> BagFiles:
     """Open a bag's folder, or a single storage file. Raises ``BagError`` saying what to do.
 
-    ``recover`` takes what is there of a bag that is incomplete, and ``notes`` say what is not.
+    ``recover`` opens an incomplete bag, and ``notes`` say what is missing.
     """
     files = BagFiles()
     try:
@@ -154,7 +153,7 @@ def _open_file(path: Path, files: BagFiles, expected: str | None, *, recover: bo
 
 
 def _sqlite(path: Path, name: Path, files: BagFiles, *, recover: bool) -> SqliteFile:
-    """Open a database, or what can be read of it; ``name`` is what the user calls it."""
+    """Open a database, or its readable rows; ``name`` is the user's path."""
     try:
         return SqliteFile(path, name)
     except BagError:
@@ -171,7 +170,7 @@ def _sqlite(path: Path, name: Path, files: BagFiles, *, recover: bool) -> Sqlite
 
 
 def _decompressed(path: Path, files: BagFiles) -> Path:
-    """Return a decompressed copy of a zstd file; readers of both formats need random access."""
+    """Return a decompressed copy of a zstd file; both formats need random access."""
     import zstandard
 
     folder = files._stack.enter_context(TemporaryDirectory(prefix="rsltrace-bag-"))

@@ -1,8 +1,8 @@
-"""Reading an MCAP file as a rosbag2 storage: topics, and messages by chunk.
+"""Read an MCAP file as a rosbag2 storage: topics, and messages by chunk.
 
-The rosbags and mcap packages read MCAP too. This reader exists because order and completeness
-decide what a simulation does: rosbags passes over chunks that are indexed without their messages,
-and neither refuses a chunk whose messages lie outside the times its index promises.
+The rosbags and mcap packages read MCAP, too. But order and completeness decide what a simulation
+does: rosbags skips chunks that are indexed without their messages, and neither refuses a chunk with
+messages outside the times in its index.
 """
 
 from __future__ import annotations
@@ -17,37 +17,36 @@ from mcap.opcode import Opcode
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import cut_messages, read_chunk
+from rsltrace.trace.mcap.reader import (
+    McapFooter,
+    McapSummary,
+    data_crc,
+    has_end,
+    read_body,
+    read_footer,
+    read_header,
+    read_summary,
+    walk_records,
+)
 from rsltrace.trace.mcap.records import (
     MAGIC,
     MESSAGE,
     RECORD_HEAD,
-    Channel,
-    CutOff,
     Damaged,
-    Span,
+    McapChannel,
+    RecordSpan,
+    TruncatedFile,
     records_in,
 )
 from rsltrace.trace.mcap.source import ByteSource, FileSource
-from rsltrace.trace.mcap.summary import (
-    Footer,
-    Summary,
-    data_crc,
-    has_end,
-    read_footer,
-    read_header,
-    read_summary,
-)
-from rsltrace.trace.mcap.walk import read_body, walk_records
 from rsltrace.trace.model.texts import format_seconds
-from rsltrace.trace.recordings.merge import Message
+from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
 
-# Walking an MCAP recording record by record, where its summary does not tell what is in it.
-#
-# Messages outside chunks are gathered into runs, so that they are read like chunks later.
+# Messages outside chunks are gathered into runs, and read like chunks.
 
 RUN_BYTES = 1 << 20
-"""Messages outside chunks are read in runs of about this many bytes."""
+"""The size of such a run."""
 
 _CHUNK, _DATA_END, _FOOTER = int(Opcode.CHUNK), int(Opcode.DATA_END), int(Opcode.FOOTER)
 _DEFINITIONS = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
@@ -56,13 +55,13 @@ _BODY = struct.Struct("<HIQQ")
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RecordRange:
     """A chunk, or a run of messages outside chunks: whole records.
 
-    ``channels`` are those with messages in it, ``None`` when unknown.
+    ``channels`` are those with messages in it, None if unknown.
     """
 
-    span: Span
+    span: RecordSpan
     start_ns: int
     end_ns: int
     channels: frozenset[int] | None
@@ -71,26 +70,28 @@ class Part:
 
 @dataclass(slots=True)
 class McapIndex:
-    """Everything about a file that is known before its messages are read.
+    """Everything known about a file before its messages are read.
 
-    ``definitions`` are its schemas and channels. ``data_size`` and ``data_crc`` are those of the
-    bytes before the DataEnd record, 0 if unknown.
+    ``definitions`` are its schemas and channels. ``data_size`` and ``data_crc`` cover the bytes
+    before the DataEnd record, 0 if unknown.
     """
 
     profile: str
-    definitions: Summary = field(default_factory=Summary)
-    parts: list[Part] = field(default_factory=list)
+    definitions: McapSummary = field(default_factory=McapSummary)
+    parts: list[RecordRange] = field(default_factory=list)
     counts: Counter[int] = field(default_factory=Counter)
     start_ns: int = 0
     end_ns: int = 0
     data_size: int = 0
     data_crc: int = 0
     cut_off: str = ""
-    """How much of a file without an end is whole; empty for a complete one."""
+    """How much of a truncated file is whole; empty for a complete one."""
 
-    def add(self, span: Span, times: tuple[int, int], counts: Counter[int], is_chunk: bool) -> None:
-        """Add a part, its messages counted."""
-        self.parts.append(Part(span, *times, frozenset(counts), is_chunk))
+    def add(
+        self, span: RecordSpan, times: tuple[int, int], counts: Counter[int], is_chunk: bool
+    ) -> None:
+        """Add a range with counted messages."""
+        self.parts.append(RecordRange(span, *times, frozenset(counts), is_chunk))
         self.counts.update(counts)
         self.start_ns = min(self.start_ns, times[0])
         self.end_ns = max(self.end_ns, times[1])
@@ -107,11 +108,11 @@ def scan_file(source: ByteSource, start: int, end: int, index: McapIndex) -> Non
 def scan_records(
     source: ByteSource, start: int, end: int, index: McapIndex, *, skip_chunks: bool
 ) -> bool:
-    """Add the records between two places of a file to ``index``. Raises Damaged.
+    """Add the records between two offsets of a file to ``index``. Raises Damaged.
 
-    With ``skip_chunks`` nothing is read of a chunk; finding one ends the walk with ``False``.
+    With ``skip_chunks`` no chunk is read; finding one ends the walk with False.
     """
-    run = _Run()
+    run = _MessageRun()
     for opcode, span in walk_records(source, start, end):
         if opcode == MESSAGE:
             if span.length < RECORD_HEAD.size + _BODY.size:
@@ -139,7 +140,7 @@ def scan_records(
     return True
 
 
-def _scan_chunk(source: ByteSource, span: Span, index: McapIndex) -> None:
+def _scan_chunk(source: ByteSource, span: RecordSpan, index: McapIndex) -> None:
     try:
         records = read_chunk(source, span, strict=False)
         counts: Counter[int] = Counter()
@@ -157,13 +158,13 @@ def _scan_chunk(source: ByteSource, span: Span, index: McapIndex) -> None:
         index.add(span, (start_ns, end_ns), counts, is_chunk=True)
 
 
-class _Run:
-    """Collects neighbouring messages outside chunks into one part."""
+class _MessageRun:
+    """Joins neighbouring messages outside chunks into one range."""
 
     def __init__(self) -> None:
         self.length = 0
 
-    def add(self, span: Span, channel: int, stamp_ns: int) -> None:
+    def add(self, span: RecordSpan, channel: int, stamp_ns: int) -> None:
         if self.length == 0:
             self.offset, self.counts = span.offset, Counter[int]()
             self.start_ns = self.end_ns = stamp_ns
@@ -173,13 +174,13 @@ class _Run:
 
     def close(self, index: McapIndex) -> None:
         if self.length:
-            span = Span(self.offset, self.length)
+            span = RecordSpan(self.offset, self.length)
             index.add(span, (self.start_ns, self.end_ns), self.counts, is_chunk=False)
         self.length = 0
 
 
-def how_far(source: ByteSource) -> tuple[int, str]:
-    """Return where the whole part of a file without an end ends, and say what is in it."""
+def intact_length(source: ByteSource) -> tuple[int, str]:
+    """Return the length of the whole part of a truncated file, and what is in it in words."""
     counts: Counter[int] = Counter()
     good, end_ns = len(MAGIC), 0
     try:
@@ -200,23 +201,21 @@ def how_far(source: ByteSource) -> tuple[int, str]:
     return good, text
 
 
-# Where the messages of an MCAP recording are: from its summary, or by walking the file.
-#
-# The summary is taken only if it tells everything: chunks may be indexed without their messages,
-# messages may stand outside chunks, and a writer may leave the summary out. What it does not tell
-# (the gaps between indexed chunks) is walked, so no message is ever passed over in silence.
+# The index comes from the summary only if that is complete: chunks may be indexed without their
+# messages, messages may lie outside chunks, and writers may omit the summary. Gaps between indexed
+# chunks are walked, so no message is skipped silently.
 
 
 def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
     """Return the index of an MCAP file.
 
-    Raises Damaged saying what is damaged and at which byte, CutOff when the end is missing (how
-    far the file is good); with ``recover`` the index is then that of what is whole.
+    Raises Damaged saying what is damaged and where, TruncatedFile when the end is missing; with
+    ``recover`` the index then covers what is whole.
     """
     if not has_end(source):
-        end, text = how_far(source)
+        end, text = intact_length(source)
         if not recover:
-            raise CutOff(text)
+            raise TruncatedFile(text)
         profile, data_start = _profile(source)
         index = McapIndex(profile, cut_off=text)
         scan_file(source, data_start, end, index)
@@ -228,7 +227,7 @@ def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
         raise Damaged(f"the footer before byte {source.size} is damaged ({error})") from None
     start = footer.summary_start
     index = McapIndex(profile)
-    complete = start != 0 and _take_summary(source, footer, data_start, index)
+    complete = start != 0 and _add_summary(source, footer, data_start, index)
     if not complete:
         index = McapIndex(profile)
         scan_file(source, data_start, start or footer.offset, index)
@@ -248,21 +247,21 @@ def _profile(source: ByteSource) -> tuple[str, int]:
     return header.profile, data_start
 
 
-def _take_summary(source: ByteSource, footer: Footer, data_start: int, index: McapIndex) -> bool:
-    """Fill ``index`` from the summary; say whether it tells everything."""
+def _add_summary(source: ByteSource, footer: McapFooter, data_start: int, index: McapIndex) -> bool:
+    """Fill ``index`` from the summary; return whether that is complete."""
     start = footer.summary_start
     try:
         if start < data_start:
             raise Damaged("it would begin in the header")
         summary = read_summary(source, footer)
-        if not _tells_everything(summary):
+        if not _is_complete(summary):
             return False
-        return _take_parts(source, summary, data_start, start, index)
+        return _add_ranges(source, summary, data_start, start, index)
     except Damaged as error:
         raise Damaged(f"the summary at byte {start} is damaged ({error})") from None
 
 
-def _tells_everything(summary: Summary) -> bool:
+def _is_complete(summary: McapSummary) -> bool:
     statistics, channels = summary.statistics, summary.channels
     return (
         statistics is not None
@@ -273,11 +272,10 @@ def _tells_everything(summary: Summary) -> bool:
     )
 
 
-def _take_parts(
-    source: ByteSource, summary: Summary, data_start: int, data_end: int, index: McapIndex
+def _add_ranges(
+    source: ByteSource, summary: McapSummary, data_start: int, data_end: int, index: McapIndex
 ) -> bool:
-    """Add the indexed chunks and the messages between them; no if there is a chunk the index
-    lacks."""
+    """Add the indexed chunks and the messages between them; False if a chunk is not indexed."""
     index.definitions = summary
     at = data_start
     for chunk in sorted(summary.chunks(), key=lambda chunk: chunk.span.offset):
@@ -286,7 +284,7 @@ def _take_parts(
         if not scan_records(source, at, chunk.span.offset, index, skip_chunks=True):
             return False
         channels = frozenset(channel for channel, _ in chunk.indexes) or None
-        index.parts.append(Part(chunk.span, chunk.start_ns, chunk.end_ns, channels, True))
+        index.parts.append(RecordRange(chunk.span, chunk.start_ns, chunk.end_ns, channels, True))
         at = chunk.end
     if at > data_end:
         raise Damaged(f"the index reaches past byte {data_end}, the end of the data")
@@ -304,7 +302,7 @@ class McapFile:
     """One open ``.mcap`` file. Raises ``BagError`` when it is no ROS 2 recording or damaged."""
 
     def __init__(self, path: Path, *, recover: bool = False) -> None:
-        """Open ``path``; with ``recover``, what is whole of a file that was cut off."""
+        """Open ``path``; with ``recover``, the whole part of a truncated file."""
         self.path = path
         self._recover = recover
         self.with_publish_time = False
@@ -328,7 +326,7 @@ class McapFile:
         self._source.close()
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
-        """Return the chunks that may hold wanted messages, in file order."""
+        """Return the chunks that may contain wanted messages, in file order."""
         extents = []
         for part in self._index.parts:
             known = part.channels is None or not part.channels.isdisjoint(wanted)
@@ -336,12 +334,14 @@ class McapFile:
                 extents.append(Extent(*part.span, max(part.start_ns, first_ns), part.end_ns))
         return extents
 
-    def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
+    def read(
+        self, extent: Extent, wanted: Mapping[int, int], first_ns: int
+    ) -> Iterator[BagMessage]:
         """Yield the wanted messages of a chunk by time, equal times in file order."""
         yield from self._messages(self._parts[extent.offset], wanted, first_ns)
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
-        """Return how many wanted messages there are."""
+        """Return the number of wanted messages."""
         count = sum(self._index.counts[channel] for channel in wanted)
         for part in self._index.parts if first_ns > self.start_ns else []:
             if part.start_ns < first_ns:
@@ -361,7 +361,9 @@ class McapFile:
                 last_ns = max(messages[-1][0], last_ns or 0)
         return last_ns
 
-    def _messages(self, part: Part, wanted: Mapping[int, int], first_ns: int) -> list[Message]:
+    def _messages(
+        self, part: RecordRange, wanted: Mapping[int, int], first_ns: int
+    ) -> list[BagMessage]:
         if self._closed:
             raise ValueError(f"{self.path} is closed")
         try:
@@ -372,7 +374,7 @@ class McapFile:
             messages = cut_messages(
                 records, wanted, first_ns, with_publish_time=self.with_publish_time
             )
-            # The order of the whole stream rests on these two times.
+            # The order of the stream depends on these two times.
             if messages and not (part.start_ns <= messages[0][0] <= messages[-1][0] <= part.end_ns):
                 raise Damaged("messages lie outside the times the index promises")
         except Damaged as error:
@@ -386,7 +388,7 @@ class McapFile:
     def _read_index(self) -> McapIndex:
         try:
             index = read_index(self._source, recover=self._recover)
-        except CutOff as error:
+        except TruncatedFile as error:
             raise BagError(
                 f"{self.path}: the recording was cut off, its footer and index are missing: "
                 f"{error}. Repair it with 'mcap recover {self.path.name} -o repaired.mcap' (and "
@@ -402,7 +404,7 @@ class McapFile:
             )
         return index
 
-    def _topic(self, channel: Channel) -> StoredTopic:
+    def _topic(self, channel: McapChannel) -> StoredTopic:
         schema = self._index.definitions.schemas.get(channel.schema_id)
         try:
             offered = parse_qos(channel.metadata.get("offered_qos_profiles", ""))

@@ -1,7 +1,7 @@
-"""One stream of messages in time order from many pieces of recording, few of them in memory.
+"""Merge many parts of a recording into one stream of messages by time, with few in memory.
 
-A piece (a chunk, a database) knows the time span of its messages before it is read, so it is
-opened only when the stream arrives at its start and dropped when it is used up.
+The time span of a part (a chunk, a database) is known before it is read, so it is opened only when
+the stream reaches its start, and dropped at its end.
 """
 
 from __future__ import annotations
@@ -10,28 +10,27 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from heapq import heappop, heappush
 
-Message = tuple[int, int, bytes]
+BagMessage = tuple[int, int, bytes]
 """Log time in nanoseconds, index of the topic, CDR bytes."""
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """A piece of recording. ``order`` is its place in the recording, unique.
+class RecordingPart:
+    """A part of a recording. ``order`` is its unique position in the recording.
 
-    ``read`` yields its messages in time order (equal times in file order), none before
-    ``start_ns``.
+    ``read`` yields its messages by time (equal times in file order), none before ``start_ns``.
     """
 
     start_ns: int
     order: int
-    read: Callable[[], Iterator[Message]]
+    read: Callable[[], Iterator[BagMessage]]
 
 
-def merge(pieces: Iterable[Piece]) -> Iterator[Message]:
-    """Yield the messages of all pieces in the order of (time, order of the piece, place in it)."""
+def merge(pieces: Iterable[RecordingPart]) -> Iterator[BagMessage]:
+    """Yield the messages of all parts by (time, order of the part, position in it)."""
     waiting = sorted(pieces, key=lambda piece: (piece.start_ns, piece.order), reverse=True)
-    # Entries never compare beyond the order, which is unique.
-    opened: list[tuple[int, int, Message, Iterator[Message]]] = []
+    # The order is unique, so comparisons end there.
+    opened: list[tuple[int, int, BagMessage, Iterator[BagMessage]]] = []
     while waiting or opened:
         while waiting and (not opened or (waiting[-1].start_ns, waiting[-1].order) < opened[0][:2]):
             piece = waiting.pop()
@@ -42,7 +41,7 @@ def merge(pieces: Iterable[Piece]) -> Iterator[Message]:
         if not opened:
             continue
         _, order, message, rest = heappop(opened)
-        # The usual case is one open piece: run through it up to where another may come first.
+        # Usually one part is open: continue it up to where another may come first.
         limits = [entry[:2] for entry in opened[:1]]
         limits += [(piece.start_ns, piece.order) for piece in waiting[-1:]]
         yield message

@@ -1,4 +1,4 @@
-"""Reading ``metadata.yaml``: which files a bag has, of which storage, compressed how."""
+"""Read ``metadata.yaml``: the files of a bag, their storage and compression."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ STORAGE_IDS = ("mcap", "sqlite3")
 
 @dataclass(frozen=True, slots=True)
 class BagMetadata:
-    """What has to be known before the storage files are opened.
+    """What must be known before the storage files are opened.
 
-    ``compression`` is ``""``, ``"file"`` or ``"message"`` (always zstd), ``None`` if unknown, as is
-    an empty ``storage_id``. ``topics`` has the QoS and the type's hash by (topic, type), for
-    storage files that do not keep them. ``notes`` say what is missing.
+    ``compression`` is ``""``, ``"file"`` or ``"message"`` (always zstd), None if unknown, like an
+    empty ``storage_id``. ``topics`` has the QoS and type hash by (topic, type), for storage files
+    without them. ``notes`` say what is missing.
     """
 
     storage_id: str
@@ -36,7 +36,7 @@ class BagMetadata:
 def read_metadata(folder: Path, *, recover: bool = False) -> BagMetadata:
     """Return the metadata of the bag in ``folder``. Raises ``BagError`` saying what to do.
 
-    ``recover`` does without metadata.yaml, and without some of the files it lists.
+    ``recover`` works without metadata.yaml, and without some of the listed files.
     """
     path = folder / NAME
     if not path.is_file():
@@ -74,8 +74,8 @@ def read_metadata(folder: Path, *, recover: bool = False) -> BagMetadata:
             f"{path}: the compression {scheme!r} by {mode!r} is unknown (only zstd, by file or "
             "message); convert the bag with 'ros2 bag convert'"
         )
-    # Before version 4 the folder's name stood in front. Only names are taken, so a bag cannot
-    # point outside its folder.
+    # Before version 4 the folder's name came first. Only file names are used, so a bag cannot point
+    # outside its folder.
     files = tuple(folder / PurePosixPath(str(name)).name for name in names)
     if not files:
         raise BagError(f"{path}: no storage files are listed: the bag is empty")
@@ -93,9 +93,9 @@ def read_metadata(folder: Path, *, recover: bool = False) -> BagMetadata:
 
 
 def _without_metadata(folder: Path) -> BagMetadata:
-    """Return what the storage files in a folder without metadata.yaml tell by themselves."""
+    """Return what the storage files of a folder without metadata.yaml show."""
     names = [path.name for path in folder.iterdir() if _RECORDING.search(path.name)]
-    # Of a file and its compressed form one is enough.
+    # A file and its compressed form are one.
     names = [name for name in names if name.removesuffix(".zstd") == name or name[:-5] not in names]
     names.sort(key=lambda name: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", name)])
     if not names:

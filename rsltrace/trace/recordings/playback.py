@@ -1,4 +1,4 @@
-"""When the messages of a bag play: by which of their times, how fast, from when on, how often."""
+"""When the messages of a bag play: by which time, rate, start and number of passes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from itertools import count
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
-from rsltrace.trace.recordings.merge import Message
+from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.reader import Bag
 
 BY_LOG_TIME = "log_time"
@@ -22,10 +22,10 @@ BY_HEADER_STAMP = "header_stamp"
 class Playback:
     """A bag with its times on the run's clock.
 
-    ``by`` is one of the constants above; ``headers`` are the indices of the topics whose messages
-    begin with a header. ``rate`` 2 plays in half the time. ``at_ns`` is when the first message
-    plays (None: as recorded), ``passes`` how often the bag plays (None: for ever); a pass begins
-    when the last message of the one before plays.
+    ``by`` is one of the constants above; ``headers`` are the indices of topics whose messages begin
+    with a header. ``rate`` 2 plays in half the time. ``at_ns`` is the time of the first message
+    (None: as recorded), ``passes`` how often the bag plays (None: forever); a pass begins when the
+    last message of the previous one plays.
     """
 
     bag: Bag
@@ -37,12 +37,12 @@ class Playback:
 
     @property
     def start_ns(self) -> int:
-        """When the first message plays."""
+        """The time of the first message."""
         return self._first_ns if self.at_ns is None else self.at_ns
 
     @property
     def end_ns(self) -> int | None:
-        """When the last message plays, as far as the bag's log times tell; None: never."""
+        """The time of the last message, judging by the bag's log times; None: never."""
         if self.passes is None:
             return None
         length_ns = max(self.bag.end_ns - self.bag.start_ns, 0) * self.passes
@@ -56,8 +56,8 @@ class Playback:
         assert first is not None, "a bag without messages to play is refused"
         return first[0]
 
-    def messages(self) -> Iterator[Message]:
-        """Yield (simulated time, index of the topic, CDR bytes) in the order they play."""
+    def messages(self) -> Iterator[BagMessage]:
+        """Yield (simulated time, index of the topic, CDR bytes) in playing order."""
         first_ns, start_ns = self._first_ns, self.start_ns
         if self.passes == 1 and first_ns == start_ns and self.rate == 1:
             yield from self._ordered()
@@ -75,36 +75,36 @@ class Playback:
                 )
             start_ns = played_ns
 
-    def _ordered(self) -> Iterator[Message]:
+    def _ordered(self) -> Iterator[BagMessage]:
         if self.by == BY_LOG_TIME:
             return self.bag.messages()
         keyed = self._by_publish_time if self.by == BY_PUBLISH_TIME else self._by_header_stamp
         return reordered(keyed)
 
-    def _by_publish_time(self) -> Iterator[Message]:
+    def _by_publish_time(self) -> Iterator[BagMessage]:
         for stamp_ns, topic, data in self.bag.with_publish_time():
             publish_ns = int.from_bytes(data[:PUBLISH_TIME_BYTES], "little")
             yield publish_ns or stamp_ns, topic, data[PUBLISH_TIME_BYTES:]
 
-    def _by_header_stamp(self) -> Iterator[Message]:
+    def _by_header_stamp(self) -> Iterator[BagMessage]:
         for stamp_ns, topic, data in self.bag.messages():
             header_ns = header_stamp_ns(data) if topic in self.headers else 0
             yield header_ns or stamp_ns, topic, data
 
 
 def header_stamp_ns(data: bytes) -> int:
-    """Return the stamp of the header a CDR message begins with; 0 if it is not set."""
+    """Return the header stamp at the beginning of a CDR message; 0 if it is not set."""
     order = "little" if data[1:2] == b"\x01" else "big"
     sec = int.from_bytes(data[4:8], order, signed=True)  # type: ignore[arg-type]
     nanosec = int.from_bytes(data[8:12], order)  # type: ignore[arg-type]
     return max(sec * 1_000_000_000 + nanosec, 0)
 
 
-def reordered(messages: Callable[[], Iterator[Message]]) -> Iterator[Message]:
-    """Yield messages in the order of their times, equal ones as they come.
+def reordered(messages: Callable[[], Iterator[BagMessage]]) -> Iterator[BagMessage]:
+    """Yield messages by time, equal times in their order.
 
-    ``messages`` gives them twice: first to find out how late one may come, then to wait so long
-    with each. So memory is that of the messages within that time, however long the bag.
+    ``messages`` is read twice: first to find the longest lateness, then to delay each message by
+    that. Memory is bounded by the messages within that time.
     """
     latest_ns, late_ns = 0, 0
     for stamp_ns, _, _ in messages():
@@ -113,7 +113,7 @@ def reordered(messages: Callable[[], Iterator[Message]]) -> Iterator[Message]:
     if late_ns == 0:
         yield from messages()
         return
-    waiting: list[tuple[int, int, Message]] = []
+    waiting: list[tuple[int, int, BagMessage]] = []
     latest_ns = 0
     for number, message in enumerate(messages()):
         latest_ns = max(latest_ns, message[0])

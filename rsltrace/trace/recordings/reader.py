@@ -1,35 +1,32 @@
-"""A rosbag2 recording as one stream of messages in time order, whatever it is stored in."""
+"""Read a rosbag2 recording as one stream of messages by time, whatever its storage."""
 
 from __future__ import annotations
 
 import difflib
 import os
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from fnmatch import fnmatchcase
 from functools import cached_property, partial
 from itertools import takewhile
 from pathlib import Path
-from types import TracebackType
 
 from rsltrace.errors import BagError
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.recordings.files import ZSTD_MAGIC, BagFiles, open_files
-from rsltrace.trace.recordings.merge import Message, Piece, merge
+from rsltrace.trace.recordings.merge import BagMessage, RecordingPart, merge
 from rsltrace.trace.recordings.topic import BagTopic, Extent, Storage, StoredTopic
-
-# Which topics of a bag play: shell globs over their names.
 
 
 def select_topics(
     names: Sequence[str], topics: Sequence[str], exclude: Sequence[str], bag: str
 ) -> set[str]:
-    """Return the names that match one of ``topics`` (none given: all) and none of ``exclude``.
+    """Return the names that match one of ``topics`` (none: all) and none of ``exclude``.
 
-    ``*`` matches ``/`` too. Raises ``BagError`` listing the topics there are when a glob of
-    ``topics`` matches nothing, or nothing is left.
+    ``*`` matches ``/`` too. Raises ``BagError`` with the topics of the bag if a glob of ``topics``
+    matches nothing, or nothing is left.
     """
     there_are = f"the bag has {', '.join(sorted(set(names))) or 'no topics'}"
     for glob in unmatched(topics, names):
@@ -58,12 +55,11 @@ STAMP_NS_MAX = 2**63 - 1
 class Bag:
     """An open recording; a context manager. Made by ``open_bag``.
 
-    ``path`` is what was opened, ``storage_id`` ``"mcap"`` or ``"sqlite3"``, ``topics`` the selected
-    topics in the order of the recording. ``recording_start_ns`` and ``recording_end_ns`` are the
-    log times of the first and last message of the whole recording; ``start_ns`` is that of the
-    first message that plays. Log times are integer nanoseconds. ``notes`` say what is missing from
-    the recording, ``skipped`` are the topics that never play, ``excluded_nothing`` the globs of
-    ``exclude`` that fit no topic.
+    ``storage_id`` is ``"mcap"`` or ``"sqlite3"``, ``topics`` the selected topics in the order of
+    the recording. ``recording_start_ns`` and ``recording_end_ns`` are the log times of the first
+    and last message of the whole recording; ``start_ns`` is that of the first message that plays.
+    Log times are integer nanoseconds. ``notes`` say what is missing, ``skipped`` are the topics
+    that never play, ``excluded_nothing`` the globs of ``exclude`` that match no topic.
     """
 
     path: Path
@@ -111,7 +107,7 @@ class Bag:
         self._zstd = files.compressed_messages
         if self._zstd is None:
             first = next(self.messages(), None)
-            # No CDR message starts with these bytes, and a single file does not tell otherwise.
+            # No CDR message starts with these bytes, and a single file does not say.
             self._zstd = first is not None and first[2].startswith(ZSTD_MAGIC)
         first = next(self.messages(), None)
         if first is None:
@@ -127,26 +123,28 @@ class Bag:
             )
         self.start_ns = first[0]
 
-    def messages(self) -> Iterator[Message]:
-        """Yield (log time in ns, index in ``topics``, CDR bytes) in the order of (time, place).
+    def messages(self) -> Iterator[BagMessage]:
+        """Yield (log time in ns, index in ``topics``, CDR bytes) by (time, position).
 
-        Lazy, with the memory of the chunks that overlap in time; several iterators may run at
-        once. Raises ``BagError`` on reaching a damaged part.
+        Lazy, with only chunks that overlap in time in memory; several iterators may run at once.
+        Raises ``BagError`` at a damaged part.
         """
-        pieces: list[Piece] = []
+        pieces: list[RecordingPart] = []
         for storage, wanted in zip(self._files.storages, self._wanted, strict=True):
             for extent in storage.extents(wanted, self._first_ns):
                 read = partial(self._read, storage, extent, wanted)
-                pieces.append(Piece(extent.start_ns, len(pieces), read))
+                pieces.append(RecordingPart(extent.start_ns, len(pieces), read))
         messages = merge(pieces)
         last_ns = self._last_ns
         if last_ns is None:
             return messages
         return takewhile(lambda message: message[0] <= last_ns, messages)
 
-    def with_publish_time(self) -> Iterator[Message]:
-        """Yield what ``messages`` does, with the publish time in front of the bytes (8 of them,
-        little-endian). Raises ``BagError`` if the recording does not keep it."""
+    def with_publish_time(self) -> Iterator[BagMessage]:
+        """Yield messages with the publish time before the data (8 bytes, little-endian).
+
+        Raises ``BagError`` if the recording does not have it.
+        """
         if self.storage_id != "mcap":
             raise BagError(
                 f"{self.path}: a {self.storage_id} recording does not keep when messages were "
@@ -162,7 +160,7 @@ class Bag:
 
     @cached_property
     def end_ns(self) -> int:
-        """Log time of the last message that plays, in nanoseconds."""
+        """Log time of the last message that plays."""
         if self._last_ns is not None:
             return max(stamp_ns for stamp_ns, _, _ in self.messages())
         ends = [
@@ -173,29 +171,24 @@ class Bag:
 
     @cached_property
     def message_count(self) -> int:
-        """How many messages play. After a start offset the skipped part is read to count it."""
+        """The number of messages that play. A start offset must read the skipped part."""
         return sum(
             storage.count(wanted, self._first_ns)
             for storage, wanted in zip(self._files.storages, self._wanted, strict=True)
         )
 
     def close(self) -> None:
-        """Close the recording. Iterators of messages end with it."""
+        """Close the recording. Its iterators end."""
         self._files.close()
 
     def __enter__(self) -> Bag:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def _select(self, globs: Sequence[str], exclude: Sequence[str]) -> None:
-        """Make ``topics`` and, per storage file, the map from its topic ids to their indices."""
+        """Set ``topics`` and the map from each storage file's topic ids to their indices."""
         everything = [topic for storage in self._files.storages for topic in storage.topics]
         skipped = [topic for topic in everything if self._skip is not None and self._skip(topic)]
         self.skipped = tuple(dict.fromkeys(topic.name for topic in skipped))
@@ -212,7 +205,7 @@ class Bag:
                 key = (stored.name, stored.type_name, stored.serialization_format)
                 ids[-1][stored.id] = key
                 new = self._topic(stored)
-                merged[key] = _joined(merged[key], new) if key in merged else new
+                merged[key] = _joined_topic(merged[key], new) if key in merged else new
         self.topics = tuple(merged.values())
         for topic in self.topics:
             if topic.serialization_format != "cdr":
@@ -224,26 +217,24 @@ class Bag:
         self._wanted = [{i: index[key] for i, key in by_id.items()} for by_id in ids]
 
     def _topic(self, stored: StoredTopic) -> BagTopic:
-        names = (stored.name, stored.type_name)
-        offered, type_hash = self._files.topics.get(names, ((), ""))
-        return BagTopic(
-            *names,
-            serialization_format=stored.serialization_format,
-            offered_qos=stored.offered_qos or offered,
-            message_count=stored.message_count,
-            schema_text=stored.schema_text,
-            schema_encoding=stored.schema_encoding,
-            type_hash=stored.type_hash or type_hash,
+        offered, type_hash = self._files.topics.get((stored.name, stored.type_name), ((), ""))
+        topic = BagTopic(*(getattr(stored, field.name) for field in fields(BagTopic)))
+        return replace(
+            topic,
+            offered_qos=topic.offered_qos or offered,
+            type_hash=topic.type_hash or type_hash,
         )
 
-    def _read(self, storage: Storage, extent: Extent, wanted: dict[int, int]) -> Iterator[Message]:
+    def _read(
+        self, storage: Storage, extent: Extent, wanted: dict[int, int]
+    ) -> Iterator[BagMessage]:
         messages = storage.read(extent, wanted, self._first_ns)
         if not self._zstd:
             return messages
         return self._decompressed(messages, PUBLISH_TIME_BYTES * storage.with_publish_time)
 
-    def _decompressed(self, messages: Iterator[Message], head: int) -> Iterator[Message]:
-        """Yield messages with what follows the first ``head`` bytes decompressed."""
+    def _decompressed(self, messages: Iterator[BagMessage], head: int) -> Iterator[BagMessage]:
+        """Yield messages with the bytes after the first ``head`` decompressed."""
         import zstandard
 
         decompressor = zstandard.ZstdDecompressor()
@@ -259,7 +250,7 @@ class Bag:
                 ) from None
 
 
-def _joined(one: BagTopic, other: BagTopic) -> BagTopic:
+def _joined_topic(one: BagTopic, other: BagTopic) -> BagTopic:
     """Join what two channels, or two files of a split bag, say about one topic."""
     new_qos = tuple(qos for qos in other.offered_qos if qos not in one.offered_qos)
     schema = one if one.schema_text else other
@@ -285,12 +276,11 @@ def open_bag(
 ) -> Bag:
     """Open a rosbag2 recording: a folder with metadata.yaml, or one ``.mcap`` or ``.db3`` file.
 
-    ``topics`` and ``exclude`` are globs (``*`` matches ``/`` too; no ``topics`` means all);
-    ``start_offset_ns`` counts from the first message of the whole recording, ``duration_ns`` from
-    there. ``recover`` takes what is there of an incomplete recording (cut off, without
-    metadata.yaml) and says in ``notes`` what is not. ``skip`` picks topics that never play; their
-    names are in ``skipped``. Raises ``BagError`` naming the file and what to do: nothing there, not
-    a bag, empty, cut off, damaged, of another encoding, or nothing selected.
+    ``topics`` and ``exclude`` are globs (``*`` matches ``/`` too; no ``topics`` means all).
+    ``start_offset_ns`` counts from the first message of the recording, ``duration_ns`` from there.
+    ``recover`` opens an incomplete recording, and ``notes`` say what is missing. ``skip`` picks
+    topics that never play, listed in ``skipped``. Raises ``BagError`` naming the file and what to
+    do.
     """
     if start_offset_ns < 0:
         raise BagError(f"{path}: the start offset must not be negative, got {start_offset_ns} ns")

@@ -1,7 +1,7 @@
-"""Reading rosbag2's sqlite3 storage (``.db3``), of all its schema versions.
+"""Read rosbag2's sqlite3 storage (``.db3``), all schema versions.
 
-The standard library's sqlite3 serves: the order (time, row) comes from the index rosbag2 makes on
-the time column, so a query streams in bounded memory.
+rosbag2's index on the time column gives the order (time, row), so a query streams in bounded
+memory.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from typing import Any
 from urllib.parse import quote
 
 from rsltrace.errors import BagError
-from rsltrace.trace.recordings.merge import Message
+from rsltrace.trace.recordings.merge import BagMessage
 from rsltrace.trace.recordings.topic import Extent, StoredTopic, parse_qos
 
 MAGIC = b"SQLite format 3\0"
 _HEADER_BYTES = 100
 _ERRORS = (sqlite3.Error, UnicodeDecodeError, OverflowError)
-"""What sqlite3 raises on a damaged file: text in it is decoded outside its own errors."""
+"""Errors for a damaged file: sqlite3 decodes text outside its own errors."""
 
 _REPAIR = "recover it with sqlite3's '.recover', then run 'ros2 bag reindex' on the bag's folder"
 
@@ -34,8 +34,8 @@ class SqliteFile:
         self.cut_off = ""
         self.with_publish_time = False
         self._check_size()
-        # A log that was not merged back means messages outside the main file; only without one is
-        # the file promised not to change, which also lets it be read from read-only media.
+        # A non-empty WAL holds messages outside the main file. Without one the file is opened as
+        # immutable, which also works on read-only media.
         wal = path.with_name(path.name + "-wal")
         mode = "mode=ro" if wal.exists() and wal.stat().st_size else "mode=ro&immutable=1"
         try:
@@ -54,14 +54,16 @@ class SqliteFile:
         self._db.close()
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
-        """Return the whole database as one part, if it has any wanted message."""
+        """Return the whole database as one extent, if it has any wanted message."""
         ids, end_ns = self._ids(wanted), self.end_ns
         if not ids or end_ns < first_ns:
             return []
         return [Extent(0, 0, max(self.start_ns, first_ns), end_ns)]
 
-    def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
-        """Yield the wanted messages in the order of (time, row)."""
+    def read(
+        self, extent: Extent, wanted: Mapping[int, int], first_ns: int
+    ) -> Iterator[BagMessage]:
+        """Yield the wanted messages by (time, row)."""
         ids = self._ids(wanted)
         query = "SELECT timestamp, topic_id, data FROM messages WHERE timestamp >= ?"
         if any(topic.message_count for topic in self.topics if topic.id not in wanted):
@@ -70,7 +72,7 @@ class SqliteFile:
             for stamp_ns, topic, data in self._db.execute(
                 f"{query} ORDER BY timestamp, rowid", (first_ns,)
             ):
-                # sqlite holds any type in any column, and a damaged file does.
+                # sqlite allows any type in any column; damaged files have them.
                 if type(stamp_ns) is not int or type(data) is not bytes or topic not in wanted:
                     raise BagError(
                         f"{self.name}: the row at time {stamp_ns!r} is not a message; {_REPAIR}"
@@ -80,7 +82,7 @@ class SqliteFile:
             raise self._damaged(error) from None
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
-        """Return how many wanted messages there are."""
+        """Return the number of wanted messages."""
         if first_ns <= self.start_ns:
             return sum(topic.message_count for topic in self.topics if topic.id in wanted)
         ids = ", ".join(map(str, self._ids(wanted)))
@@ -166,7 +168,7 @@ class SqliteFile:
         return BagError(f"{self.name}: the database cannot be read ({error}); {_REPAIR}")
 
     def _check_size(self) -> None:
-        """Compare the file's size with what its header promises; sqlite would find out late."""
+        """Compare the file's size with its header; sqlite would notice late."""
         with self.path.open("rb") as file:
             header = file.read(_HEADER_BYTES)
         if not header.startswith(MAGIC):

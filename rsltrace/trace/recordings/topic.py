@@ -1,4 +1,4 @@
-"""What a bag says about its topics: frozen values, as given in the recording."""
+"""What a bag says about its topics, as recorded."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from typing import Any, Protocol
 
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import NS_PER_S
-from rsltrace.trace.recordings.merge import Message
+from rsltrace.trace.recordings.merge import BagMessage
 
 DURATION_INFINITE_NS = 2**63 - 1
-"""A QoS duration without end, as ROS 2 writes it."""
+"""An infinite QoS duration in ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)
 class BagQos:
-    """The QoS one publisher offered when it was recorded.
+    """The QoS that one publisher offered when it was recorded.
 
     Policies are ROS's lower-case words (``keep_last``, ``reliable``, ``transient_local``,
-    ``unknown``, ...). Durations are in nanoseconds: 0 is "not specified",
-    ``DURATION_INFINITE_NS`` is without end. ``depth`` is often 0: publishers do not announce it.
+    ``unknown``, ...). Durations are in nanoseconds: 0 is "not specified", ``DURATION_INFINITE_NS``
+    is infinite. ``depth`` is often 0: publishers do not announce it.
     """
 
     history: str
@@ -39,10 +39,9 @@ class BagQos:
 class BagTopic:
     """One topic of a bag; two types on one name are two topics.
 
-    ``offered_qos`` has one entry per publisher that was recorded. ``message_count`` counts the
-    whole recording, whatever the start offset. ``schema_text`` is the type's definition in
-    ``schema_encoding`` (``ros2msg`` or ``ros2idl``) with its dependencies, if the recording
-    carries it; ``type_hash`` is ``RIHS01_...`` or empty.
+    ``offered_qos`` has one entry per recorded publisher. ``message_count`` counts the whole
+    recording. ``schema_text`` is the type's definition with dependencies in ``schema_encoding``
+    (``ros2msg`` or ``ros2idl``), if recorded; ``type_hash`` is ``RIHS01_...`` or empty.
     """
 
     name: str
@@ -56,15 +55,13 @@ class BagTopic:
 
     @property
     def qos(self) -> BagQos | None:
-        """What all recorded publishers offered alike, or ``None`` when unknown or at odds."""
+        """The QoS of all recorded publishers, None if unknown or different."""
         distinct = set(self.offered_qos)
         return next(iter(distinct)) if len(distinct) == 1 else None
 
 
-# Reading ``offered_qos_profiles``, whose form has changed with rosbag2's versions.
-#
-# It is a YAML text (in storage files, and in metadata.yaml up to version 8) or a list already
-# parsed (metadata.yaml from version 9); policies are numbers (up to version 8) or words.
+# ``offered_qos_profiles`` is YAML text (in storage files, and in metadata.yaml up to version 8) or
+# a parsed list (metadata.yaml from version 9); policies are numbers (up to version 8) or words.
 
 # In the order of the enumerations in rmw/types.h.
 HISTORY = ("system_default", "keep_last", "keep_all", "unknown")
@@ -79,14 +76,14 @@ LIVELINESS = (
     "best_available",
 )
 
-# How DDS, and ROS 2 until Galactic, wrote a duration without end.
+# An infinite duration in DDS, and in ROS 2 until Galactic.
 _DDS_INFINITE = (0x7FFFFFFF, 0xFFFFFFFF)
 
 
 def parse_qos(profiles: object) -> tuple[BagQos, ...]:
-    """Return the profiles in a YAML text or parsed list. Raises ``ValueError`` when it is neither.
+    """Return the profiles in a YAML text or parsed list. Raises ``ValueError`` for anything else.
 
-    What a profile leaves out is "unknown" or 0, as for a publisher that did not say.
+    Missing values are "unknown" or 0.
     """
     if isinstance(profiles, str):
         return _parse_text(profiles)
@@ -97,7 +94,7 @@ def parse_qos(profiles: object) -> tuple[BagQos, ...]:
     return tuple(_profile(item) for item in profiles)
 
 
-# A recording repeats the same few texts for its many topics, and parsing YAML is slow.
+# A recording repeats few texts for many topics, and parsing YAML is slow.
 @lru_cache(maxsize=256)
 def _parse_text(text: str) -> tuple[BagQos, ...]:
     if not text.strip():
@@ -152,27 +149,16 @@ def _duration_ns(value: Any) -> int:
     return min(max(sec * NS_PER_S + nsec, 0), DURATION_INFINITE_NS)
 
 
-# What a bag needs from a storage format: one file of it, as topics and pieces.
-
-
 @dataclass(frozen=True, slots=True)
-class StoredTopic:
-    """A topic (in MCAP: a channel) of one storage file; ``id`` is the file's own."""
+class StoredTopic(BagTopic):
+    """A topic (in MCAP: a channel) of one storage file; ``id`` is unique in the file."""
 
     id: int
-    name: str
-    type_name: str
-    serialization_format: str
-    offered_qos: tuple[BagQos, ...]
-    message_count: int
-    schema_text: str | None
-    schema_encoding: str
-    type_hash: str
 
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """A part of a storage file that is read as one: its place and the times it may hold."""
+    """A part of a storage file that is read at once: its position and time span."""
 
     offset: int
     length: int
@@ -183,8 +169,7 @@ class Extent:
 class Storage(Protocol):
     """One open storage file. Every method raises ``BagError`` naming the file.
 
-    ``wanted`` maps the file's topic ids to the indices given to messages; messages before
-    ``first_ns`` are left out.
+    ``wanted`` maps the file's topic ids to topic indices; messages before ``first_ns`` are skipped.
     """
 
     topics: list[StoredTopic]
@@ -192,18 +177,20 @@ class Storage(Protocol):
     start_ns: int
     end_ns: int
     cut_off: str
-    """What is left of a file that was cut off, in words; empty for a whole one."""
+    """How much of a truncated file is left, in words; empty for a whole one."""
     with_publish_time: bool
-    """Set it to get the publish time in front of each message: 8 bytes, little-endian."""
+    """If set, messages begin with the publish time: 8 bytes, little-endian."""
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
-        """Return the parts that may hold wanted messages, in file order."""
+        """Return the parts that may contain wanted messages, in file order."""
 
-    def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
+    def read(
+        self, extent: Extent, wanted: Mapping[int, int], first_ns: int
+    ) -> Iterator[BagMessage]:
         """Yield the wanted messages of a part in time order, equal times in file order."""
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
-        """Return how many wanted messages there are."""
+        """Return the number of wanted messages."""
 
     def last_ns(self, wanted: Mapping[int, int], first_ns: int) -> int | None:
         """Return the time of the last wanted message."""

@@ -1,23 +1,26 @@
-"""The decoded messages of a topic as record batches, a column for each field."""
+"""The decoded messages of a topic as record batches, one column per field."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError, did_you_mean
-from rsltrace.trace.cdr import STAND_IN_TYPE
+from rsltrace.trace.cdr import WIDE_TEXT_TYPE
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NO_FIELD
-from rsltrace.trace.tables.rows import Labels, Source, node_names, whole_numbers
-from rsltrace.trace.tables.table import Table
+from rsltrace.trace.tables.rows import TextDictionary, node_names, whole_numbers
+from rsltrace.trace.tables.table import TraceTable
+
+if TYPE_CHECKING:
+    from rsltrace.trace.reader import Trace
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20
@@ -29,51 +32,51 @@ _BYTES = {"byte": "uint8", "char": "uint8"}
 _ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
 
 
-class _Field(NamedTuple):
-    """A field by its path, and what its schema says of it."""
+class _MessageColumn(NamedTuple):
+    """A field by its path, with its description from the schema."""
 
     path: str
     description: Any
 
 
 def message_table(
-    trace: Source,
+    trace: Trace,
     decoder_of: Callable[[ChannelInfo], Decoder],
     topic: str,
     fields: Sequence[str] | None,
     type_name: str | None,
-) -> Table:
-    """Return the messages of a topic as a table. Raises TraceError for what is not there."""
+) -> TraceTable:
+    """Return the messages of a topic as a table. Raises TraceError for unknown ones."""
     channel = _channel(trace, topic, type_name)
     try:
         decoder = decoder_of(channel)
     except TraceError as error:
         raise TraceError(f"{trace.name}: {error}") from error
-    chosen = _chosen(trace, decoder, topic, fields)
+    chosen = _selected_columns(trace, decoder, topic, fields)
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
-        nodes = Labels(arrow, node_names(trace.entities))
+        nodes = TextDictionary(arrow, node_names(trace.entities))
         whole = arrow.int64()
         types = [_arrow_type(arrow, decoder, field.description) for field in chosen]
         own = zip(_OWN, (whole, whole, nodes.type, arrow.uint32()), strict=True)
-        # A field of the message may have the name of a column of ours; it is that of the message.
+        # A message field may have the name of an own column, which then gets an underscore.
         named = [(f"_{name}" if name in {f.path for f in chosen} else name, t) for name, t in own]
         schema = arrow.schema(
             [*named, *((field.path, t) for field, t in zip(chosen, types, strict=True))]
         )
         return schema, _batches(arrow, schema, trace, channel, decoder, chosen, nodes)
 
-    return Table(make)
+    return TraceTable(make)
 
 
 def _batches(
     arrow: Any,
     schema: Any,
-    trace: Source,
+    trace: Trace,
     channel: ChannelInfo,
     decoder: Decoder,
-    chosen: Sequence[_Field],
-    nodes: Labels,
+    chosen: Sequence[_MessageColumn],
+    nodes: TextDictionary,
 ) -> Iterator[Any]:
     senders = _Senders(trace, channel)
     getters = [attrgetter(field.path) for field in chosen]
@@ -117,9 +120,9 @@ def _batches(
 
 
 class _Senders:
-    """By the number of a message of a channel: the event it was sent in, and by whom."""
+    """By the number of a channel's message: its event and its sender."""
 
-    def __init__(self, trace: Source, channel: ChannelInfo) -> None:
+    def __init__(self, trace: Trace, channel: ChannelInfo) -> None:
         sent = {
             (kind.value, entity)
             for entity in trace.entities
@@ -134,7 +137,7 @@ class _Senders:
                 if len(entities):
                     own |= (outputs["kind"] == kind) & np.isin(outputs["entity"], entities)
             found.append(outputs[own & (outputs["sequence"] != NO_SEQUENCE)])
-        # A message may be an output twice: as what was logged, and as what was published.
+        # A message may be an output twice: as a log record and as a published message.
         rows = np.concatenate(found) if found else np.zeros(0, [("sequence", "<u4")])
         self._sequences, first = np.unique(rows["sequence"], return_index=True)
         self._rows = rows[first]
@@ -142,7 +145,7 @@ class _Senders:
     def of(
         self, sequences: npt.NDArray[np.uint32]
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32]]:
-        """Return the events of messages (-1: none has sent it) and the ids of their senders."""
+        """Return the events of messages (-1: none) and the ids of their senders."""
         if not len(self._rows):
             nobody = np.full(len(sequences), NO_SEQUENCE, dtype=np.uint32)
             return np.full(len(sequences), -1, dtype=np.int64), nobody
@@ -155,8 +158,8 @@ class _Senders:
         return events, owners
 
 
-def _channel(trace: Source, topic: str, type_name: str | None) -> ChannelInfo:
-    """Return the channel that is meant."""
+def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
+    """Return the channel of a topic and type."""
     found = [channel for channel in trace.channels.values() if channel.topic == topic]
     if not found:
         topics = {channel.topic for channel in trace.channels.values()}
@@ -174,10 +177,10 @@ def _channel(trace: Source, topic: str, type_name: str | None) -> ChannelInfo:
     return wanted[0]
 
 
-def _chosen(
-    trace: Source, decoder: Decoder, topic: str, fields: Sequence[str] | None
-) -> list[_Field]:
-    """Return the columns for the fields that are wanted, in their order."""
+def _selected_columns(
+    trace: Trace, decoder: Decoder, topic: str, fields: Sequence[str] | None
+) -> list[_MessageColumn]:
+    """Return the columns for the requested fields, in order."""
     if isinstance(fields, str):
         fields = [fields]
     if (count := _count(decoder, decoder.name, {})) > _FIELDS_MAX:
@@ -185,7 +188,7 @@ def _chosen(
     every = list(_leaves(decoder, "", decoder.name))
     if fields is None:
         return every
-    chosen: dict[str, _Field] = {}
+    chosen: dict[str, _MessageColumn] = {}
     for wanted in fields:
         found = [one for one in every if f"{one.path}.".startswith(f"{wanted}.")]
         if not found:
@@ -196,7 +199,7 @@ def _chosen(
 
 
 def _count(decoder: Decoder, interface: str, known: dict[str, int]) -> int:
-    """Return how many fields an interface has, with those of the messages in it."""
+    """Return the number of fields of an interface, nested ones included."""
     if interface not in known:
         kinds = [d[0] if k in _ARRAYS else (k, d) for _, (k, d) in decoder.types[interface][1]]
         known[interface] = sum(
@@ -206,16 +209,16 @@ def _count(decoder: Decoder, interface: str, known: dict[str, int]) -> int:
     return known[interface]
 
 
-def _leaves(decoder: Decoder, prefix: str, interface: str) -> Iterator[_Field]:
-    """Yield the fields of an interface, with those of messages in it in their place."""
+def _leaves(decoder: Decoder, prefix: str, interface: str) -> Iterator[_MessageColumn]:
+    """Yield the fields of an interface, with those of nested messages in their place."""
     for name, description in decoder.types[interface][1]:
         kind, detail = description
         if name == NO_FIELD:
             continue
-        if kind == Nodetype.NAME and detail != STAND_IN_TYPE:
+        if kind == Nodetype.NAME and detail != WIDE_TEXT_TYPE:
             yield from _leaves(decoder, f"{prefix}{name}.", str(detail))
         else:
-            yield _Field(f"{prefix}{name}", description)
+            yield _MessageColumn(f"{prefix}{name}", description)
 
 
 def _arrow_type(arrow: Any, decoder: Decoder, description: Any) -> Any:
@@ -225,7 +228,7 @@ def _arrow_type(arrow: Any, decoder: Decoder, description: Any) -> Any:
         base = _BYTES.get(detail[0], detail[0])
         return getattr(arrow, _NAMES.get(base, base))()
     if kind == Nodetype.NAME:
-        if detail == STAND_IN_TYPE:
+        if detail == WIDE_TEXT_TYPE:
             return arrow.string()
         inner = [
             arrow.field(name, _arrow_type(arrow, decoder, one))
@@ -237,9 +240,9 @@ def _arrow_type(arrow: Any, decoder: Decoder, description: Any) -> Any:
 
 
 def _as_arrow(decoder: Decoder, description: Any) -> Callable[[Any], Any] | None:
-    """Return what makes a decoded value one that Arrow takes; None if it is."""
+    """Return a function that converts a decoded value for Arrow; None if it needs none."""
     kind, detail = description
-    if kind == Nodetype.NAME and detail != STAND_IN_TYPE:
+    if kind == Nodetype.NAME and detail != WIDE_TEXT_TYPE:
         inner = [
             (name, _as_arrow(decoder, one))
             for name, one in decoder.types[str(detail)][1]

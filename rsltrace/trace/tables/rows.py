@@ -1,7 +1,7 @@
-"""Events, outputs and entities as record batches: a segment of rows becomes columns.
+"""Events, outputs and entities as record batches: the rows of a segment become columns.
 
-A segment lies in memory row by row, Arrow wants columns: each is copied out once, as it is. Names
-and kinds are dictionary-encoded, so a row costs a number for each.
+A segment is stored by rows, Arrow needs columns: each is copied once. Names and kinds are
+dictionary-encoded, so each row has one number for them.
 """
 
 from __future__ import annotations
@@ -9,49 +9,33 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
     EventFlag,
     EventKind,
-    Output,
     OutputKind,
 )
-from rsltrace.trace.tables.table import Table
+from rsltrace.trace.tables.table import TraceTable
+
+if TYPE_CHECKING:
+    from rsltrace.trace.reader import Trace
 
 _WHOLE_MAX = np.uint64(2**63 - 1)
 
 
-class Source(Protocol):
-    """What a table needs of a trace."""
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def entities(self) -> dict[int, Entity]: ...
-    @property
-    def channels(self) -> Mapping[int, ChannelInfo]: ...
-    def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]: ...
-    def outputs(
-        self, first: int = 0, last: int | None = None
-    ) -> Iterator[npt.NDArray[np.void]]: ...
-    def channel_of(self, output: Output) -> ChannelInfo | None: ...
-    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]: ...
-
-
-class Labels:
-    """Texts that many rows have, in Arrow's dictionary encoding: by a number of each row."""
+class TextDictionary:
+    """Texts shared by many rows, in Arrow's dictionary encoding."""
 
     def __init__(self, arrow: Any, texts: Mapping[int, str | None]) -> None:
-        """``texts`` are those of the rows' numbers; those missing, and None, become null."""
+        """``texts`` maps numbers to texts; missing numbers and None become null."""
         known = dict.fromkeys(text for text in texts.values() if text is not None)
         places = {text: place for place, text in enumerate(known)}
         self._arrow = arrow
@@ -63,27 +47,27 @@ class Labels:
         self.type = arrow.dictionary(arrow.int32(), arrow.string())
 
     def of(self, numbers: npt.NDArray[np.unsignedinteger]) -> Any:
-        """Return the texts of some rows."""
+        """Return the texts of rows by their numbers."""
         places = self._places[np.minimum(numbers, len(self._places) - 1)]
         indices = self._arrow.array(places, mask=places < 0)
         return self._arrow.DictionaryArray.from_arrays(indices, self._texts)
 
 
 def node_names(entities: Mapping[int, Entity]) -> dict[int, str | None]:
-    """Return the names of the entities' nodes; None for what belongs to the run itself."""
+    """Return the names of the entities' nodes; None for the run."""
     nodes = {e.id: entities.get(e.node) for e in entities.values()}
     return {number: node.name if node and node.id else None for number, node in nodes.items()}
 
 
-def event_table(trace: Source, first: int, last: int | None) -> Table:
+def event_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     """Return the events as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, hashes, number = arrow.int64(), arrow.uint64(), arrow.uint32()
         entities = trace.entities
-        kinds = Labels(arrow, {kind.value: kind.label for kind in EventKind})
-        nodes = Labels(arrow, node_names(entities))
-        names = Labels(arrow, {e.id: e.name or None for e in entities.values()})
+        kinds = TextDictionary(arrow, {kind.value: kind.label for kind in EventKind})
+        nodes = TextDictionary(arrow, node_names(entities))
+        names = TextDictionary(arrow, {e.id: e.name or None for e in entities.values()})
         schema = arrow.schema(
             {
                 "index": whole,
@@ -128,19 +112,19 @@ def event_table(trace: Source, first: int, last: int | None) -> Table:
 
         return schema, map(batch, trace.events(first, last))
 
-    return Table(make)
+    return TraceTable(make)
 
 
-def output_table(trace: Source, first: int, last: int | None) -> Table:
+def output_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     """Return the outputs as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
         whole, number = arrow.int64(), arrow.uint32()
         entities = trace.entities
-        kinds = Labels(arrow, {kind.value: kind.label for kind in OutputKind})
-        nodes = Labels(arrow, node_names(entities))
-        names = Labels(arrow, {e.id: e.name or None for e in entities.values()})
-        types = Labels(arrow, {e.id: e.type or None for e in entities.values()})
+        kinds = TextDictionary(arrow, {kind.value: kind.label for kind in OutputKind})
+        nodes = TextDictionary(arrow, node_names(entities))
+        names = TextDictionary(arrow, {e.id: e.name or None for e in entities.values()})
+        types = TextDictionary(arrow, {e.id: e.type or None for e in entities.values()})
         schema = arrow.schema(
             {
                 "event": whole,
@@ -176,10 +160,10 @@ def output_table(trace: Source, first: int, last: int | None) -> Table:
         pairs = zip(trace.events(first, last), trace.outputs(first, last), strict=True)
         return schema, map(batch, pairs)
 
-    return Table(make)
+    return TraceTable(make)
 
 
-def entity_table(trace: Source) -> Table:
+def entity_table(trace: Trace) -> TraceTable:
     """Return the entities as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
@@ -199,18 +183,18 @@ def entity_table(trace: Source) -> Table:
         arrays = [arrow.array(values, kind) for kind, values in columns.values()]
         return schema, iter([arrow.record_batch(arrays, schema=schema)])
 
-    return Table(make)
+    return TraceTable(make)
 
 
-def whole_numbers(trace: Source, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
-    """Return indexes or stamps as signed integers, whose differences are no surprise."""
+def whole_numbers(trace: Trace, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+    """Return indexes or stamps as signed integers, which can be subtracted."""
     if len(values) and values.max() > _WHOLE_MAX:
         raise TraceError(f"{trace.name}: an event is later than any time of ROS")
     return values.astype(np.int64)
 
 
 def check_kinds(
-    trace: Source, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
+    trace: Trace, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
 ) -> None:
     """Raise TraceError for a kind that this version does not know."""
     unknown = set(np.unique(values).tolist()) - {kind.value for kind in known}

@@ -1,4 +1,4 @@
-"""A table whose rows are read when they are asked for: as Arrow, as pandas, or as a stream."""
+"""A table whose rows are read when needed: for Arrow, pandas, or as a stream."""
 
 from __future__ import annotations
 
@@ -8,31 +8,31 @@ from typing import Any
 from rsltrace.errors import SetupError
 
 Makers = Callable[[Any], tuple[Any, Iterator[Any]]]
-"""Given pyarrow: the schema of a table, and its rows as record batches."""
+"""Given pyarrow, returns the schema of a table and its rows as record batches."""
 
 
-class Table:
+class TraceTable:
     """A table of a trace. Each use reads the trace again, which must still be open.
 
-    Libraries that know Arrow's PyCapsule interface take it as it is: ``polars.DataFrame(table)``.
+    Libraries with Arrow's PyCapsule interface accept it: ``polars.DataFrame(table)``.
     """
 
     def __init__(self, make: Makers) -> None:
         self._make = make
 
     def to_arrow(self) -> Any:
-        """Return a ``pyarrow.Table``, of a chunk per segment of the trace.
+        """Return a ``pyarrow.Table`` with one chunk per segment.
 
-        A segment's rows are unpacked, and each column is copied out of them once. Raises
-        SetupError if pyarrow is not installed, TraceError where the trace is damaged.
+        Each column is copied once. Raises SetupError without pyarrow, TraceError where the trace is
+        damaged.
         """
         arrow = _arrow()
         schema, batches = self._make(arrow)
         return arrow.Table.from_batches(list(batches), schema)
 
     def to_pandas(self) -> Any:
-        """Return a ``pandas.DataFrame``: numbers as they are, also beside nulls; labels as
-        categories. Raises SetupError if pandas or pyarrow is not installed."""
+        """Return a ``pandas.DataFrame``: integers stay integers, also beside nulls; texts are
+        categories. Raises SetupError without pandas or pyarrow."""
         arrow = _arrow()
         try:
             import pandas
@@ -44,7 +44,7 @@ class Table:
             arrow.uint64(): pandas.UInt64Dtype(),
             arrow.uint32(): pandas.UInt32Dtype(),
         }
-        # pandas would make floats of whole numbers beside nulls, which rounds hashes.
+        # pandas converts integers beside nulls to floats, which rounds hashes.
         columns = {
             name: table[name].to_pandas(
                 types_mapper=numbers.get if table[name].null_count else None
@@ -54,12 +54,12 @@ class Table:
         return pandas.DataFrame(columns, copy=False)
 
     def to_reader(self) -> Any:
-        """Return a ``pyarrow.RecordBatchReader``, which reads a segment of the trace at a time."""
+        """Return a ``pyarrow.RecordBatchReader``, which reads one segment at a time."""
         arrow = _arrow()
         return arrow.RecordBatchReader.from_batches(*self._make(arrow))
 
     def __arrow_c_stream__(self, requested_schema: Any = None) -> Any:
-        """Give the rows to another library as a stream."""
+        """Pass the rows to another library as a stream."""
         return self.to_reader().__arrow_c_stream__(requested_schema)
 
 

@@ -1,4 +1,4 @@
-"""The code of callbacks and of outputs, on this machine: traces name files as they are imported."""
+"""The source code of callbacks and outputs on this machine: traces have module file names."""
 
 from __future__ import annotations
 
@@ -20,25 +20,24 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.logs import log_record
 
 ELSEWHERE = "elsewhere"
-"""Beside the places from which an output may have come: it was not looked at."""
+"""Listed with an output's possible lines: its own line was not noted."""
 _SENT = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST))
 _LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKind.ACTION))
-"""Kinds of events that may run another function than the callback of their entity."""
+"""Kinds of events that may run another function than their entity's callback."""
 _PLACES_SHOWN = 3
 
 
 def code_place(trace: Trace, event: Event) -> str:
-    """Return the one place of ``code_places``, "" if there is none or there are several."""
+    """Return the only entry of ``code_places``, "" for none or several."""
     places = code_places(trace, event)
     return places[0] if len(places) == 1 else ""
 
 
 def code_places(trace: Trace, event: Event) -> list[str]:
-    """Return ``module.py:24`` of the function that an event ran: a constructor's for a node that
-    was made in it, the call's for an answer that somebody awaits.
+    """Return ``module.py:24`` of the function that an event ran: the constructor of a new node, the
+    call of an awaited response.
 
-    There are several where its entity has run several and nobody knows which, none if nobody knows
-    any.
+    Several if the entity ran several and it is unknown which; none if unknown.
     """
     entity = event.entity
     if event.kind is EventKind.CONSTRUCT:
@@ -62,11 +61,11 @@ def _functions(lines: list[CodeLine], event: Event) -> list[str]:
 
 
 def output_places(trace: Trace, output: Output) -> list[str]:
-    """Return the lines (``module.py:31``) from which a message, call or log record came, or before
-    which another thread went on.
+    """Return the lines (``module.py:31``) that a message, call or log record came from, or before
+    which another thread continued.
 
-    There are several where its callback had sent from several until then, none if nobody knows.
-    The last is ``ELSEWHERE`` where a run has not looked at the output.
+    Several if the callback had sent from several until then; none if unknown. The last is
+    ``ELSEWHERE`` if the output's line was not noted.
     """
     if output.kind is OutputKind.LOG:
         record = log_record(trace, output)
@@ -92,7 +91,7 @@ def output_places(trace: Trace, output: Output) -> list[str]:
 
 
 def entity_places(trace: Trace, entity: Entity) -> list[str]:
-    """Return where the functions are that an entity runs, then the lines from which it sends."""
+    """Return the functions that an entity runs, then the lines from which it sends."""
     lines = trace.code_lines.get(entity.id, [])
     ran = [line.place for line in lines if line.output == NO_SEQUENCE]
     sent = [line.place for line in lines if line.output != NO_SEQUENCE]
@@ -100,14 +99,14 @@ def entity_places(trace: Trace, entity: Entity) -> list[str]:
 
 
 def places_text(places: list[str], joint: str = " or ") -> str:
-    """Return places as one text; of many the first: ``a.py:3 or a.py:9``."""
+    """Return places as one text, shortened: ``a.py:3 or a.py:9``."""
     more = len(places) - _PLACES_SHOWN
     shown = places[:_PLACES_SHOWN] + ([f"{more} more"] if more > 0 else [])
     return joint.join(shown)
 
 
 def place_here(trace: Trace, place: str) -> str:
-    """Return a place by its path in the present folder if it is below that, or else as it is."""
+    """Return a place relative to the working directory if it is below, else unchanged."""
     found = code_file(trace, place)
     if found is None or found[0].is_absolute() or ".." in found[0].parts:
         return place
@@ -115,10 +114,10 @@ def place_here(trace: Trace, place: str) -> str:
 
 
 def code_file(trace: Trace, place: str) -> tuple[Path, int] | None:
-    """Return file and line (from 1) of a place, if a file of that name is where the job's are.
+    """Return file and line (from 1) of a place, if such a file is found.
 
-    Looked for below the present folder and that of the trace, in the folders of the job's
-    ``search_path``. Nothing says that it is the file of then: see ``rsltrace:sources``.
+    Searched below the working directory and the trace's folder, in the job's ``search_path``. It
+    may differ from the recorded file: see ``rsltrace:sources``.
     """
     name, _, line = place.rpartition(":")
     path = PurePosixPath(name)

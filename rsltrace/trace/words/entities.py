@@ -1,4 +1,4 @@
-"""What entities are called: within one trace by their ids, and whatever their ids are."""
+"""Names of entities: by their ids in one trace, and independent of ids."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from fnmatch import fnmatchcase
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.texts import printable
 
-# Names and levels as people type them, in filters and in breakpoints.
-
 LOG_LEVELS = {"debug": 10, "info": 20, "warn": 30, "warning": 30, "error": 40, "fatal": 50}
 
 
 def is_named(pattern: str, name: str) -> bool:
-    """Whether a name is meant: a glob matches it whole, ``/x`` is it, ``x`` is contained in it."""
+    """Whether a name matches: a glob as a whole, ``/x`` exactly, ``x`` as a part."""
     if any(c in pattern for c in "*?["):
         return fnmatchcase(name, pattern)
     if pattern.startswith("/"):
@@ -24,14 +22,14 @@ def is_named(pattern: str, name: str) -> bool:
 
 
 RUN_NAME = "(run)"
-"""Stands for a node where something belongs to the run itself."""
+"""The displayed node of what belongs to the run itself."""
 
 
 @dataclass(frozen=True, slots=True)
 class EntityKey:
-    """An entity by what it is, whatever its id in a trace.
+    """An entity independent of its id.
 
-    ``ordinal`` tells apart entities that are otherwise alike: 0, 1, … in creation order.
+    ``ordinal`` distinguishes otherwise equal entities: 0, 1, … in creation order.
     """
 
     node: str
@@ -46,7 +44,7 @@ class EntityKey:
 
 
 class EntityNames:
-    """The names of one trace's entities by id, safe to print."""
+    """The names of one trace's entities by id, printable."""
 
     def __init__(self, entities: Mapping[int, Entity]) -> None:
         self._names: dict[int, tuple[str, str]] = {0: ("", "")}
@@ -57,17 +55,17 @@ class EntityNames:
             self._names[entity.id] = node, name
 
     def node(self, entity_id: int) -> str:
-        """Return the name of the node that an entity belongs to; nothing for the run."""
+        """Return the name of an entity's node; empty for the run."""
         return self._names.get(entity_id, ("", ""))[0]
 
     def name(self, entity_id: int) -> str:
         """Return an entity's name, or its kind if it has none; ``#7`` if the trace does not
-        describe it, nothing for the run."""
+        describe it, empty for the run."""
         return self._names.get(entity_id, ("", f"#{entity_id}"))[1]
 
     @property
     def longest_node(self) -> int:
-        """The length of the longest name of a node."""
+        """The length of the longest node name."""
         return max(len(node) for node, _ in self._names.values())
 
     @property

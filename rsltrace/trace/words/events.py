@@ -1,4 +1,4 @@
-"""The events of one trace in words: whose they are, what ran, and everything they did."""
+"""Words for the events of one trace: the node, what ran, and every output."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from rsltrace.trace.words.entities import EntityNames
 from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.logs import log_record
 
-# What an output is, in a few words, as far as its record tells: without its payload.
-
 _NAMELESS = frozenset((OutputKind.LOG, OutputKind.EXCEPTION, OutputKind.SHUTDOWN))
-"""Kinds of which one says what, not of whom: the event's node."""
+"""Kinds that are shown without a name: they belong to the event's node."""
 
 
 def output_text(kind: int, name: str, entity_kind: str) -> str:
@@ -40,7 +38,7 @@ def output_text(kind: int, name: str, entity_kind: str) -> str:
 
 
 def counted(texts: Iterable[str]) -> Iterator[str]:
-    """Yield texts; of equal ones next to each other, one and how many: ``/odom ×3``."""
+    """Yield texts; equal neighbours once with their number: ``/odom ×3``."""
     for text, same in groupby(texts):
         count = sum(1 for _ in same)
         yield text if count == 1 else f"{text} ×{count}"
@@ -52,7 +50,7 @@ _WITHOUT_DETAIL = frozenset(
 
 
 class EventWords:
-    """Puts the events of a trace in words. What it returns is safe to print."""
+    """Words for the events of a trace. Results are printable."""
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
@@ -60,7 +58,7 @@ class EventWords:
         self.names = EntityNames(trace.entities)
 
     def node(self, event: Event, outputs: Sequence[Output]) -> str:
-        """Return the node of an event: of a constructor, the one that it made; "" for the run."""
+        """Return the node of an event: for a constructor the new node; "" for the run."""
         if event.kind is EventKind.CONSTRUCT:
             for output in outputs:
                 entity = self._entities.get(output.entity)
@@ -69,7 +67,7 @@ class EventWords:
         return self.names.node(event.entity)
 
     def output(self, output: Output) -> str:
-        """Return an output with what its payload says: ``log WARN too far``, ``delay 5 ms``."""
+        """Return an output with its payload in words: ``log WARN too far``, ``delay 5 ms``."""
         kind, name = output.kind, self.names.name(output.entity)
         if kind is OutputKind.LOG:
             record = log_record(self._trace, output)
@@ -89,9 +87,9 @@ class EventWords:
     def outputs(
         self, outputs: Sequence[Output], more: Callable[[Output], str] = lambda output: ""
     ) -> Iterator[str]:
-        """Yield the outputs of an event; repeated ones, and what every node has, are counted.
+        """Yield the outputs of an event, counting repeated ones and those that every node has.
 
-        ``more`` gives what else to say of one.
+        ``more`` returns an addition for each.
         """
         built_in = 0
         own = []

@@ -1,4 +1,4 @@
-"""Kinds of events and outputs, and flags, in words."""
+"""Words for kinds of events and outputs, and for flags."""
 
 from __future__ import annotations
 

@@ -1,7 +1,6 @@
-"""Log records, read from their bytes.
+"""Log records, parsed from their bytes.
 
-They are in sight all the time, and the decoder that goes by schemas takes longer to load than
-everything else on a first screen.
+They are shown often, and loading the schema decoder takes longer than the rest of a first screen.
 """
 
 from __future__ import annotations
@@ -17,18 +16,18 @@ from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
-# What somebody waits for in vain: a topic that nobody publishes, a service or an action that
-# nobody serves. A name that is misspelt, most often, or a node that is missing.
+# Topics without publisher, services and actions without server: mostly a misspelt name or a missing
+# node.
 
 _STANDARD = frozenset((*NODE_TOPICS, "/clock", "/tf", "/tf_static", "/diagnostics", "/joy"))
-"""What nodes listen to in case that somebody publishes it."""
+"""Topics that nodes subscribe to in case that somebody publishes them."""
 
 _HIDDEN = "/_"
 _NAMED_MAX = 3
 
 
 def silent_topics(entities: Iterable[Entity]) -> str:
-    """Return ``nobody publishes /scan, which /follower listens to``, "" if all is well."""
+    """Return ``nobody publishes /scan, which /follower listens to``, "" if all are published."""
     nodes: dict[int, str] = {}
     published: set[str] = set()
     heard: dict[str, dict[str, None]] = {}
@@ -50,11 +49,11 @@ def silent_topics(entities: Iterable[Entity]) -> str:
         topic, listeners = silent[0]
         verb = "listen" if len(listeners) > 1 else "listens"
         return f"nobody publishes {printable(topic)}, which {_and(list(listeners))} {verb} to"
-    return f"nobody publishes what is listened to: {_several(silent, 'topics')}"
+    return f"topics without a publisher: {_names_text(silent, 'topics')}"
 
 
 def without_server(entities: Iterable[Entity]) -> str:
-    """Return ``nobody serves /reset, of which /panel is a client``, "" if all is well."""
+    """Return ``nobody serves /reset, of which /panel is a client``, "" if there is none."""
     nodes: dict[int, str] = {}
     served: set[str] = set()
     called: dict[str, dict[str, None]] = {}
@@ -78,14 +77,14 @@ def without_server(entities: Iterable[Entity]) -> str:
         name, clients = missing[0]
         verb = "are clients" if len(clients) > 1 else "is a client"
         return f"nobody serves {printable(name)}, of which {_and(list(clients))} {verb}"
-    return f"nobody serves what there are clients of: {_several(missing, 'services')}"
+    return f"services without a server: {_names_text(missing, 'services')}"
 
 
-def _several(found: list[tuple[str, dict[str, None]]], what: str) -> str:
+def _names_text(found: list[tuple[str, dict[str, None]]], what: str) -> str:
     """Return ``/a (for /x), /b (for /y) and 2 more topics``."""
-    told = [f"{printable(name)} (for {_and(list(whom))})" for name, whom in found[:_NAMED_MAX]]
+    texts = [f"{printable(name)} (for {_and(list(whom))})" for name, whom in found[:_NAMED_MAX]]
     more = len(found) - _NAMED_MAX
-    return f"{', '.join(told)}{f' and {more} more {what}' if more > 0 else ''}"
+    return f"{', '.join(texts)}{f' and {more} more {what}' if more > 0 else ''}"
 
 
 def _and(names: list[str]) -> str:
@@ -117,7 +116,7 @@ class LogRecord:
 
 
 def log_record(trace: Trace, output: Output) -> LogRecord | None:
-    """Return the log record of an output of kind LOG; None if it was not kept or is unreadable."""
+    """Return the log record of an output; None if it was not recorded or is unreadable."""
     try:
         found = trace.payload(output)
         channel = trace.channel_of(output)
@@ -129,7 +128,7 @@ def log_record(trace: Trace, output: Output) -> LogRecord | None:
 
 
 def parse_log(data: bytes) -> LogRecord:
-    """Read a ``rcl_interfaces/msg/Log`` in CDR. Raises ValueError for anything else."""
+    """Parse an ``rcl_interfaces/msg/Log`` in CDR. Raises ValueError for anything else."""
     try:
         _, _, level = _HEAD.unpack_from(data)
         name, position = _string(data, _HEAD.size)

@@ -12,13 +12,11 @@ from rsltrace.trace.model.texts import format_seconds, printable
 if TYPE_CHECKING:
     from rsltrace.trace.words.entities import EntityKey
 
-# Text on a terminal or in a pipe: aligned and stable.
-
 
 def table(rows: Iterable[Sequence[str]], *, right: frozenset[int] = frozenset()) -> list[str]:
     """Return ``rows`` as lines with aligned columns, two spaces apart.
 
-    ``right`` names the columns that are aligned to the right. No line ends in spaces.
+    ``right`` has the columns that are aligned to the right. No line ends in spaces.
     """
     cells = [list(row) for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -40,7 +38,7 @@ _PARTS = {
     "feedback": "feedback",
     "status": "status",
 }
-"""What a person calls the services and topics that an action is made of."""
+"""Words for the services and topics of an action."""
 
 
 def event_title(kind: EventKind, entity: EntityKey) -> str:
@@ -94,7 +92,7 @@ def at_time(stamp_ns: int) -> str:
 
 
 def as_sentence(text: str) -> str:
-    """Return a text with a capital and a full stop, whoever made it."""
+    """Return a text with a capital letter and a full stop."""
     text = printable(text).strip()
     text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."

@@ -263,7 +263,7 @@ def _tell_of_import(thread: Any, frame: FrameType) -> None:
     guard = engaged()
     if guard is not None and guard.mode(Source.THREAD, frame) is not Mode.ALLOW:
         call = f"threading.Thread.start() while {module_of(frame)} is imported"
-        guard.found(Source.THREAD, Mode.WARN, call, thread.name, frame)
+        guard.report(Source.THREAD, Mode.WARN, call, thread.name, frame)
 
 
 def _start_late(timer: Any, frame: FrameType | None = None) -> None:

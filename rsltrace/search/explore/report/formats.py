@@ -19,6 +19,7 @@ from rsltrace.search.explore.report.exploration import (
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
+from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.model.texts import printable, printable_lines
 
 # The runs of a search as a Parquet table, one row each, for DuckDB, pandas and the like.
@@ -53,12 +54,8 @@ def write_parquet(explored: Exploration, path: Path) -> None:
         columns.append(values)
         types.append(pa.field(name, getattr(pa, kind)()))
     table = pa.table(columns, schema=pa.schema(types))
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        parquet.write_table(table, beside)
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with replacement_of(path) as work:
+        parquet.write_table(table, work)
 
 
 _COLUMNS = (

@@ -22,6 +22,7 @@ from rsltrace.search.explore.report.exploration import (
     view_command,
 )
 from rsltrace.search.explore.trial import TrialResult
+from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.model.texts import format_duration, printable, printable_lines
 
 _RUNS_MAX = 200
@@ -58,12 +59,8 @@ def write_page(explored: Exploration, path: Path) -> None:
 
     :raises OSError: it cannot be written.
     """
-    beside = path.with_name(f".{path.name}.part")
-    try:
-        beside.write_bytes(page(explored))
-        beside.replace(path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with replacement_of(path) as work:
+        work.write_bytes(page(explored))
 
 
 def page(explored: Exploration) -> bytes:

@@ -1,7 +1,6 @@
-"""An MCAP file that has no place yet: what is written waits, and is poured into a file later.
+"""An MCAP writer without a file: it buffers the records until a file is opened.
 
-The beginning of a run that many others go on from is recorded once; each of them has a file of its
-own, which begins with it.
+Many runs may share one beginning. It is recorded once, and each run's file begins with it.
 """
 
 from __future__ import annotations
@@ -10,13 +9,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from rsltrace.trace.mcap.chunk_body import ChunkBody
+from rsltrace.trace.mcap.chunk_builder import ChunkBody
 from rsltrace.trace.mcap.writer import McapWriter
 
 
-class DeferredWriter(McapWriter):
-    """Takes what an ``McapWriter`` takes up to ``pour``, as it would be on the disk. Metadata or an
-    attachment of a name that was there takes its place."""
+class BufferedWriter(McapWriter):
+    """Buffers calls of ``McapWriter`` until ``write_to``. Metadata and attachments of the same name
+    replace each other."""
 
     def __init__(self, *, compression: str, profile: str, library: str) -> None:
         self._prepare(compression, progress=lambda: "nothing is on the disk")
@@ -27,27 +26,27 @@ class DeferredWriter(McapWriter):
 
     @property
     def bytes_written(self) -> int:
-        """Nothing is written before there is a file."""
+        """0: there is no file."""
         return 0
 
     def channel(
         self, topic: str, type_name: str, schema_text: str, metadata: Mapping[str, str]
     ) -> int:
-        """Take a channel; return the id that it will have."""
+        """Buffer a channel; return its future id."""
         self._add(McapWriter.channel, topic, type_name, schema_text, metadata)
         self._channels += 1
         return self._channels
 
     def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
-        """Take a metadata record."""
+        """Buffer a metadata record."""
         self._add(McapWriter.metadata, name, mapping)
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Take an attachment."""
+        """Buffer an attachment."""
         self._add(McapWriter.attachment, name, media_type, data)
 
     def chunk(self, body: ChunkBody) -> tuple[int, int]:
-        """Take a chunk; return which one it is, and 0: where it is turns out in ``pour``."""
+        """Buffer a chunk; return its number, and 0: its offset is known after ``write_to``."""
         self._add(McapWriter.packed_chunk, body, *self.packed(body))
         self._chunks += 1
         return self._chunks - 1, 0
@@ -60,12 +59,12 @@ class DeferredWriter(McapWriter):
                     return
         self._records.append((write, what))
 
-    def pour(
+    def write_to(
         self, path: Path, *, force: bool, progress: Callable[[], str]
     ) -> tuple[McapWriter, list[tuple[int, int]]]:
-        """Create the file; return who goes on writing it, and where each chunk is.
+        """Create the file; return its writer, and where each chunk is.
 
-        :raises OutputError: the disk refuses, or there is something else.
+        :raises OutputError: the disk refuses, or something else has that name.
         """
         writer = McapWriter(
             path, force=force, compression=self._compression, progress=progress, **self._about
@@ -75,11 +74,11 @@ class DeferredWriter(McapWriter):
         except BaseException:
             writer.abort()
             raise
-        writer.trust_as(self)
+        writer.copy_compressibility(self)
         return writer, [where for write, where in found if write is McapWriter.packed_chunk]
 
     def abort(self) -> None:
-        """There is no file to close."""
+        """Do nothing: there is no file."""
 
     def poison(self) -> None:
-        """Nothing can be half written."""
+        """Do nothing: no record can be half written."""

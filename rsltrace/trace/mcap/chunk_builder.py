@@ -1,9 +1,8 @@
-"""Bodies of MCAP chunks, built in bulk.
+"""Build chunks of MCAP messages in bulk.
 
-Writing a message at a time costs several microseconds in Python; a run has 100,000 messages a
-second. So messages are collected as they come and a whole chunk of them is laid out by numpy: those
-of one size are one structured array, others are joined with headers that were made as one array.
-The message indexes of a chunk are made the same way.
+Writing one message at a time takes several microseconds in Python, and a run has 100,000 messages
+per second. So messages are collected, and numpy lays out a whole chunk of them with its message
+indexes: messages of one size as one structured array, others joined with headers from one array.
 """
 
 from __future__ import annotations
@@ -16,30 +15,42 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from rsltrace.trace.mcap.layout import MESSAGE_HEADER_DTYPE
 from rsltrace.trace.mcap.records import RECORD_HEAD
+
+MESSAGE_HEADER_DTYPE = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel_id", "<u2"),
+        ("message_sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""``message_sequence`` is MCAP's ``sequence``: messages have a field of that name, too, and share
+one layout with it."""
+
 
 _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX_ENTRY_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
 
-Waiting = list[Any]
-"""Messages that wait for their chunk: channel id, sequence, stamp in ns and data of the first, then
-of the second, and so on. One flat list holds nothing that the garbage collector has to visit."""
+PendingMessages = list[Any]
+"""Messages for the next chunk: channel id, sequence, stamp in ns and data of each. One flat list
+contains nothing that the garbage collector must visit."""
 
-WAITING_FIELDS = 4
+PENDING_FIELDS = 4
 LARGE_BYTES = 1 << 20
-"""From here on a message's data are left where they are."""
+"""Messages from this size on are not copied."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkBody:
-    """The records of a chunk before compression, and what its indexes say.
+    """The records of a chunk before compression, and the content of its indexes.
 
     ``parts`` are the records in pieces: large messages are not copied behind their headers.
-    ``start_ns`` and ``end_ns`` are the smallest and largest log times. ``indexes`` holds, by
-    ascending channel id, the channel, its number of messages and its MessageIndex record.
-    ``rows`` says that all messages have one size.
+    ``indexes`` holds, by ascending channel id, the channel, its number of messages and its
+    MessageIndex record. ``rows`` is set if all messages have one size.
     """
 
     parts: tuple[bytes, ...]
@@ -50,7 +61,7 @@ class ChunkBody:
 
     @property
     def size(self) -> int:
-        """Bytes of the records."""
+        """The size of the records in bytes."""
         return sum(map(len, self.parts))
 
     @property
@@ -59,25 +70,25 @@ class ChunkBody:
         return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
 
 
-def messages_chunk(waiting: Waiting) -> ChunkBody:
-    """Return the chunk of messages of any size and channel, in the order given (at least one)."""
-    datas: list[bytes] = waiting[3::WAITING_FIELDS]
+def messages_chunk(waiting: PendingMessages) -> ChunkBody:
+    """Return the chunk of messages of any size and channel, in order (at least one)."""
+    datas: list[bytes] = waiting[3::PENDING_FIELDS]
     count = len(datas)
-    channels = np.array(waiting[0::WAITING_FIELDS], dtype="<u2")
-    times = np.array(waiting[2::WAITING_FIELDS], dtype="<u8")
+    channels = np.array(waiting[0::PENDING_FIELDS], dtype="<u2")
+    times = np.array(waiting[2::PENDING_FIELDS], dtype="<u8")
     sizes = np.fromiter(map(len, datas), dtype="<u8", count=count) + np.uint64(_HEADER_BYTES)
     headers = np.empty(count, dtype=MESSAGE_HEADER_DTYPE)
     headers["opcode"] = Opcode.MESSAGE
     headers["length"] = sizes - np.uint64(RECORD_HEAD.size)
     headers["channel_id"] = channels
-    headers["message_sequence"] = waiting[1::WAITING_FIELDS]
+    headers["message_sequence"] = waiting[1::PENDING_FIELDS]
     headers["log_time"] = headers["publish_time"] = times
     pieces = [b""] * (2 * count)
     pieces[0::2] = headers.view(f"V{_HEADER_BYTES}").tolist()
     pieces[1::2] = datas
     offsets = np.cumsum(sizes) - sizes
     indexes = []
-    for channel_id in sorted(set(waiting[0::WAITING_FIELDS])):  # np.unique would load numpy.ma
+    for channel_id in sorted(set(waiting[0::PENDING_FIELDS])):  # np.unique would load numpy.ma
         chosen = channels == channel_id
         indexes.append(_message_index(channel_id, times[chosen], offsets[chosen]))
     parts = _joined(pieces) if int(sizes.max()) >= LARGE_BYTES else (b"".join(pieces),)
@@ -85,7 +96,7 @@ def messages_chunk(waiting: Waiting) -> ChunkBody:
 
 
 def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
-    """Join what lies between large pieces."""
+    """Join the small pieces between large ones."""
     parts: list[bytes] = []
     small: list[bytes] = []
     for piece in pieces:
@@ -98,10 +109,10 @@ def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
 
 
 def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
-    """Return the chunk of messages of one size: an array of them, header and all.
+    """Return the chunk of messages of one size: an array of them with headers.
 
-    Each lies where its number says, so its message index has no entries. The record is there all
-    the same: Foxglove's reader refuses a file with a chunk that has none.
+    The position of a message follows from its number, so the message index has no entries. Its
+    record is needed: Foxglove's reader refuses a chunk without one.
     """
     times = messages["log_time"]
     index = (channel_id, len(messages), _index_record(channel_id, b""))

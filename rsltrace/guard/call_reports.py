@@ -1,0 +1,318 @@
+"""Calls that the guard reports, and records or answers where ``rules.RULES`` and the job say so.
+
+Python's audit hooks report files, processes, sockets, addresses and the C library. A run replaces
+functions that have no audit event, and the class of ``os.environ``.
+"""
+
+from __future__ import annotations
+
+import gc  # noqa: F401  (loaded, so that its functions can be replaced)
+import hashlib
+import os
+import re
+import resource  # noqa: F401
+import signal  # noqa: F401
+import sqlite3  # a node may import it during the run; it is replaced by then
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.callers import is_python_frame, module_of, user_frame
+from rsltrace.guard.file_report_filter import (
+    SOURCE_READERS,
+    UNREPORTED_MODULES,
+    calling_module,
+    is_installed_path,
+)
+from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.libraries import is_library
+from rsltrace.guard.redirect import redirect, redirect_function
+from rsltrace.guard.rules import AUDIT_EVENTS, C_FUNCTIONS, RULES, Rule, answers, sql_call
+from rsltrace.trace.model.finding import READ_BY, Mode, Source
+
+# -- functions that are replaced ------------------------------------------------------------------
+
+REPORTED_MODULES = frozenset(
+    name.rpartition(".")[0] for name, rule in RULES.items() if rule.reports is not None
+)
+"""Modules with such functions; the run replaces them at once, or when a node imports the module."""
+
+
+def report_functions(stack: ExitStack, module: str) -> None:
+    """Replace the functions of a loaded module that have a rule, until ``stack`` ends."""
+    for name, rule in RULES.items():
+        owner, _, attribute = name.rpartition(".")
+        if owner == module and rule.reports is not None:
+            redirect_function(
+                stack, sys.modules[module], attribute, partial(_reporting, name, rule)
+            )
+
+
+def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
+    source, restore, answer = rule.reports, rule.restore, rule.answer
+    assert source is not None
+    name = name.lstrip("_")
+    is_thread, is_file = source is Source.THREAD, source is Source.FILE
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        guard = engaged()
+        if guard is None:
+            return real(*arguments, **options)
+        frame = caller()
+        if not guard.is_user_call(frame):
+            return real(*arguments, **options)  # ROS and Python, for themselves
+        if answer is not None and answers(source, guard.mode(source, frame)):
+            guard.count_call(source, f"{name}()", frame)
+            return answer(*arguments, **options)
+        if not is_thread and calling_module(frame) in UNREPORTED_MODULES:
+            return real(*arguments, **options)
+        shown = ""
+        if is_file:
+            if is_installed_path(arguments[0] if arguments else options.get("path")):
+                return real(*arguments, **options)
+            shown = ", ".join(map(repr, arguments))[:100]
+        text = f"{name}({shown})"
+        if restore is not None and guard.mode(source, frame) is Mode.RECORD:
+            return restore(guard.record(source, text, lambda: real(*arguments, **options), frame))
+        value = real(*arguments, **options)
+        guard.report_user_call(source, text, value, frame, _value_text)
+        return value
+
+    return call
+
+
+def _value_text(value: Any) -> str:
+    return f"{len(value)} elements" if isinstance(value, list) else repr(value)[:200]
+
+
+def _connecting(real: Callable[..., Any]) -> Any:
+    def connect(*arguments: Any, **options: Any) -> Any:
+        connection = real(*arguments, **options)
+        if engaged() is not None:
+            connection.set_trace_callback(_report_statement)
+        return connection
+
+    return connect
+
+
+def _report_statement(sql: str) -> None:
+    found = sql_call(sql)
+    guard = engaged() if found is not None else None
+    if guard is not None and found is not None and found[1].source is not None:
+        guard.report_user_call(found[1].source, found[0], sql[:200], caller())
+
+
+# -- reads of os.environ --------------------------------------------------------------------------
+#
+# For the time of a run, ``os.environ`` gets a class derived from its own. Its own class is left
+# alone: methods that are set on a class twice per run cost it its place in the interpreter's
+# caches, and Python 3.13 then calls the cached ``__getitem__``.
+
+_NOT_READ = ("PYTHON", "ROS_PYTHON_", "ROS_VERSION")
+"""Variables that Python itself reads, that every message class reads when imported, and that are
+the same wherever ROS 2 is."""
+
+_HELP_MODULES = {
+    "os",
+    "_collections_abc",
+    "collections.abc",
+    "shutil",
+    "locale",
+    "gettext",
+    "argparse",
+}
+
+_SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
+
+_Environ: Any = type(os.environ)
+
+
+class _ReportedEnvironment(_Environ):  # type: ignore[misc]
+    """``os.environ`` during a run."""
+
+    def __getitem__(self, name: str) -> str:
+        guard = _guard_of(self, name)
+        if guard is None:
+            return str(super().__getitem__(name))
+        frame = caller()
+        call = f"os.environ[{name!r}]"
+        if guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD and guard.is_user_call(frame):
+            kept = guard.record(
+                Source.ENVIRONMENT, call, lambda: self._data.get(self.encodekey(name)), frame
+            )
+            if kept is None:
+                raise KeyError(name)
+            return str(self.decodevalue(kept))
+        try:
+            value = str(super().__getitem__(name))
+        except KeyError:
+            guard.report_user_call(Source.ENVIRONMENT, call + _reader(frame), "not set", frame)
+            raise
+        guard.report_user_call(
+            Source.ENVIRONMENT, call + _reader(frame), _variable_text(name, value), frame
+        )
+        return value
+
+    def __iter__(self) -> Iterator[str]:
+        guard = _guard_of(self)
+        if guard is not None:
+            frame = caller()
+            call = "os.environ" + _reader(frame)
+            guard.report_user_call(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
+        names: Iterator[str] = super().__iter__()
+        return names
+
+
+def _guard_of(environment: object, name: str = "") -> Guard | None:
+    """Return the engaged guard if the caller's read is to be reported."""
+    guard = engaged()
+    if guard is None or environment is not os.environ or str(name).startswith(_NOT_READ):
+        return None
+    return None if _is_formatting_help(sys._getframe(2)) else guard
+
+
+@contextmanager
+def environment_watched() -> Iterator[None]:
+    """Report reads of ``os.environ``."""
+    environment: Any = os.environ
+    kind = type(environment)
+    environment.__class__ = _ReportedEnvironment
+    try:
+        yield
+    finally:
+        environment.__class__ = kind
+
+
+def _is_formatting_help(frame: FrameType | None) -> bool:
+    """Whether argparse reads the terminal's width and language, which no node uses."""
+    while frame is not None and (module := module_of(frame)) in _HELP_MODULES:
+        if module == "argparse":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _reader(frame: FrameType | None) -> str:
+    """Return which library reads a variable, if not the node itself."""
+    while frame is not None and is_python_frame(frame):
+        frame = frame.f_back
+    if frame is None or not is_library(code_of(frame).co_filename):
+        return ""
+    return f"{READ_BY}{module_of(frame).partition('.')[0]}"
+
+
+def _variable_text(name: str, value: str) -> str:
+    """Return a variable's value as evidence; only a hash if it may be a secret."""
+    if _SECRET.search(name) or len(value) > 200:
+        return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
+    return repr(value)
+
+
+# -- audit events ---------------------------------------------------------------------------------
+#
+# A hook cannot be removed, so a process has one, which does nothing while no guard is engaged.
+
+_HASHED_BYTES_MAX = 64 << 20
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+_ADDRESSES = ("ctypes.addressof", "builtins.id")
+_is_hooked = False
+
+
+def _hook(event: str, arguments: tuple[Any, ...]) -> None:
+    """Take an audit event: of hundreds of kinds, few matter."""
+    handle = _HANDLERS.get(event)
+    guard = engaged() if handle is not None else None
+    if handle is None or guard is None:
+        return
+    frame: Any = caller()
+    if event in _ADDRESSES:
+        if not guard.is_user(frame):
+            return  # libraries use id() for bookkeeping
+    elif user_frame(frame, guard.packages) is None:
+        return
+    with engage(None):  # what a finding costs is no finding
+        wanted = handle(arguments, frame)
+    if wanted is not None:
+        source, call, value = wanted
+        if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
+            return  # starting it is recorded, or else is a finding of its own
+        guard.report_user_call(source, call, value, frame)
+
+
+_Report = tuple[Source, str, object] | None
+
+
+def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
+    path, mode, flags = arguments
+    if isinstance(path, int) or calling_module(frame) in SOURCE_READERS:
+        return None
+    name = os.fsdecode(path)
+    if name in ("/dev/urandom", "/dev/random"):
+        return Source.RANDOM, f"open({name!r})", ""
+    if is_installed_path(name):
+        return None
+    writing = any(c in mode for c in "wax+") if isinstance(mode, str) else flags & _WRITING
+    if writing:
+        return Source.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
+    return Source.FILE, f"open({name!r})", _content(name)
+
+
+def _content(name: str) -> str:
+    """Describe the content of a file in few characters."""
+    try:
+        size = os.stat(name).st_size
+        if not os.path.isfile(name):
+            return "no plain file"
+        if size > _HASHED_BYTES_MAX:
+            return f"{size} bytes"
+        with open(name, "rb") as file:
+            return f"{size} bytes, SHA-256 {hashlib.sha256(file.read()).hexdigest()[:16]}"
+    except OSError as error:
+        return error.strerror or type(error).__name__
+
+
+def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
+    name = str(arguments[1])
+    source = C_FUNCTIONS.get(name)
+    return None if source is None else (source, f"C library: {name}()", "")
+
+
+def _event_report(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Report]:
+    def wanted(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
+        shown = next((a for a in arguments if isinstance(a, (str, bytes, list, tuple))), "")
+        return source, f"{name}()", str(shown)[:200]
+
+    return wanted
+
+
+_HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Report]] = {
+    "open": _open_report,
+    "ctypes.dlsym": _foreign_function,
+    "ctypes.addressof": lambda arguments, frame: (Source.ADDRESS, "ctypes.addressof()", ""),
+    "builtins.id": lambda arguments, frame: (Source.ADDRESS, "id()", hex(arguments[0])),
+    **{event: _event_report(source, event) for event, source in AUDIT_EVENTS.items()},
+}
+
+
+def report_audit_events() -> None:
+    """Report audit events from now on, while a guard is engaged."""
+    global _is_hooked
+    if not _is_hooked:
+        sys.addaudithook(_hook)
+        _is_hooked = True
+
+
+@contextmanager
+def reported_calls() -> Iterator[None]:
+    """Report calls until the block ends."""
+    report_audit_events()
+    with ExitStack() as stack:
+        for module in sorted(REPORTED_MODULES & sys.modules.keys()):
+            report_functions(stack, module)
+        redirect(stack, sqlite3.connect, _connecting)
+        stack.enter_context(environment_watched())
+        yield
