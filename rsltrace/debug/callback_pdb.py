@@ -15,7 +15,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
-from rsltrace.debug.source import is_users
+from rsltrace.debug.current_event import is_users
 from rsltrace.errors import DebugError
 from rsltrace.guard.guard import engage
 

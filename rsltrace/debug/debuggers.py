@@ -2,15 +2,124 @@
 
 from __future__ import annotations
 
+import os
 import select
+import sys
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from types import CodeType, FrameType
 from typing import Any, Protocol
 
-from rsltrace.debug.source import code_of
-from rsltrace.debug.view import View
+from rsltrace.debug.current_event import View, code_of
+from rsltrace.errors import DebugError
 from rsltrace.line_protocol import Lines, Message
+
+# ``debugpy`` in a copy of a simulation: an editor stops in callbacks, and simulated time waits.
+#
+# Debugpy's threads, locks and sleeps have to be real ones, also on the stack of a callback that
+# stands still: for them there is no run. ``Outside`` is how a run looks away.
+
+HOST = "127.0.0.1"
+_BREAKPOINT = 1_000_000_000
+_SETTINGS = {
+    "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # or it says a word about frozen modules
+    "PYDEVD_USE_SYS_MONITORING": "0",  # sys.settrace, which can be told what is outside
+    "PYDEVD_USE_FRAME_EVAL": "NO",
+}
+
+Trace = Callable[[FrameType, str, Any], Any]
+Outside = Callable[[], AbstractContextManager[object]]
+
+
+class Debugpy:
+    """An editor's view of this process. Made and used ``outside`` of the run.
+
+    :raises DebugError: debugpy is missing, or nobody can listen at the port.
+    """
+
+    def __init__(self, port: int, outside: Outside) -> None:
+        for name, value in _SETTINGS.items():
+            os.environ.setdefault(name, value)
+        try:
+            import debugpy
+        except ImportError:
+            raise DebugError("debugpy is not here: pip install 'rsltrace[debugpy]'") from None
+
+        self._outside = outside
+        self._debugpy: Any = debugpy
+        debugpy.configure(subProcess=False)
+        try:
+            _, self.port = debugpy.listen((HOST, port))
+        except (RuntimeError, OSError) as error:
+            raise DebugError(f"nobody can listen at {HOST}:{port}: {error}") from error
+        import pydevd  # debugpy brings its own, once it listens
+        import pydevd_tracing
+
+        holder = pydevd_tracing.TracingFunctionHolder
+        self._settrace = holder._original_tracing or sys.settrace
+        holder._original_tracing = self._trace
+        pydevd_tracing.set_trace_to_threads = lambda *args, **more: -1  # there is one
+        self._pydb: Any = pydevd.get_global_debugger()
+        waits = self._pydb.do_wait_suspend
+
+        def do_wait_suspend(*args: Any, **more: Any) -> Any:
+            with outside():
+                return waits(*args, **more)
+
+        self._pydb.do_wait_suspend = do_wait_suspend
+
+    def _trace(self, function: Trace | None) -> None:
+        """Stand in for ``sys.settrace``: what debugpy does at each line is no part of the run."""
+        self._settrace(None if function is None else self._apart(function))
+
+    def _apart(self, function: Trace) -> Trace:
+        def trace(frame: FrameType, event: str, arg: Any) -> Any:
+            with self._outside():
+                following = function(frame, event, arg)
+            return None if following is None else self._apart(following)
+
+        return trace
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether an editor is there."""
+        return bool(self._debugpy.is_client_connected())
+
+    def wait(self) -> None:
+        """Wait until an editor has connected, and set its breakpoints."""
+        self._debugpy.wait_for_client()
+
+    def stop_in(self, code: CodeType) -> None:
+        """Stop at the first line of a function when it is called next."""
+        from _pydevd_bundle.pydevd_api import PyDevdAPI
+
+        PyDevdAPI().add_breakpoint(
+            self._pydb,
+            code.co_filename,
+            "python-line",
+            _BREAKPOINT,
+            first_line(code),
+            None,
+            "None",
+            None,
+            "NONE",
+            "@HIT@ == 1",
+            False,
+        )
+
+    def call(self, callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        """Call a callback in sight of the editor, whatever stack it is on."""
+        with self._outside():
+            self._pydb.enable_tracing()
+        callback(*args)
+
+
+def first_line(code: CodeType) -> int:
+    """Return the line of a function's first statement."""
+    lines = {line for _, _, line in code.co_lines() if line}
+    return min((line for line in lines if line > code.co_firstlineno), default=code.co_firstlineno)
+
 
 Calls = Callable[..., None]
 """Takes a callback and its arguments."""
@@ -55,7 +164,6 @@ def _under_pdb(copy: Copy, address: str) -> Calls:
 
 
 def _under_debugpy(copy: Copy, port: int) -> Calls:
-    from rsltrace.debug.callback_debugpy import HOST, Debugpy
 
     with copy.outside():
         _end_when_told(copy)

@@ -22,8 +22,8 @@ from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
 from rsltrace.debug.debuggers import debugger
 from rsltrace.debug.goal import Goal, Watched, goal_of
-from rsltrace.debug.ledger import Ledger, described
-from rsltrace.debug.view import NO_CALL, Call, View, call_of
+from rsltrace.debug.event_history import Ledger, described
+from rsltrace.debug.current_event import NO_CALL, Call, View, call_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage

@@ -9,7 +9,7 @@ from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.view import View
+from rsltrace.debug.current_event import View
 from rsltrace.line_protocol import Message
 
 NOWHERE = 1 << 62

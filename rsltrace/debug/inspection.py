@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ast
+import builtins
 import json
+import math
 import reprlib
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -10,18 +13,131 @@ from dataclasses import asdict
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rsltrace.conditions.names import nodes_called, short_name
-from rsltrace.debug.python_expression import PythonError, python_value
-from rsltrace.debug.source import source
-from rsltrace.errors import DebugError, did_you_mean
+from rsltrace.conditions.evaluation import (
+    Places,
+    Refused,
+    field_names,
+    parsed,
+)
+from rsltrace.conditions.expressions import (
+    check_names,
+    free_names,
+    message_of,
+    no_such_field,
+    node_named,
+)
+from rsltrace.conditions.names import Names, nodes_called, short_name
+from rsltrace.conditions.view import EventView
+from rsltrace.debug.current_event import source
+from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import overview
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.names import Names
-    from rsltrace.debug.ledger import Ledger
-    from rsltrace.debug.view import View
+    from rsltrace.debug.event_history import Ledger
+    from rsltrace.debug.current_event import View
     from rsltrace.run.session import Session
+
+# Python at the prompt of a session: ``print EXPRESSION``, and ``DebugSession.evaluate``.
+#
+# That is meant to be Python, of whoever sits there, in a copy of a run whose code they have agreed
+# to run: methods of nodes may be called. Nothing that a file says is evaluated so: conditions,
+# checks and metrics have a language of their own (``rsltrace.conditions``).
+
+_HARMLESS = (
+    "abs all any bool bytes chr dict divmod enumerate float format frozenset getattr hasattr hash "
+    "hex int isinstance issubclass iter len list max min next ord pow range repr reversed round "
+    "set slice sorted str sum tuple type vars zip"
+).split()
+_BUILTINS = {name: getattr(builtins, name) for name in _HARMLESS}
+_REFUSED: Mapping[type[ast.AST], str] = {
+    ast.NamedExpr: "an expression cannot assign (:=)",
+    ast.Await: "an expression cannot wait (await)",
+    ast.Yield: "an expression cannot yield",
+    ast.YieldFrom: "an expression cannot yield",
+}
+
+
+def python_value(text: str, names: Names, view: EventView, *, message: object, node: object) -> Any:
+    """Return what a Python expression is worth.
+
+    Names are looked for in ``message`` (its fields), in ``node`` (its attributes), then among the
+    run's own, nodes by their short names, and what Python has built in.
+
+    :raises ConditionError: it is none, or names what is not there.
+    :raises PythonError: it raised.
+    """
+    text = text.strip()
+    tree = parsed(text, text, 0)
+    try:
+        for part in ast.walk(tree):
+            if type(part) in _REFUSED:
+                raise Refused(part, _REFUSED[type(part)])
+        others = ("self", "math", "np", *_BUILTINS)
+        check_names(tree, names, interface="", has_own=True, others=others)
+    except Refused as error:
+        raise ConditionError(error.message, text, *Places(text).of(error.node)) from None
+    try:
+        code = compile(ast.Expression(tree), "<expression>", "eval")
+        scope: dict[str, Any] = {"__builtins__": {}}
+        for name in free_names(tree):
+            scope[name] = _look_up(name, view, message, node)
+        return eval(code, scope)
+    except Exception as error:
+        raise PythonError(f"{type(error).__name__}: {error}") from error
+
+
+class PythonError(Exception):
+    """What an expression has raised, in words."""
+
+
+def _look_up(name: str, view: EventView, message: object, node: object) -> Any:
+    if message is not None and name in field_names(message):
+        return getattr(message, name)
+    if node is not None and name != "self":
+        try:
+            return getattr(node, name)
+        except AttributeError:
+            pass
+    found = _RUN.get(name)
+    if found is not None:
+        return found(view, message, node)
+    called = nodes_called(name, view.nodes())
+    if len(called) == 1:
+        return view.nodes()[called[0]]
+    if name in _BUILTINS:
+        return _BUILTINS[name]
+    if message is not None:
+        raise no_such_field(message, name)
+    if node is not None:
+        raise AttributeError(
+            f"{type(node).__name__} has no attribute {name!r}{did_you_mean(name, vars(node))}"
+        )
+    raise NameError(f"there is no node {name!r} (yet)")
+
+
+def _self_of(node: object) -> object:
+    if node is None:
+        raise NameError('self: say in which node, or node("name")')
+    return node
+
+
+def _numpy() -> object:
+    import numpy
+
+    return numpy
+
+
+_RUN: Mapping[str, Callable[[Any, Any, Any], Any]] = {
+    "node": lambda view, message, node: lambda name: node_named(view, name),
+    "event": lambda view, message, node: view,
+    "now": lambda view, message, node: view.stamp_ns / 1e9,
+    "msg": lambda view, message, node: message_of(view, message),
+    "self": lambda view, message, node: _self_of(node),
+    "math": lambda view, message, node: math,
+    "np": lambda view, message, node: _numpy(),
+}
+
 
 _JSON_BYTES_MAX = 1 << 20
 _ATTRIBUTES_MAX = 1000
@@ -45,7 +161,7 @@ class Standing(Protocol):
         """Return the names in the run."""
 
 
-def node_named(run: Standing, name: str) -> Any:
+def live_node(run: Standing, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
     :raises DebugError: there is none, or several, or it is not there now.
@@ -81,7 +197,7 @@ def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]
     :raises ConditionError: it is no expression, or names what is not there.
     :raises DebugError: it raised.
     """
-    owner = None if node is None else node_named(run, node)
+    owner = None if node is None else live_node(run, node)
     received = run.view.received()
     message = None if received is None else received[1]
     try:
@@ -133,7 +249,7 @@ def attributes(run: Standing, name: str) -> dict[str, str]:
     """
     from rsltrace.adapters.rclpy.handles.node_state import own_attributes
 
-    own = own_attributes(node_named(run, name))
+    own = own_attributes(live_node(run, name))
     found = islice(_within(own, "", _DEPTH_MAX), _ATTRIBUTES_MAX)
     return {path: text_of(value) for path, value in found}
 

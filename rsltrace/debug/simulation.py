@@ -21,7 +21,7 @@ from rsltrace.guard.pin import pin, unpin
 from rsltrace.line_protocol import Lines
 
 if TYPE_CHECKING:
-    from rsltrace.debug.ledger import History
+    from rsltrace.debug.event_history import History
     from rsltrace.job import Job
     from rsltrace.replay.edits import Edit
 
@@ -53,7 +53,7 @@ def _opened(
 
     :raises RsltraceError: it cannot be run here.
     """
-    from rsltrace.debug.ledger import RunHistory, TraceHistory
+    from rsltrace.debug.event_history import RunHistory, TraceHistory
     from rsltrace.diff.file_kind import is_trace
 
     source = spec["source"]
@@ -81,7 +81,7 @@ def _serve(
     stack: ExitStack,
 ) -> None:
     from rsltrace.debug.engine import Engine
-    from rsltrace.debug.ledger import Ledger
+    from rsltrace.debug.event_history import Ledger
     from rsltrace.replay.editing import Editing
     from rsltrace.run.process import Observer
     from rsltrace.run.session import Session

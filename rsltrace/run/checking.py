@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.run.plans.bags import PLAYER
+from rsltrace.run.plans.entries import impossible_starts
 from rsltrace.run.plans.executables import source_of
-from rsltrace.run.plans.starts import impossible_starts
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop

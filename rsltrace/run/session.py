@@ -17,9 +17,7 @@ from typing import TYPE_CHECKING
 from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
-from rsltrace.run.full_queues import drop_notes, drops
 from rsltrace.run.inputs import check_output, without_launch_files
-from rsltrace.run.numerical_libraries import LateLibraries
 from rsltrace.run.plans.bags import (
     BagInput,
     check_bag_types,
@@ -28,10 +26,10 @@ from rsltrace.run.plans.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.entries import hook_entries, missed_starts, node_entries, say_where
+from rsltrace.run.plans.executables import MainProgram
 from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
 from rsltrace.run.plans.guard import RunGuard, install_guard, packages_of
-from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
 from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
@@ -47,7 +45,6 @@ from rsltrace.run.plans.scheduling import (
     switches_at_lines,
     unmet_departures,
 )
-from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.process import (
     Observer,
     frozen_heap,
@@ -56,8 +53,16 @@ from rsltrace.run.process import (
     quiet_gc,
     search_path,
 )
-from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.run.provenance import (
+    LateLibraries,
+    environment,
+    payload_filter,
+    write_job,
+    write_sources,
+)
 from rsltrace.run.unused_rules import (
+    drop_notes,
+    drops,
     has_rules,
     unused_parameters,
     unused_ros_parameters,
@@ -84,7 +89,7 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import ObservedRun, RecordedRun
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000

@@ -26,8 +26,7 @@ from rsltrace.simulation.chance.distribution import (
     Uniform,
     quantile,
 )
-from rsltrace.simulation.chance.exact import exp, log
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import Stream, exp, log
 
 N = 100_000
 MS = 1_000_000

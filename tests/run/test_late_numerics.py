@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import rsltrace.run.numerical_libraries as numerical_libraries
+import rsltrace.run.provenance as numerical_libraries
 from rsltrace.trace.reader import Trace
 
 _MAIN = """

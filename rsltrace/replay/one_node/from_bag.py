@@ -15,14 +15,14 @@ from pathlib import Path
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import BagSpec, Job, StopSpec
-from rsltrace.replay.one_node.outputs import Key, Put, Side, changes, outputs_of_node
+from rsltrace.replay.one_node.output_comparison import Key, Put, Side, changes, outputs_of_node
 from rsltrace.replay.one_node.result import NodeReplayResult
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.process import kept_process
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64

@@ -13,10 +13,9 @@ import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
-from rsltrace.replay.one_node.outputs import Side, Watch, changes, outputs_of_node
+from rsltrace.replay.one_node.output_comparison import Side, Watch, changes, outputs_of_node
 from rsltrace.replay.one_node.result import Column, Columns, NodeReplayResult
-from rsltrace.replay.one_node.script import RecordedScript, check_payloads
-from rsltrace.replay.one_node.unit import Unit
+from rsltrace.replay.one_node.script import RecordedScript, Unit, check_payloads
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
@@ -25,7 +24,7 @@ from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
-from rsltrace.simulation.loop.fed import FedLoop, FedOrderedLoop, end_of
+from rsltrace.simulation.loop.recorded_input_loop import FedLoop, FedOrderedLoop, end_of
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.policy import Fifo
 from rsltrace.simulation.loop.stop import Stop

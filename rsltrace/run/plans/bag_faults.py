@@ -5,18 +5,210 @@ It happens before a message is published, so all that follows, the trace include
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
 
+from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interface_classes import class_of
-from rsltrace.errors import BagError
+from rsltrace.adapters.rclpy.wire.message_spec import (
+    Array,
+    FieldType,
+    Item,
+    Message,
+    Primitive,
+    Sequence,
+    Text,
+    message_spec,
+)
+from rsltrace.errors import BagError, did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.run.plans.changed_fields import UnfitError, changer
+from rsltrace.job.values.field_path import Step, field_steps, number_of
 
 if TYPE_CHECKING:
-    from rsltrace.adapters.player import BagPublisher, Message
+    from rsltrace.adapters.player import BagPublisher
+    from rsltrace.adapters.player import Message as BagMessage
+
+# Another value in one field of a message, as ``change:`` among a job's ``faults:`` says.
+
+_FLOAT_MAX = {"f": 3.4028234663852886e38, "d": 1.7976931348623157e308}
+
+
+class UnfitError(ValueError):
+    """A field that is not there, or cannot have such a value; says why."""
+
+
+def changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
+    """Return what changes a message (canonical CDR) as a fault says. It raises UnfitError for one
+    whose array has no such item.
+
+    :raises UnfitError: the class has no such field, or that cannot have such a value.
+    """
+    assert spec.field is not None
+    steps = field_steps(spec.field)
+    new = _change_of(spec, _type_at(message_spec(message_class), steps))
+    codec = codec_for(message_class)
+
+    def change(data: bytes) -> bytes:
+        message = codec.deserialize(data)
+        _change(message, steps, new)
+        return codec.serialize(message)
+
+    return change
+
+
+def _type_at(spec: Message, steps: tuple[Step, ...]) -> FieldType:
+    """Return of what type the field is that steps lead to."""
+    kind: FieldType = spec
+    before = ""
+    for name, place in steps:
+        if isinstance(kind, (Array, Sequence)):
+            raise UnfitError(f"{before} is an array: write {before}[0] or {before}[*]")
+        if not isinstance(kind, Message):
+            raise UnfitError(f"{before} has no fields")
+        fields = {field.name: field.type for field in kind.fields}
+        if name not in fields:
+            near = did_you_mean(name, fields)
+            listed = ", ".join(fields)
+            raise UnfitError(f"{kind.type_name} has no field {name} (it has {listed}){near}")
+        kind, before = fields[name], name
+        if place is not None:
+            if not isinstance(kind, (Array, Sequence)):
+                raise UnfitError(f"{name} is no array, so there is no {name}[{place}]")
+            kind = kind.item
+    return kind
+
+
+def _change_of(spec: FaultSpec, kind: FieldType) -> Callable[[Any], Any]:
+    """Return what gives the new value of a field from the old one."""
+    name = str(spec.field)
+    if isinstance(kind, (Array, Sequence)):
+        return _change_of_array(spec, kind, name)
+    if spec.length is not None or isinstance(spec.value, list):
+        raise UnfitError(f"{name} is no array")
+    if isinstance(kind, Message):
+        raise UnfitError(f"{name} is a {kind.type_name}: name a field of it")
+    if _is_character(kind):
+        raise UnfitError(f"{name} is a character, which cannot be changed")
+    if spec.value is not None:
+        value = _fitting(kind, spec.value, name)
+        return lambda old: value
+    if isinstance(kind, Text) or kind.code == "?":
+        raise UnfitError(f"{name} is no number: give value")
+    scale = 1.0 if spec.scale is None else spec.scale
+    offset = spec.offset or 0.0
+    return lambda old: _moved(kind, old, scale, offset)
+
+
+def _change_of_array(spec: FaultSpec, kind: Array | Sequence, name: str) -> Callable[[Any], Any]:
+    most = kind.length if isinstance(kind, Array) else kind.bound
+    least = kind.length if isinstance(kind, Array) else 0
+    count = len(spec.value) if isinstance(spec.value, list) else spec.length
+    if count is None:
+        raise UnfitError(f"{name} is an array: write {name}[*] for all of its items")
+    if count < least or (most is not None and count > most):
+        bound = "exactly" if least else "at most"
+        raise UnfitError(f"{name} has {bound} {most} items, not {count}")
+    item = kind.item
+    if spec.length is not None:
+        return lambda old: _with_length(list(old), count, item)
+    if isinstance(item, Message) or _is_character(item):
+        raise UnfitError(f"{name} cannot be changed as a whole, but its length can")
+    values = [_fitting(item, value, name) for value in spec.value]
+    return lambda old: values
+
+
+def _with_length(items: list[Any], count: int, item: Item) -> list[Any]:
+    if not items and count:
+        items = [_blank(item)]
+    return items[:count] + items[-1:] * (count - len(items))
+
+
+def _blank(item: Item) -> Any:
+    if isinstance(item, Message):
+        return item.cls()
+    if isinstance(item, Text):
+        return ""
+    blanks = {"?": False, "c": b"\0" if item.name == "octet" else "\0"}
+    return blanks.get(item.code, 0.0 if item.code in "fd" else 0)
+
+
+def _is_character(item: Item) -> bool:
+    return isinstance(item, Primitive) and item.name == "char"
+
+
+def _limits(item: Primitive) -> tuple[float, float]:
+    """Return the least and the greatest number of a type; finite ones."""
+    if item.code in "fd":
+        return -_FLOAT_MAX[item.code], _FLOAT_MAX[item.code]
+    bits = 8 * item.size
+    is_signed = item.code in "bhiq"
+    return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if is_signed else (0, 2**bits - 1)
+
+
+def _fitting(item: Primitive | Text, value: Any, name: str) -> Any:
+    """Return a value as the field has it.
+
+    :raises UnfitError: it cannot.
+    """
+    if isinstance(item, Text):
+        if not isinstance(value, str):
+            raise UnfitError(f"{name} is text, not {value!r}")
+        return value
+    if item.code == "?":
+        if not isinstance(value, bool):
+            raise UnfitError(f"{name} is true or false, not {value!r}")
+        return value
+    number = number_of(value)
+    if number is None:
+        raise UnfitError(f"{name} is a number, not {value!r}")
+    least, most = _limits(item)
+    if item.code in "fd":
+        if math.isfinite(number) and not least <= number <= most:
+            raise UnfitError(f"{name} is from {least:g} to {most:g}, not {number}")
+        return float(number)
+    if not (math.isfinite(number) and number == int(number) and least <= number <= most):
+        raise UnfitError(f"{name} is a whole number from {least} to {most}, not {value}")
+    return bytes([int(number)]) if item.code == "c" else int(number)
+
+
+def _moved(item: Primitive, old: Any, scale: float, offset: float) -> Any:
+    """Return a number, scaled and shifted; what is beyond a type's limits is infinite, or of
+    integers the limit."""
+    least, most = _limits(item)
+    if item.code in "fd":
+        moved = old * scale + offset
+        return math.copysign(math.inf, moved) if abs(moved) > most else moved
+    number = old[0] if item.code == "c" else old
+    exact = int(scale) * number if scale == int(scale) else round(scale * number)
+    exact += int(offset) if offset == int(offset) else round(offset)
+    exact = int(min(max(exact, least), most))
+    return bytes([exact]) if item.code == "c" else exact
+
+
+def _change(owner: Any, steps: tuple[Step, ...], new: Callable[[Any], Any]) -> None:
+    """Change the field that steps lead to."""
+    (name, place), *rest = steps
+    held = getattr(owner, name)
+    if place is None:
+        if rest:
+            _change(held, tuple(rest), new)
+        else:
+            setattr(owner, name, new(held))
+        return
+    chosen = range(len(held)) if place == "*" else [int(str(place))]
+    if not len(held) or not -len(held) <= chosen[0] < len(held):
+        raise UnfitError(f"there is no {name}[{place}]: it has {len(held)} items")
+    items = list(held)
+    for index in chosen:
+        if rest:
+            _change(items[index], tuple(rest), new)
+        else:
+            items[index] = new(items[index])
+    if not rest:
+        setattr(owner, name, items)
 
 
 def check_changes(job: Job, topic: str, message_class: type) -> None:
@@ -60,12 +252,12 @@ class BagFaults:
                 times = "message" if reached == 1 else "messages"
                 yield fault.where, f"bags played {reached} {times} on {spec.name}"
 
-    def played(self, messages: Iterator[Message]) -> Iterator[Message]:
+    def played(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
         """Yield messages as they are to be published."""
         return self._played(messages) if self._all or self._is_open else messages
 
-    def _played(self, messages: Iterator[Message]) -> Iterator[Message]:
-        ahead: deque[Message] = deque()
+    def _played(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
+        ahead: deque[BagMessage] = deque()
         while True:
             message = ahead.popleft() if ahead else next(messages, None)
             if message is None:
@@ -84,7 +276,11 @@ class BagFaults:
             yield stamp_ns, publisher, data
 
     def _swapped(
-        self, fault: _BagFault, message: Message, ahead: deque[Message], rest: Iterator[Message]
+        self,
+        fault: _BagFault,
+        message: BagMessage,
+        ahead: deque[BagMessage],
+        rest: Iterator[BagMessage],
     ) -> bytes:
         """Put the content of a message where its publisher's next one is, return that one's."""
         _, publisher, data = message

@@ -28,7 +28,7 @@ from rsltrace.simulation.loop.policy import (
     PriorityRule,
     decoded,
 )
-from rsltrace.simulation.loop.recorded import (
+from rsltrace.simulation.loop.recorded_order import (
     CALLBACKS,
     THE_RUN,
     ObservedCallback,
@@ -45,7 +45,7 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import ObservedRun, RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.simulation.loop.policy``."""
@@ -59,7 +59,7 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import ObservedRun, RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
         return None

@@ -14,7 +14,7 @@ from functools import partial
 from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
-from rsltrace.simulation.chance.exact import exp, log
+from rsltrace.simulation.chance.stream import exp, log
 
 if TYPE_CHECKING:
     from rsltrace.simulation.chance.stream import Stream

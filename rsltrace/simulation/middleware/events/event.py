@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable
-from rsltrace.simulation.loop.recorded import THE_RUN, described
+from rsltrace.simulation.loop.recorded_order import THE_RUN, described
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.ordered import OrderedLoop
-from rsltrace.simulation.loop.recorded import ObservedOrder, Recorded, RecordedEvent, event_text
+from rsltrace.simulation.loop.recorded_order import ObservedOrder, Recorded, RecordedEvent, event_text
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
