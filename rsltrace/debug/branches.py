@@ -22,7 +22,7 @@ _ERROR = "rsltrace: error: "
 _HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")
 
 
-class Branches:
+class EditBranches:
     """The branches of the run of a trace or job; ``path`` is the trace of the last one."""
 
     def __init__(
@@ -103,11 +103,11 @@ class Branches:
 
         if is_trace(os.fspath(self._source)):
             if self._job_folder is None:
-                from rsltrace.replay.preparation import folder_of
+                from rsltrace.replay.preparation import job_folder_of
                 from rsltrace.trace.reader import Trace
 
                 with Trace.open(self._source) as trace:
-                    self._job_folder = folder_of(trace, None).absolute()
+                    self._job_folder = job_folder_of(trace, None).absolute()
             return self._source
         self._job_folder = self._source.parent.absolute()
         path = folder / "run.mcap"

@@ -23,7 +23,7 @@ _SKIPPED = ("rsltrace", "rsltrace.*", "rclpy", "rclpy.*", "greenlet", "greenlet.
 """What is neither stopped in nor stepped into: it stands between a run and its callbacks."""
 
 
-class Conversation:
+class PdbConnection:
     """A terminal that is somewhere else, as far as ``pdb`` needs one."""
 
     def __init__(self, address: str) -> None:
@@ -70,7 +70,7 @@ class Conversation:
 class CallbackPdb(pdb.Pdb):
     """Stops in the first line of the user's in what it calls."""
 
-    def __init__(self, conversation: Conversation) -> None:
+    def __init__(self, conversation: PdbConnection) -> None:
         super().__init__(
             stdin=conversation,  # type: ignore[arg-type]
             stdout=conversation,  # type: ignore[arg-type]
@@ -115,7 +115,7 @@ def call_under_pdb(callback: Callable[..., Any], args: tuple[Any, ...], address:
     :raises DebugError: nobody listens at ``address``.
     """
     with engage(None):
-        conversation = Conversation(address)
+        conversation = PdbConnection(address)
         debugger = CallbackPdb(conversation)
     try:
         debugger.runcall(callback, *args)

@@ -13,7 +13,7 @@ from rsltrace.trace.model.texts import format_seconds
 
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class RunPosition:
     """A place between two events. ``index`` is how many have ended, ``stamp_ns`` simulated time.
 
     ``event`` is the one that has ended last, None before the first: ``index``, ``stamp_ns``,
@@ -54,14 +54,14 @@ class Stopped:
     """
 
     reason: str
-    position: Position
+    position: RunPosition
     breakpoint: Breakpoint | None = None
     text: str = ""
 
 
-def position_of(values: dict[str, Any]) -> Position:
+def position_of(values: dict[str, Any]) -> RunPosition:
     """Return the position in an answer."""
-    return Position(
+    return RunPosition(
         index=int(values["index"]),
         stamp_ns=int(values["stamp_ns"]),
         event=values.get("event"),

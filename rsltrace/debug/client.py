@@ -22,8 +22,8 @@ from types import TracebackType
 from typing import Any
 
 from rsltrace import errors
-from rsltrace.debug.branches import Branches
-from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped, position_of, stopped_of
+from rsltrace.debug.branches import EditBranches
+from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 
@@ -76,7 +76,7 @@ class DebugSession:
             "overrides": list(overrides),
         }
         self._spec = spec
-        self._branches: Branches | None = None
+        self._branches: EditBranches | None = None
         self._last_id = 0
         self._lock = threading.Lock()
         self._sending = threading.Lock()
@@ -136,7 +136,7 @@ class DebugSession:
     # -- where it stands ---------------------------------------------------------------------------
 
     @property
-    def position(self) -> Position:
+    def position(self) -> RunPosition:
         """Where the session stands."""
         return position_of(self._ask("position"))
 
@@ -255,15 +255,15 @@ class DebugSession:
         """Return an event that is known: of a trace, or that has run."""
         return dict(self._ask("event", index=index))
 
-    def last_changed(self, node: str, attribute: str) -> Position:
+    def last_changed(self, node: str, attribute: str) -> RunPosition:
         """Return where a node's attribute (``P[0][0]``) was changed last, up to this place."""
         return position_of(self._ask("last_changed", node=node, attribute=attribute))
 
-    def sent_by(self, index: int) -> Position:
+    def sent_by(self, index: int) -> RunPosition:
         """Return the position after the event that sent what event ``index`` received."""
         return position_of(self._ask("sent_by", index=index))
 
-    def first_true(self, condition: str) -> Position:
+    def first_true(self, condition: str) -> RunPosition:
         """Return the first position up to this one at which a condition is true."""
         return position_of(self._ask("first_true", condition=condition))
 
@@ -274,7 +274,7 @@ class DebugSession:
 
     # -- what if -----------------------------------------------------------------------------------
 
-    def edit(self, text: str) -> Position:
+    def edit(self, text: str) -> RunPosition:
         """Change something (docs/what-if.md), and go on in the branch that comes of it.
 
         A text without a place, as ``message.data = 3.0``, is about the event that follows. The run
@@ -287,7 +287,7 @@ class DebugSession:
         position = self.position
         if self._branches is None:
             spec = self._spec
-            self._branches = Branches(spec["source"], spec["job_folder"], spec["overrides"])
+            self._branches = EditBranches(spec["source"], spec["job_folder"], spec["overrides"])
         path = self._branches.make(text, position.index)
         breakpoints = self.breakpoints
         self._end()

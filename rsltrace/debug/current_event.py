@@ -20,7 +20,7 @@ from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.words.logs import parse_log
 
 if TYPE_CHECKING:
-    from rsltrace.debug.event_history import Ledger, Payload
+    from rsltrace.debug.event_history import EventLedger, Payload
     from rsltrace.run.session import Session
 
 # The user's code of an event: what it calls, and the line at which that waits or goes on.
@@ -40,7 +40,7 @@ def code_of(callback: Any) -> CodeType | None:
     return code if isinstance(code, CodeType) else None
 
 
-def source(view: View, ledger: Ledger) -> dict[str, Any] | None:
+def source(view: CurrentEventView, ledger: EventLedger) -> dict[str, Any] | None:
     """Return file, first line, name and lines of what the present event calls of the user's.
 
     ``at`` is the line at which that waits, or is about to go on; None where it does neither.
@@ -62,7 +62,7 @@ def source(view: View, ledger: Ledger) -> dict[str, Any] | None:
     }
 
 
-def _function(view: View) -> Any:
+def _function(view: CurrentEventView) -> Any:
     """Return what is called: of an event that has made a node, its constructor."""
     if view.kind == EventKind.CONSTRUCT:
         made = view.nodes().get(view.node or view.entity_name)
@@ -70,14 +70,14 @@ def _function(view: View) -> Any:
     return view.call.callback
 
 
-def _is_inside(view: View, ledger: Ledger) -> bool:
+def _is_inside(view: CurrentEventView, ledger: EventLedger) -> bool:
     """Say whether the run stands in the middle of the callback: it waits, or goes on."""
     if view.is_next:
         return view.kind == EventKind.RESUME
     return bool(ledger.rest) and bool(EVENT_REST.unpack(ledger.rest)[_FLAGS] & _SUSPENDED)
 
 
-def _frame(view: View) -> FrameType | None:
+def _frame(view: CurrentEventView) -> FrameType | None:
     """Return the innermost frame of the user's, on this stack or of a coroutine."""
     if view.call.task is not None:
         found = None
@@ -110,7 +110,7 @@ def _between() -> tuple[str, ...]:
     return tuple(os.path.dirname(str(one.__file__)) + os.sep for one in (rsltrace, rclpy))
 
 
-class Call(NamedTuple):
+class CallbackCall(NamedTuple):
     """What an event calls, with its arguments; ``task`` runs it if it is a coroutine."""
 
     callback: Any
@@ -118,17 +118,17 @@ class Call(NamedTuple):
     task: TaskRun | None = None
 
 
-NO_CALL = Call(None, ())
+NO_CALL = CallbackCall(None, ())
 
 
-class View:
+class CurrentEventView:
     """An ``EventView``: ``is_next`` says that the event is about to run, else it has just ended.
 
     One object serves a whole run; what it says is what is true when it is asked.
     ``call`` is what is called then.
     """
 
-    def __init__(self, session: Session, ledger: Ledger) -> None:
+    def __init__(self, session: Session, ledger: EventLedger) -> None:
         self.start_ns = session.start_ns
         self._domain = session.world.domain
         self._event = self._domain.event
@@ -229,10 +229,14 @@ class View:
         return () if self.is_next else [one.source.value for one in self._ledger.findings]
 
 
-def call_of(callback: Any, args: tuple[Any, ...]) -> Call:
+def call_of(callback: Any, args: tuple[Any, ...]) -> CallbackCall:
     """Return what of the user's an event calls: a task calls a coroutine."""
     task = getattr(callback, "__self__", None)
-    return Call(*task.called, task) if isinstance(task, TaskRun) else Call(callback, args)
+    return (
+        CallbackCall(*task.called, task)
+        if isinstance(task, TaskRun)
+        else CallbackCall(callback, args)
+    )
 
 
 def _decoded(type_name: str, data: bytes) -> object:

@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from types import CodeType, FrameType
 from typing import Any, Protocol
 
-from rsltrace.debug.current_event import View, code_of
+from rsltrace.debug.current_event import CurrentEventView, code_of
 from rsltrace.errors import DebugError
 from rsltrace.line_protocol import Lines, Message
 
@@ -32,7 +32,7 @@ Trace = Callable[[FrameType, str, Any], Any]
 Outside = Callable[[], AbstractContextManager[object]]
 
 
-class Debugpy:
+class DebugpyServer:
     """An editor's view of this process. Made and used ``outside`` of the run.
 
     :raises DebugError: debugpy is missing, or nobody can listen at the port.
@@ -125,11 +125,11 @@ Calls = Callable[..., None]
 """Takes a callback and its arguments."""
 
 
-class Copy(Protocol):
+class DebuggedCopy(Protocol):
     """A copy of a simulation, made for a debugger."""
 
     lines: Lines
-    view: View
+    view: CurrentEventView
 
     def outside(self) -> AbstractContextManager[None]:
         """Do what is no part of the run."""
@@ -138,7 +138,7 @@ class Copy(Protocol):
         """End the copy with an answer."""
 
 
-def debugger(copy: Copy, request: Message) -> Calls:
+def make_debugger(copy: DebuggedCopy, request: Message) -> Calls:
     """Return what calls the next callbacks under the debugger that a request names.
 
     :raises DebugError: there is none such here.
@@ -148,7 +148,7 @@ def debugger(copy: Copy, request: Message) -> Calls:
     return _under_debugpy(copy, int(request["port"]))
 
 
-def _under_pdb(copy: Copy, address: str) -> Calls:
+def _under_pdb(copy: DebuggedCopy, address: str) -> Calls:
     from rsltrace.debug.callback_pdb import call_under_pdb
 
     def calls(callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
@@ -163,11 +163,11 @@ def _under_pdb(copy: Copy, address: str) -> Calls:
     return calls
 
 
-def _under_debugpy(copy: Copy, port: int) -> Calls:
+def _under_debugpy(copy: DebuggedCopy, port: int) -> Calls:
 
     with copy.outside():
         _end_when_told(copy)
-        editor = Debugpy(port, copy.outside)
+        editor = DebugpyServer(port, copy.outside)
         text = f"debugpy waits for an editor at {HOST}:{editor.port}"
         copy.lines.send({"notice": "debugpy", "port": editor.port, "text": text})
         editor.wait()
@@ -186,7 +186,7 @@ def _under_debugpy(copy: Copy, port: int) -> Calls:
     return calls
 
 
-def _end_when_told(copy: Copy) -> None:
+def _end_when_told(copy: DebuggedCopy) -> None:
     """End the copy as soon as somebody says so, or is gone, whatever it does then."""
 
     def wait() -> None:

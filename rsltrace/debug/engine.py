@@ -20,10 +20,10 @@ from rsltrace.conditions.message_fields import loaded_fields
 from rsltrace.conditions.names import Names, names_of
 from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
-from rsltrace.debug.debuggers import debugger
-from rsltrace.debug.goal import Goal, Watched, goal_of
-from rsltrace.debug.event_history import Ledger, described
-from rsltrace.debug.current_event import NO_CALL, Call, View, call_of
+from rsltrace.debug.current_event import NO_CALL, CallbackCall, CurrentEventView, call_of
+from rsltrace.debug.debuggers import make_debugger
+from rsltrace.debug.event_history import EventLedger, event_values
+from rsltrace.debug.goal import RunGoal, WatchedCondition, parse_goal
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage
@@ -42,7 +42,7 @@ _cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-typ
 _getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
 
 
-class Copy(NamedTuple):
+class ForkedCopy(NamedTuple):
     """A copy of this process: its id, and the socket to it."""
 
     pid: int
@@ -57,7 +57,7 @@ class Engine(EventObserver):
     def __init__(
         self,
         session: Session,
-        ledger: Ledger,
+        ledger: EventLedger,
         lines: Lines,
         *,
         supervisor: int,
@@ -76,14 +76,14 @@ class Engine(EventObserver):
         self._supervisor = supervisor
         self._forks = checkpoints
         self._idle = idle
-        self.view = View(session, ledger)
-        self._goal = Goal()
+        self.view = CurrentEventView(session, ledger)
+        self._goal = RunGoal()
         self._mark = _NEVER
         self._checkpoint_s = 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
         self._copied_at = -1
-        self._calls: dict[greenlet, Call] = {}
+        self._calls: dict[greenlet, CallbackCall] = {}
         """What each stack has called last that is not yet over."""
         self._is_unasked = False
         """Whether a callback goes on of which nobody knows yet if that makes an event."""
@@ -215,7 +215,7 @@ class Engine(EventObserver):
                     return
                 self.view.is_next = False
 
-    def _ask(self, watched: list[Watched], index: int, *, before: bool = False) -> bool:
+    def _ask(self, watched: list[WatchedCondition], index: int, *, before: bool = False) -> bool:
         """Ask conditions; True if one of them has stopped the run. ``before`` asks what was to be
         asked before the event that has ended."""
         is_next = self.view.is_next
@@ -317,9 +317,11 @@ class Engine(EventObserver):
                 else:
                     self._do(request)
             except KeyError as error:
-                self._answer(error=said(DebugError(f"not a request of this protocol: no {error}")))
+                self._answer(
+                    error=error_answer(DebugError(f"not a request of this protocol: no {error}"))
+                )
             except Exception as error:
-                self._answer(error=said(error))
+                self._answer(error=error_answer(error))
 
     def _begin(self, request: Message) -> bool:
         """Set off for a goal; False if nothing follows any more, or it is here."""
@@ -331,7 +333,7 @@ class Engine(EventObserver):
             return False
         was_next = self.is_next
         self.view.is_next = False
-        goal = goal_of(request, self.view, self.names)
+        goal = parse_goal(request, self.view, self.names)
         index = self.ledger.events
         if goal.is_reached(index) or (was_next and goal.is_next_at == index):
             self._answer(ok={"reason": "step", "position": self.position()})
@@ -357,7 +359,7 @@ class Engine(EventObserver):
         elif do == "pause":
             pass  # it stands already
         elif do == "inspect":
-            self._answer(ok=inspection.inspected(self, request["what"]))
+            self._answer(ok=inspection.inspect_run(self, request["what"]))
         elif do == "evaluate":
             expression, node = request["expression"], request.get("node")
             self._apart(lambda: inspection.evaluate(self, expression, node))
@@ -399,7 +401,7 @@ class Engine(EventObserver):
         self._checkpoint_s = max(now_s - began_s, self._checkpoint_s * 0.75)
         self._next_checkpoint_s = now_s + max(self._goal.interval_s, 8 * self._checkpoint_s)
 
-    def _forked(self) -> Copy | None:
+    def _forked(self) -> ForkedCopy | None:
         """Fork; return the copy, or None in the copy itself, whose ``lines`` are new.
 
         :raises DebugError: why there can be no copy.
@@ -421,7 +423,7 @@ class Engine(EventObserver):
         self._copied_at = self.ledger.events
         if pid:
             theirs.close()
-            return Copy(pid, ours)
+            return ForkedCopy(pid, ours)
         ours.close()
         self.lines.close()
         self.lines = Lines(theirs)
@@ -429,7 +431,7 @@ class Engine(EventObserver):
         self.session.changes_process(_getpid(), pairs)
         return None
 
-    def _hand_over(self, copy: Copy, message: Message) -> None:
+    def _hand_over(self, copy: ForkedCopy, message: Message) -> None:
         """Send a message with the socket to a copy, which is then the supervisor's."""
         with copy.end:
             self.lines.send(message, copy.end.fileno())
@@ -449,7 +451,7 @@ class Engine(EventObserver):
             try:
                 answer = {"ok": work()}
             except BaseException as error:
-                answer = {"error": said(error)}
+                answer = {"error": error_answer(error)}
             with suppress(BaseException):
                 self.lines.send(answer)
             end_process(0)
@@ -468,10 +470,10 @@ class Engine(EventObserver):
             self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
             return False
         try:
-            self._apart_calls = debugger(self, request)
+            self._apart_calls = make_debugger(self, request)
         except BaseException as error:
-            self.end_apart(error=said(error))
-        self._goal, self._mark, self.is_next = Goal(), _NEVER, False
+            self.end_apart(error=error_answer(error))
+        self._goal, self._mark, self.is_next = RunGoal(), _NEVER, False
         self.ledger.on_difference = lambda: None  # who debugs may change things
         return True
 
@@ -500,7 +502,7 @@ class Engine(EventObserver):
             raise DebugError(
                 f"there is no event {index} (yet): {history.known} are known"
             ) from None
-        return described(
+        return event_values(
             rest, chain_hash, self.ledger.entities if trace is None else trace.entities
         )
 
@@ -511,7 +513,7 @@ class Engine(EventObserver):
         return names_of(entities.values(), are_all=trace is not None, fields=loaded_fields)
 
 
-def said(error: BaseException) -> Message:
+def error_answer(error: BaseException) -> Message:
     """Return an error as an answer has it."""
     kind = type(error).__name__
     text = str(error)

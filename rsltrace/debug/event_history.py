@@ -35,7 +35,7 @@ _pwrite = copy_of(os.pwrite)  # type: ignore[arg-type]
 _fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 
 
-class History(Protocol):
+class EventHistory(Protocol):
     """The events of a run, by index."""
 
     trace: Trace | None
@@ -161,7 +161,7 @@ _ENOUGH = 1 << 62
 DID_MAX = 100
 
 
-class Ledger(TraceWriter):
+class EventLedger(TraceWriter):
     """Stands in for the writer of a trace. ``on_difference`` is called when an event differs.
 
     ``entities`` and ``channels`` (topic and type) are those so far, by id. Of the last event there
@@ -169,7 +169,7 @@ class Ledger(TraceWriter):
     ``findings``. ``events`` is how many have ended.
     """
 
-    def __init__(self, history: History, *, ends_at_size_after: int | None = None) -> None:
+    def __init__(self, history: EventHistory, *, ends_at_size_after: int | None = None) -> None:
         # Nothing of the writer's own: there is no file.
         self.history = history
         self.events = 0
@@ -308,7 +308,7 @@ class Ledger(TraceWriter):
         """Return the last event as an answer has it, None before the first."""
         if not self.rest:
             return None
-        event = described(self.rest, self.chain_hash, self.entities)
+        event = event_values(self.rest, self.chain_hash, self.entities)
         event["did"] = list(islice(counted(map(self._output_text, self.outputs)), DID_MAX))
         return event
 
@@ -327,7 +327,7 @@ class Ledger(TraceWriter):
             yield kind, entity, content_hash, kept
 
 
-def described(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
+def event_values(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
     """Return a packed event as an answer has it."""
     index, stamp, cause, _, _, state, entity_id, cause_output, outputs, kind, flags = (
         EVENT_REST.unpack(rest)

@@ -9,14 +9,14 @@ from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.current_event import View
+from rsltrace.debug.current_event import CurrentEventView
 from rsltrace.line_protocol import Message
 
 NOWHERE = 1 << 62
 
 
 @dataclass
-class Watched:
+class WatchedCondition:
     """A condition that counts in a run, with the number of its breakpoint (0: of a request)."""
 
     number: int
@@ -25,7 +25,7 @@ class Watched:
 
 
 @dataclass
-class Goal:
+class RunGoal:
     """Where a run stops: at ``until`` events, before the first event after ``until_ns``, where the
     callback of event ``is_next_at`` begins, and where one of the conditions is true.
 
@@ -37,8 +37,8 @@ class Goal:
     until: int | None = None
     until_ns: int | None = None
     is_next_at: int | None = None
-    before: list[Watched] = field(default_factory=list)
-    after: list[Watched] = field(default_factory=list)
+    before: list[WatchedCondition] = field(default_factory=list)
+    after: list[WatchedCondition] = field(default_factory=list)
     searches: bool = False
     below: int = NOWHERE
     ladder: list[int] = field(default_factory=list)
@@ -59,7 +59,7 @@ class Goal:
         return [f"{one.text}: {one.armed.note}" for one in found.values() if one.armed.note]
 
 
-class AfterNode(Armed):
+class AfterNodeEvent(Armed):
     """After an event of a node."""
 
     def __init__(self, node: str) -> None:
@@ -70,12 +70,12 @@ class AfterNode(Armed):
         return self._node if view.node == self._node else ""
 
 
-def goal_of(request: Message, view: View, names: Callable[[], Names]) -> Goal:
+def parse_goal(request: Message, view: CurrentEventView, names: Callable[[], Names]) -> RunGoal:
     """Return the goal of a request; its conditions count from where the run stands now.
 
     :raises ConditionError: a condition is wrong.
     """
-    goal = Goal(
+    goal = RunGoal(
         until=request.get("until"),
         until_ns=request.get("until_ns"),
         is_next_at=request.get("is_next_at"),
@@ -86,11 +86,11 @@ def goal_of(request: Message, view: View, names: Callable[[], Names]) -> Goal:
     )
     for one in request.get("breakpoints", ()):
         condition: Condition = parse_condition(one["text"], names())
-        watched = Watched(int(one["number"]), condition.text, condition.arm(view))
+        watched = WatchedCondition(int(one["number"]), condition.text, condition.arm(view))
         if condition.before:
             goal.before.append(watched)
         if condition.after:
             goal.after.append(watched)
     if "node" in request:
-        goal.after.append(Watched(0, request["node"], AfterNode(request["node"])))
+        goal.after.append(WatchedCondition(0, request["node"], AfterNodeEvent(request["node"])))
     return goal

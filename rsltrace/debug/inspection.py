@@ -31,11 +31,11 @@ from rsltrace.conditions.view import EventView
 from rsltrace.debug.current_event import source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.simulation.middleware.entity import Receiver
-from rsltrace.simulation.middleware.overview import overview
+from rsltrace.simulation.middleware.overview import graph_overview
 
 if TYPE_CHECKING:
-    from rsltrace.debug.event_history import Ledger
-    from rsltrace.debug.current_event import View
+    from rsltrace.debug.current_event import CurrentEventView
+    from rsltrace.debug.event_history import EventLedger
     from rsltrace.run.session import Session
 
 # Python at the prompt of a session: ``print EXPRESSION``, and ``DebugSession.evaluate``.
@@ -150,18 +150,18 @@ _short.maxlist = _short.maxtuple = _short.maxset = _short.maxdict = _short.maxde
 _short.maxlevel = 6
 
 
-class Standing(Protocol):
+class StoppedRun(Protocol):
     """A run that stands still."""
 
-    view: View
+    view: CurrentEventView
     session: Session
-    ledger: Ledger
+    ledger: EventLedger
 
     def names(self) -> Names:
         """Return the names in the run."""
 
 
-def live_node(run: Standing, name: str) -> Any:
+def live_node(run: StoppedRun, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
     :raises DebugError: there is none, or several, or it is not there now.
@@ -175,7 +175,7 @@ def live_node(run: Standing, name: str) -> Any:
     return node
 
 
-def full_name(run: Standing, name: str) -> str:
+def full_name(run: StoppedRun, name: str) -> str:
     """Return the full name of the node that is meant.
 
     :raises DebugError: there is none, or several.
@@ -191,7 +191,7 @@ def full_name(run: Standing, name: str) -> str:
     raise DebugError(f"no node is called {name!r}; {hint}")
 
 
-def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]:
+def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, Any]:
     """Return the value of a Python expression as JSON, and how Python shows it.
 
     :raises ConditionError: it is no expression, or names what is not there.
@@ -204,9 +204,9 @@ def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]
         value = python_value(expression, run.names(), run.view, message=message, node=owner)
     except PythonError as error:
         raise DebugError(f"{expression}: {error}") from error
-    answer: dict[str, Any] = {"repr": text_of(value), "type": type(value).__qualname__}
+    answer: dict[str, Any] = {"repr": short_repr(value), "type": type(value).__qualname__}
     try:
-        text = json.dumps(plain(value), allow_nan=False)
+        text = json.dumps(json_value(value), allow_nan=False)
         if len(text) <= _JSON_BYTES_MAX:
             answer["value"] = json.loads(text)
     except (TypeError, ValueError, RecursionError):
@@ -214,7 +214,7 @@ def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]
     return answer
 
 
-def text_of(value: object) -> str:
+def short_repr(value: object) -> str:
     """Return how Python shows a value, cut where it is long."""
     try:
         return _short.repr(value)
@@ -222,7 +222,7 @@ def text_of(value: object) -> str:
         return f"<{type(value).__qualname__} whose repr raised {type(error).__name__}: {error}>"
 
 
-def plain(value: Any) -> Any:
+def json_value(value: Any) -> Any:
     """Return a value as JSON knows it: arrays are lists, messages objects.
 
     :raises TypeError: it cannot be.
@@ -230,19 +230,21 @@ def plain(value: Any) -> Any:
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if hasattr(value, "get_fields_and_field_types"):
-        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+        return {
+            name: json_value(getattr(value, name)) for name in value.get_fields_and_field_types()
+        }
     if hasattr(value, "tolist"):  # of numpy, array.array
-        return plain(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if isinstance(value, (bytes, bytearray)):
         return list(value)
     raise TypeError(f"{type(value).__qualname__} is not JSON")
 
 
-def attributes(run: Standing, name: str) -> dict[str, str]:
+def attributes(run: StoppedRun, name: str) -> dict[str, str]:
     """Return a node's own attributes and parameters as Python shows them.
 
     Of objects that Python shows by their address only there are the attributes: ``_ekf.P``.
@@ -251,7 +253,7 @@ def attributes(run: Standing, name: str) -> dict[str, str]:
 
     own = own_attributes(live_node(run, name))
     found = islice(_within(own, "", _DEPTH_MAX), _ATTRIBUTES_MAX)
-    return {path: text_of(value) for path, value in found}
+    return {path: short_repr(value) for path, value in found}
 
 
 def _within(values: Mapping[str, Any], prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
@@ -277,7 +279,7 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
 # -- what there is ---------------------------------------------------------------------------------
 
 
-def nodes(run: Standing) -> list[dict[str, Any]]:
+def nodes(run: StoppedRun) -> list[dict[str, Any]]:
     """Return the nodes there are."""
     return [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
@@ -285,7 +287,7 @@ def nodes(run: Standing) -> list[dict[str, Any]]:
     ]
 
 
-def queues(run: Standing) -> list[dict[str, Any]]:
+def queues(run: StoppedRun) -> list[dict[str, Any]]:
     """Return what waits in the queues of subscriptions, services and clients."""
     graph = run.session.world.domain.graph
     found = []
@@ -304,7 +306,7 @@ def queues(run: Standing) -> list[dict[str, Any]]:
     return found
 
 
-def timers(run: Standing) -> list[dict[str, Any]]:
+def timers(run: StoppedRun) -> list[dict[str, Any]]:
     """Return the timers, those that are due first before others; cancelled ones come last."""
     found = []
     for node in run.session.world.domain.graph.nodes:
@@ -326,21 +328,21 @@ def _timers_of(node: Any) -> list[Any]:
     return list(node.timers) if wrapper is None else [one.handle for one in wrapper.timers]
 
 
-def stacks(run: Standing) -> list[str]:
+def stacks(run: StoppedRun) -> list[str]:
     """Return who waits for what, with the lines of user code that led there."""
     stacks = run.session.world.stacks
     waits = [one.waits_for() for one in stacks.coroutines.suspended]
     return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
 
 
-def graph(run: Standing) -> dict[str, Any]:
+def graph(run: StoppedRun) -> dict[str, Any]:
     """Return nodes, topics, services and actions with their ends."""
-    values = asdict(overview(run.session.world.domain.graph, ()))
+    values = asdict(graph_overview(run.session.world.domain.graph, ()))
     del values["waiting"]
     return values
 
 
-def message(run: Standing) -> dict[str, Any] | None:
+def message(run: StoppedRun) -> dict[str, Any] | None:
     """Return what the callback of the present event gets: the next one's, if it is about to run."""
     received = run.view.received()
     if received is None:
@@ -349,11 +351,11 @@ def message(run: Standing) -> dict[str, Any] | None:
     return {
         "name": name,
         "type": "/".join([*type(content).__module__.split(".")[:2], type(content).__name__]),
-        "content": plain(content),
+        "content": json_value(content),
     }
 
 
-INSPECTED: dict[str, Callable[[Standing], Any]] = {
+INSPECTED: dict[str, Callable[[StoppedRun], Any]] = {
     "nodes": nodes,
     "queues": queues,
     "timers": timers,
@@ -364,7 +366,7 @@ INSPECTED: dict[str, Callable[[Standing], Any]] = {
 }
 
 
-def inspected(run: Standing, what: str) -> Any:
+def inspect_run(run: StoppedRun, what: str) -> Any:
     """Return the answer to a request to inspect.
 
     :raises DebugError: there is no such thing to see.

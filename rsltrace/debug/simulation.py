@@ -21,7 +21,7 @@ from rsltrace.guard.pin import pin, unpin
 from rsltrace.line_protocol import Lines
 
 if TYPE_CHECKING:
-    from rsltrace.debug.event_history import History
+    from rsltrace.debug.event_history import EventHistory
     from rsltrace.job import Job
     from rsltrace.replay.edits import Edit
 
@@ -40,15 +40,15 @@ def main() -> None:
             lines.move_high()
             _serve(job, history, edits, notes, spec, lines, stack)
         except (RsltraceError, OSError) as error:
-            from rsltrace.debug.engine import said
+            from rsltrace.debug.engine import error_answer
 
-            lines.send({"notice": "failed", "error": said(error)})
+            lines.send({"notice": "failed", "error": error_answer(error)})
             end_process(2)
 
 
 def _opened(
     spec: dict[str, Any], stack: ExitStack
-) -> tuple[Job, History, tuple[Edit, ...], list[str]]:
+) -> tuple[Job, EventHistory, tuple[Edit, ...], list[str]]:
     """Return the job to run, what is known of its run, the edits in it, and notes.
 
     :raises RsltraceError: it cannot be run here.
@@ -73,7 +73,7 @@ def _opened(
 
 def _serve(
     job: Job,
-    history: History,
+    history: EventHistory,
     edits: tuple[Edit, ...],
     notes: list[str],
     spec: dict[str, Any],
@@ -81,8 +81,8 @@ def _serve(
     stack: ExitStack,
 ) -> None:
     from rsltrace.debug.engine import Engine
-    from rsltrace.debug.event_history import Ledger
-    from rsltrace.replay.editing import Editing
+    from rsltrace.debug.event_history import EventLedger
+    from rsltrace.replay.editing import EditObserver
     from rsltrace.run.process import Observer
     from rsltrace.run.session import Session
 
@@ -91,7 +91,7 @@ def _serve(
     recorded = None
     if trace is not None and job.guard.enabled:
         recorded = Path(os.path.abspath(trace.name))
-    ledger = Ledger(history, ends_at_size_after=None if trace is None else trace.ended_after)
+    ledger = EventLedger(history, ends_at_size_after=None if trace is None else trace.ended_after)
     session = stack.enter_context(
         Session(
             job,
@@ -103,7 +103,7 @@ def _serve(
         )
     )
     if edits:  # those that a branch was made with
-        Editing(edits, known=len(edits)).attach(session)
+        EditObserver(edits, known=len(edits)).attach(session)
     engine = Engine(
         session,
         ledger,

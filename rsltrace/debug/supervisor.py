@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.debug.tree import ClientGone, Over, Tree
+from rsltrace.debug.tree import CheckpointTree, ClientGoneError, SessionOverError
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 
@@ -26,7 +26,7 @@ class Supervisor:
     def __init__(self, client: Lines, spec: dict[str, Any]) -> None:
         self.client = client
         self.waiting: deque[Message] = deque()
-        self.tree = Tree(spec, client, self.waiting)
+        self.tree = CheckpointTree(spec, client, self.waiting)
         self._breakpoints: dict[int, str] = {}
         self._last_number = 0
         self._do: dict[str, Callable[[Message], Any]] = {
@@ -67,7 +67,7 @@ class Supervisor:
                 self.client.send({"id": request.get("id"), **self._answer(request)})
                 self.tree.thin()
         except RsltraceError as error:
-            if not isinstance(error, ClientGone):
+            if not isinstance(error, ClientGoneError):
                 self.client.send({"notice": "failed", "error": _said(error)})
         except ConnectionError:
             pass
@@ -80,7 +80,7 @@ class Supervisor:
             if do is None:
                 raise DebugError(f"there is no request {request.get('do')!r}")
             return {"ok": do(request)}
-        except (ClientGone, Over):
+        except (ClientGoneError, SessionOverError):
             raise
         except RsltraceError as error:
             return {"error": _said(error)}

@@ -20,15 +20,15 @@ _NEARLY = 0.8
 _PIECE_BYTES = 1 << 16
 
 
-class ClientGone(DebugError):
+class ClientGoneError(DebugError):
     """Nobody is there to answer."""
 
 
-class Over(DebugError):
+class SessionOverError(DebugError):
     """The session cannot go on. The message says why."""
 
 
-class Refused(DebugError):
+class RefusedRequestError(DebugError):
     """An error that a process of the simulation has answered; ``kind`` is the class it names."""
 
     def __init__(self, message: str, kind: str) -> None:
@@ -36,7 +36,7 @@ class Refused(DebugError):
         self.kind = kind
 
 
-class Tree:
+class CheckpointTree:
     """Where a session stands, and how it gets elsewhere. ``position`` is that of the cursor."""
 
     def __init__(self, spec: dict[str, Any], client: Lines, waiting: deque[Message]) -> None:
@@ -69,7 +69,7 @@ class Tree:
         self.start_ns = int(ready["start_ns"])
         try:
             self._cursor = self._copy_of(root)
-        except Refused as error:
+        except RefusedRequestError as error:
             self._no_checkpoints(str(error))
             self._cursor = root
         else:
@@ -87,7 +87,7 @@ class Tree:
                     return root, message
                 if message.get("notice") == "failed":
                     error = message["error"]
-                    raise Refused(error["message"], error["kind"])
+                    raise RefusedRequestError(error["message"], error["kind"])
         except DebugError:
             self.family.kill(root)
             raise
@@ -142,12 +142,12 @@ class Tree:
         for is_last in (False, True):  # who kills one process may just have killed another
             try:
                 self._cursor, answer = self._at({"until": index})
-            except ClientGone:
+            except ClientGoneError:
                 raise
             except DebugError as again:
                 if is_last:
                     why = f"the simulation cannot go on: {error}; nor again: {again}"
-                    raise Over(why) from None
+                    raise SessionOverError(why) from None
             else:
                 break
         self.position = answer["position"]
@@ -209,7 +209,7 @@ class Tree:
                 return self._copy_of(one.process), one.index
             except Lost:
                 self._forget(one)
-            except Refused as error:
+            except RefusedRequestError as error:
                 self._no_checkpoints(str(error))
                 break
         if not bases or self._why_no_checkpoints:
@@ -386,7 +386,7 @@ class Tree:
         while True:
             message = self._message_of(process, limit_s)
             if "error" in message:
-                raise Refused(message["error"]["message"], message["error"]["kind"])
+                raise RefusedRequestError(message["error"]["message"], message["error"]["kind"])
             if "ok" in message:
                 return message if whole else message["ok"]
 
@@ -452,7 +452,7 @@ class Tree:
             else:
                 self._waiting.append(request)
         if self._client.ended and process is not None:
-            raise ClientGone("the client is gone")
+            raise ClientGoneError("the client is gone")
 
     def _pass_output_on(self) -> None:
         """Give the client what nodes have printed."""

@@ -22,7 +22,7 @@ _OF_FILES = "file:"
 
 
 @dataclass(frozen=True, slots=True)
-class Code:
+class JobCodeFile:
     """A module (or script, or data file) of a job, and what has become of it since the recording.
 
     ``file`` is None where there is none. ``recorded`` and ``present`` are the first 16 hex digits
@@ -42,7 +42,7 @@ class Code:
         return "has changed" if self.recorded and self.recorded != self.present else ""
 
 
-def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
+def code_of(job: Job, sources: dict[str, str]) -> tuple[JobCodeFile, ...]:
     """Return the code of a job; ``sources`` are the hashes that a trace has of it."""
     places = [job.resolve(folder) for folder in job.search_path]
     if any(spec.executable is not None for spec in job.nodes):
@@ -57,14 +57,14 @@ def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
     return tuple(_code(name, file, sources.get(name, "")) for name, file in found.items())
 
 
-def _code(name: str, file: Path | None, recorded: str) -> Code:
+def _code(name: str, file: Path | None, recorded: str) -> JobCodeFile:
     there = file is not None and file.is_file()  # no device, no pipe
     present = ""
     if there and recorded:
         assert file is not None
         with suppress(OSError):
             present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    return Code(name.removeprefix(_OF_FILES), file if there else None, recorded, present)
+    return JobCodeFile(name.removeprefix(_OF_FILES), file if there else None, recorded, present)
 
 
 def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
@@ -107,7 +107,7 @@ def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> P
     """Return the file that a module would be loaded from: of ``folders``, or, if it may be an
     ``installed`` one, then of Python's own path."""
     if installed:
-        spec = find_module(module, [*folders, *sys.path], _found_otherwise)
+        spec = find_module(module, [*folders, *sys.path], _editable_spec)
     else:
         spec = find_module(module, folders)
     if spec is None or not spec.origin or not spec.has_location:
@@ -115,7 +115,7 @@ def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> P
     return Path(spec.origin)
 
 
-def _found_otherwise(module: str) -> ModuleSpec | None:
+def _editable_spec(module: str) -> ModuleSpec | None:
     """Ask the finders of packages that are installed in place, which know files of their own."""
     for finder in sys.meta_path:
         if finder is not PathFinder and "editable" in f"{finder!r}".lower():

@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import EditError, did_you_mean
 from rsltrace.replay.edits import (
-    Defer,
-    Delay,
-    Drop,
+    DeferEdit,
+    DelayEdit,
+    DropEdit,
     Edit,
-    SetAttribute,
-    SetMessage,
-    SetParameter,
-    change,
+    SetAttributeEdit,
+    SetMessageEdit,
+    SetParameterEdit,
     path_text,
+    set_path,
 )
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.stop import Stop
@@ -131,9 +131,9 @@ def _change_message(message: Any, edit: Edit) -> None:
     :raises EditError: there is no such field, or it cannot have the value.
     """
     action = edit.action
-    assert isinstance(action, SetMessage)
+    assert isinstance(action, SetMessageEdit)
     try:
-        change(message, action.path, action.operator, action.value)
+        set_path(message, action.path, action.operator, action.value)
     except AttributeError:
         fields = message.get_fields_and_field_types()
         near = did_you_mean(str(action.path[0][1]), fields)
@@ -149,7 +149,7 @@ _CAN_BE_DROPPED = (*_CAN_COME_LATER, EventKind.CLIENT, EventKind.ACTION, EventKi
 FAILED = Stop("an edit could not be made", 2)
 
 
-class Editing(EventObserver):
+class EditObserver(EventObserver):
     """The edits of one run. ``error`` says which of them could not be made, and why.
 
     ``on_new`` is called before the first edit, from number ``known`` on, that is made.
@@ -223,7 +223,7 @@ class Editing(EventObserver):
         for edit in [edit for edit in self._pending if self._is_due(edit)]:
             if edit.of_event:
                 self._check_is_to_come(edit)
-            elif not isinstance(edit.action, SetParameter):  # it is an event: see before_event
+            elif not isinstance(edit.action, SetParameterEdit):  # it is an event: see before_event
                 self._try(edit, self._between)
         self._deferred.release()
 
@@ -269,14 +269,14 @@ class Editing(EventObserver):
             self._arm(edit, edit.topic)
             return
         self._pending.remove(edit)
-        assert isinstance(action, (SetAttribute, SetParameter))
+        assert isinstance(action, (SetAttributeEdit, SetParameterEdit))
         node = self._node(action.node)
-        if isinstance(action, SetAttribute):
+        if isinstance(action, SetAttributeEdit):
             first = action.path[0][1]
             if not hasattr(node, first):
                 near = did_you_mean(first, vars(node))
                 raise EditError(f"{action.node} has no attribute {first!r}{near}")
-            change(node, action.path, action.operator, action.value)
+            set_path(node, action.path, action.operator, action.value)
         else:
             self._setting = handle = OutsideEvent(lambda: f"the edit {edit.text!r}")
             self._dispatcher.run_outside(
@@ -284,7 +284,7 @@ class Editing(EventObserver):
             )
             self._setting = None
 
-    def _set_parameter(self, edit: Edit, node: Any, action: SetParameter) -> None:
+    def _set_parameter(self, edit: Edit, node: Any, action: SetParameterEdit) -> None:
         """Set a parameter; what is wrong with it is no exception of a node's."""
         try:
             _set_parameter(node, action)
@@ -310,7 +310,7 @@ class Editing(EventObserver):
             domain.filter(topic, None)
             result: bytes | None = data
             for armed in self._armed.pop(topic, ()):
-                if result is None or isinstance(armed.action, Drop):
+                if result is None or isinstance(armed.action, DropEdit):
                     return None
                 result = self._try(armed, partial(changed_data, publisher), result)
             return result
@@ -323,12 +323,12 @@ class Editing(EventObserver):
         """Make an edit of an event; return whether it happens now."""
         self._pending.remove(edit)
         handle, kind, action = call.handle, call.kind, edit.action
-        if isinstance(action, SetMessage):
+        if isinstance(action, SetMessageEdit):
             receive_edited(edit, call)
             return True
         name = f"{handle.describe()} ({EventKind(kind).label})"
         waits = hasattr(handle, "task")  # a coroutine
-        if isinstance(action, Drop):
+        if isinstance(action, DropEdit):
             if kind not in _CAN_BE_DROPPED:
                 raise EditError(f"{name} cannot be dropped")
             if waits:
@@ -343,15 +343,15 @@ class Editing(EventObserver):
         if getattr(call.node, "mailbox", None) is not None:
             raise EditError(f"{name} cannot run later: an executor of its program runs it")
         later = _LaterEvent(self._dispatcher, call)
-        if isinstance(action, Delay):
+        if isinstance(action, DelayEdit):
             self._loop.schedule_release(self._loop.now_ns + action.delay_ns, lambda _: later)
         else:
-            assert isinstance(action, Defer)
+            assert isinstance(action, DeferEdit)
             self._deferred.add(later, action.count)
         return False
 
 
-def _set_parameter(node: Any, action: SetParameter) -> None:
+def _set_parameter(node: Any, action: SetParameterEdit) -> None:
     from rclpy.parameter import Parameter
 
     value = action.value

@@ -13,7 +13,7 @@ from rsltrace.adapters.launch import ros_launch
 from rsltrace.errors import JobError, ReplayError
 from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.job.reading.resolved import job_from_resolved
-from rsltrace.replay.code import Code, code_of, file_of
+from rsltrace.replay.code import JobCodeFile, code_of, file_of
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
 from rsltrace.run.inputs import without_launch_files
 from rsltrace.run.provenance import environment
@@ -52,7 +52,7 @@ def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
     """
     try:
         resolved = _resolved(trace)
-        _let_follow(trace, resolved, folder)
+        _follow_trace_order(trace, resolved, folder)
         if not bags:
             resolved.update(bags=[], progress=None)
         return job_from_resolved(
@@ -77,7 +77,7 @@ def _resolved(trace: Trace) -> dict[str, Any]:
     return resolved
 
 
-def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
+def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
     """Let a job that followed a recording which is gone follow the trace: it has that order."""
     policy = resolved.get("policy")
     if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
@@ -92,7 +92,7 @@ def job_name(trace: Trace) -> str:
     return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
 
 
-def folder_of(trace: Trace, given: Path | None) -> Path:
+def job_folder_of(trace: Trace, given: Path | None) -> Path:
     """Return the folder of a trace's job: the one that is given, or one in which the job is.
 
     :raises ReplayError: saying what was looked for, and where.
@@ -103,9 +103,9 @@ def folder_of(trace: Trace, given: Path | None) -> Path:
         return given
     beside = [] if "://" in trace.name else [Path(trace.name).parent]
     places = list(dict.fromkeys([*beside, Path()]))
-    wanted = _wanted(trace)
-    best = max(places, key=lambda place: _found(trace, place, wanted))
-    if _found(trace, best, wanted)[0] or not wanted:
+    wanted = _folder_markers(trace)
+    best = max(places, key=lambda place: _match_folder(trace, place, wanted))
+    if _match_folder(trace, best, wanted)[0] or not wanted:
         return best
     listed = ", ".join(wanted[:5]) + (f" and {len(wanted) - 5} more" if len(wanted) > 5 else "")
     where = " and in ".join(_shown(place) for place in places)
@@ -119,14 +119,14 @@ def _shown(place: Path) -> str:
     return "the present folder" if place == Path() else str(place)
 
 
-def _wanted(trace: Trace) -> list[str]:
+def _folder_markers(trace: Trace) -> list[str]:
     """Return what shows that a folder is the job's: its file, or else the modules of its nodes."""
     if job_name(trace):
         return [job_name(trace)]
     return [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
 
 
-def _found(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
+def _match_folder(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
     """Say whether a folder has what is wanted, and whether the job file says what it said."""
     if not job_name(trace):
         folders = _search(trace, folder)
@@ -239,7 +239,7 @@ Position = int | str
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class EnvironmentChange:
     """A version, or a setting of the process, that is another one than when a trace was made."""
 
     name: str
@@ -257,8 +257,8 @@ class Preparation:
     trace: Trace
     job: Job
     folder: Path
-    code: tuple[Code, ...]
-    changes: tuple[Change, ...]
+    code: tuple[JobCodeFile, ...]
+    changes: tuple[EnvironmentChange, ...]
     distrust: str
     notes: tuple[str, ...]
     edits: tuple[Edit, ...] = ()
@@ -288,7 +288,7 @@ def prepared(
         if trace.event_count == 0:
             raise ReplayError(f"{path} has no events to replay")
         if job is None:
-            folder = folder_of(trace, job_folder)
+            folder = job_folder_of(trace, job_folder)
             job = job_in_trace(trace, folder, bags=bags)
             named = job_folder is not None
             distrust = why_not_trusted(trace, job, folder, named=named, bags=bags)
@@ -306,12 +306,12 @@ def prepared(
         )
 
 
-def _changes(trace: Trace) -> Iterator[Change]:
+def _changes(trace: Trace) -> Iterator[EnvironmentChange]:
     """Yield what of the environment is not as recorded; libraries are known once they are there."""
     recorded, present = trace.environment, environment()
     for name in sorted({*recorded, *present} - {"numerics", "ros_distro", "addresses"}):
         if recorded.get(name) != present.get(name):
-            yield Change(name, recorded.get(name, ""), present.get(name, ""))
+            yield EnvironmentChange(name, recorded.get(name, ""), present.get(name, ""))
 
 
 def _notes(trace: Trace) -> Iterator[str]:

@@ -14,11 +14,11 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError
-from rsltrace.replay.editing import Editing
-from rsltrace.replay.edits import Edit, as_metadata, check_edits
+from rsltrace.replay.editing import EditObserver
+from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.result import ReplayResult
-from rsltrace.replay.verification import Verification
+from rsltrace.replay.verification import EventVerification
 from rsltrace.run import Observer, RunResult
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
@@ -62,8 +62,10 @@ def replay_prepared(
     def on_first(session: Session) -> None:
         session.world.echo_logs(echo)
 
-    verification = Verification(plan.trace, until, first=first, on_first=on_first)
-    editing = Editing((*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off)
+    verification = EventVerification(plan.trace, until, first=first, on_first=on_first)
+    editing = EditObserver(
+        (*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off
+    )
     check_edits(edits, plan.trace)
     with place_for(output) as path:
         run = _run(plan, verification, editing, path, force=force, observer=observer)
@@ -88,8 +90,8 @@ def place_for(output: Path | None) -> Iterator[Path]:
 
 def _run(
     plan: Preparation,
-    verification: Verification,
-    editing: Editing,
+    verification: EventVerification,
+    editing: EditObserver,
     path: Path,
     *,
     force: bool,
@@ -97,7 +99,7 @@ def _run(
 ) -> RunResult:
     recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
     edits = editing.unmade
-    metadata = {METADATA_EDITS: as_metadata(edits, plan.trace)} if edits else {}
+    metadata = {METADATA_EDITS: edits_metadata(edits, plan.trace)} if edits else {}
     with (
         kept_process(),
         Session(
@@ -123,7 +125,7 @@ def _run(
     raise error
 
 
-def _diverged(trace: Trace, verification: Verification) -> bool:
+def _diverged(trace: Trace, verification: EventVerification) -> bool:
     """Say whether a run that is over did something else, or ended where the trace goes on."""
     if verification.diverged:
         return True
@@ -151,8 +153,8 @@ def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
 
 def _branch(
     plan: Preparation,
-    verification: Verification,
-    editing: Editing,
+    verification: EventVerification,
+    editing: EditObserver,
     run: RunResult,
     place: Path,
     kept: Path | None,
@@ -183,7 +185,7 @@ def _branch(
 
 def _result(
     plan: Preparation,
-    verification: Verification,
+    verification: EventVerification,
     run: RunResult,
     difference: Diff | None,
     path: Path | None,

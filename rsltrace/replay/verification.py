@@ -28,7 +28,7 @@ BRANCH_END = "as far as the run that it branches off"
 _BY_DRIVER = "the driver of the simulation"
 
 
-class Verification(EventObserver):
+class EventVerification(EventObserver):
     """What a run has to do, and how far it has done so.
 
     ``until`` is how many events to verify, None for all. ``verified`` events were as recorded;

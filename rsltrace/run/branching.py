@@ -12,7 +12,7 @@ from greenlet import getcurrent
 
 from rsltrace.job import Job
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.run.driver import time_of_step
+from rsltrace.run.driver import next_step_ns
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.policy import Departures
 from rsltrace.trace.model.texts import format_seconds
@@ -23,7 +23,7 @@ def run_up_to(session: Session, time_ns: int) -> bool:
     loop, runners = session.loop, session.world.stacks.runners
 
     def gate(next_ns: int | None) -> bool:
-        coming_ns = time_of_step(loop, next_ns)
+        coming_ns = next_step_ns(loop, next_ns)
         if coming_ns is not None and coming_ns <= time_ns:
             return False
         loop.gate = None

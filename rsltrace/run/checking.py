@@ -49,7 +49,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     :raises JobError, SetupError, BagError: the job cannot run.
     :raises RunError: a constructor raised.
     """
-    from rsltrace.simulation.middleware.overview import overview
+    from rsltrace.simulation.middleware.overview import graph_overview
 
     notes: list[str] = []
     observer = Observer(note=notes.append)
@@ -62,7 +62,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.finish()
             raise error
         world = session.world
-        found = overview(
+        found = graph_overview(
             world.domain.graph,
             world.blocked(),
             everything=everything,

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 _INTERRUPTED = 130
 
 
-class _Who(Enum):
+class _ActiveCode(Enum):
     """Whose code is running."""
 
     DRIVER = "driver"
@@ -33,7 +33,7 @@ class _Who(Enum):
     LISTENER = "listener"
 
 
-def time_of_step(loop: EventLoop, next_ns: int | None) -> int | None:
+def next_step_ns(loop: EventLoop, next_ns: int | None) -> int | None:
     """Return when the next time step of a loop is, at whose gate ``next_ns`` is due next."""
     if next_ns is not None and loop.min_step_ns and next_ns > loop.now_ns:
         return loop.stepped(next_ns, quiet_until_ns(loop.stop_conditions))
@@ -53,7 +53,7 @@ class Driver:
         self.loop = session.loop
         self.loop.gate = self._gate
         self.outside: Outside = Outside(session.world)
-        self._who = _Who.DRIVER
+        self._who = _ActiveCode.DRIVER
         self._steps: int | None = 0
         self._until_ns: int | None = None
         self._to_the_end = False
@@ -101,11 +101,11 @@ class Driver:
         self._counted = self.loop.events
         self._steps, self._until_ns, self._to_the_end = steps, until_ns, to_the_end
         while True:
-            self._who = _Who.RUN
+            self._who = _ActiveCode.RUN
             try:
                 self.session.go_on()
             finally:
-                self._who = _Who.DRIVER
+                self._who = _ActiveCode.DRIVER
             self.outside.enter()
             self.raise_error()
             if not self._tell():
@@ -149,7 +149,7 @@ class Driver:
 
     def _may_advance(self, next_ns: int | None) -> bool:
         until_ns, end_ns = self._until_ns, self.session.end_ns
-        next_ns = time_of_step(self.loop, next_ns)
+        next_ns = next_step_ns(self.loop, next_ns)
         if next_ns is not None and (until_ns is None or next_ns <= until_ns):
             return True
         if until_ns is None:
@@ -169,12 +169,12 @@ class Driver:
     def _tell(self) -> bool:
         """Call who listens; return whether the loop has to go on from where it was stopped."""
         news, self._news = self._news, []
-        self._who = _Who.LISTENER
+        self._who = _ActiveCode.LISTENER
         try:
             for callback, message in news:
                 callback(message)
         finally:
-            self._who = _Who.DRIVER
+            self._who = _ActiveCode.DRIVER
         return bool(news) and not self.ended
 
     # -- checks ------------------------------------------------------------------------------------
@@ -182,14 +182,14 @@ class Driver:
     def check_driver(self) -> None:
         """Raise RunError unless the present code may move time."""
         self.check_outside()
-        if self._who is _Who.LISTENER:
+        if self._who is _ActiveCode.LISTENER:
             raise RunError("a callback of subscribe cannot move time; it may publish")
 
     def check_outside(self) -> None:
         """Raise RunError if the present code is a node's, or that of another thread."""
         if threading.get_ident() != self.session.world.stacks.runners.thread:
             raise RunError("a simulation is driven by the thread that has entered it")
-        if self._who is _Who.RUN:
+        if self._who is _ActiveCode.RUN:
             raise RunError("a node cannot drive the simulation that it is part of")
 
     def raise_error(self) -> None:

@@ -77,7 +77,7 @@ def housekeeping(
 
 
 @contextmanager
-def quiet_gc() -> Iterator[None]:
+def gc_disabled() -> Iterator[None]:
     """Keep Python's own garbage collector off."""
     was_enabled = gc.isenabled()
     gc.disable()
@@ -99,7 +99,7 @@ def end_with_run() -> None:
 
 
 @contextmanager
-def frozen_heap() -> Iterator[None]:
+def frozen_gc() -> Iterator[None]:
     """Keep what there was before the run out of all garbage collection in it: it takes longer to
     look at than what the run makes."""
     gc.freeze()
@@ -110,7 +110,7 @@ def frozen_heap() -> Iterator[None]:
             gc.unfreeze()
 
 
-def keep_heap() -> None:
+def keep_freed_memory() -> None:
     """Have the C library keep the memory that is freed for what comes next.
 
     The segments of a trace are laid out in blocks of half a megabyte, again and again. glibc gives
@@ -285,7 +285,7 @@ def run_as_main(name: str) -> ModuleSpec | None:
     return spec
 
 
-def is_of_pytest(name: str) -> bool:
+def is_pytest_module(name: str) -> bool:
     """Whether a loaded module is a test module or a conftest: pytest's own loader brought it."""
     spec = getattr(sys.modules.get(name), "__spec__", None)
     return type(getattr(spec, "loader", None)).__module__.startswith("_pytest.")

@@ -21,7 +21,7 @@ from rsltrace.guard.callers import is_own, is_user_file
 from rsltrace.guard.pin import HASH_SEED, thread_pools
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
-from rsltrace.run.process import is_below, is_of_pytest, run_as_main, user_modules
+from rsltrace.run.process import is_below, is_pytest_module, run_as_main, user_modules
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_CODE,
@@ -47,12 +47,12 @@ _LIBRARIES = frozenset(
 def numerical_libraries(job: Job) -> str:
     """Return the libraries with version and kernel, or an empty text if the job uses none.
 
-    The nodes' modules are imported already. For what a run imports later see ``LateLibraries``.
+    The nodes' modules are imported already. For what a run imports later see ``LateLibraryScan``.
     """
     return _kernels() if any(map(_uses_numbers, _modules(job))) else ""
 
 
-class LateLibraries:
+class LateLibraryScan:
     """Looks at the end of a run for libraries that only it has imported.
 
     A main imports what it needs when it runs: a test suite its tests, for instance.
@@ -104,7 +104,7 @@ def _uses_numbers(module: ModuleType) -> bool:
     """Whether a module has something of the libraries, or a function that imports one."""
     file = getattr(module, "__file__", None)
     for value in list(vars(module).values()):
-        name = value.__name__ if isinstance(value, ModuleType) else _home(value)
+        name = value.__name__ if isinstance(value, ModuleType) else _module_of_value(value)
         if name.partition(".")[0] in _LIBRARIES:
             return True
         functions = vars(value).values() if isinstance(value, type) else (value,)
@@ -115,7 +115,7 @@ def _uses_numbers(module: ModuleType) -> bool:
     return False
 
 
-def _home(value: object) -> str:
+def _module_of_value(value: object) -> str:
     """Return the module that a function or class is from."""
     if not isinstance(value, type) and not callable(value):
         return ""
@@ -203,7 +203,7 @@ def source_files(job: Job) -> dict[str, Path]:
     modules = {
         name: path
         for name, path in user_modules(folders).items()
-        if name in of_nodes or not is_of_pytest(name)
+        if name in of_nodes or not is_pytest_module(name)
     }
     modules.update(_run_as_main(job, folders))
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})

@@ -20,22 +20,22 @@ from rsltrace.job import Job, locate
 from rsltrace.run.inputs import check_output, without_launch_files
 from rsltrace.run.plans.bags import (
     BagInput,
+    bag_notes,
     check_bag_types,
-    notes_of,
     open_bag_of,
     start_ns_of,
     start_players,
 )
-from rsltrace.run.plans.entries import hook_entries, missed_starts, node_entries, say_where
+from rsltrace.run.plans.entries import add_job_location, hook_entries, missed_starts, node_entries
 from rsltrace.run.plans.executables import MainProgram
-from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
-from rsltrace.run.plans.guard import RunGuard, install_guard, packages_of
+from rsltrace.run.plans.faults import arm_node_faults, arm_topic_faults, missed_faults
+from rsltrace.run.plans.guard import RunGuard, install_guard, node_packages
 from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
-from rsltrace.run.plans.processes import process_door
-from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
+from rsltrace.run.plans.processes import make_process_adapter
+from rsltrace.run.plans.recorded_order import follow_recording, remember_choices, write_choices
 from rsltrace.run.plans.scheduling import (
+    continued_policy,
     end_ns_of,
-    going_on,
     is_ordered,
     policy_of_job,
     scheduling_plan,
@@ -47,14 +47,14 @@ from rsltrace.run.plans.scheduling import (
 )
 from rsltrace.run.process import (
     Observer,
-    frozen_heap,
+    frozen_gc,
+    gc_disabled,
     housekeeping,
-    keep_heap,
-    quiet_gc,
+    keep_freed_memory,
     search_path,
 )
 from rsltrace.run.provenance import (
-    LateLibraries,
+    LateLibraryScan,
     environment,
     payload_filter,
     write_job,
@@ -62,8 +62,8 @@ from rsltrace.run.provenance import (
 )
 from rsltrace.run.unused_rules import (
     drop_notes,
-    drops,
     has_rules,
+    queue_drops,
     unused_parameters,
     unused_ros_parameters,
     unused_rules,
@@ -73,8 +73,8 @@ from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.loop.timer_queue import timer_queue
-from rsltrace.simulation.middleware.events.event import Census
-from rsltrace.simulation.middleware.interface import FaultsOfAll
+from rsltrace.simulation.middleware.events.event import NameRegistry
+from rsltrace.simulation.middleware.interface import AllTopicFaults
 from rsltrace.trace.format import METADATA_ENVIRONMENT
 from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.model.drop import kept_drops
@@ -89,7 +89,10 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_order_observer import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import (
+        NativeOrderObserver,
+        RecordedOrderObserver,
+    )
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -178,8 +181,8 @@ class Session:
         self._guarded: RunGuard
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
-        self._recorded: RecordedRun | ObservedRun | None
-        self._late: LateLibraries
+        self._recorded: RecordedOrderObserver | NativeOrderObserver | None
+        self._late: LateLibraryScan
         self._processes: ProcessDoor
         self._numerics_known = True
         self._faults: NodeFaults | None = None
@@ -233,7 +236,7 @@ class Session:
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
         self._guarded = install_guard(stack, self.job)
-        stack.enter_context(frozen_heap())  # the guard has looked at what there is
+        stack.enter_context(frozen_gc())  # the guard has looked at what there is
         self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
@@ -246,8 +249,8 @@ class Session:
             self._open_trace(stack, self._output)
         elif self._recorded_by is not None:
             self._record_to(self._recorded_by)
-        stack.enter_context(quiet_gc())
-        keep_heap()
+        stack.enter_context(gc_disabled())
+        keep_freed_memory()
         if self._recorded_by is None:
             stack.enter_context(self._watchdog.on_duty())
 
@@ -259,7 +262,7 @@ class Session:
         ]
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
-        self._notes = (*notes, *notes_of(job, self._bags), *clock_notes(job, self.start_ns))
+        self._notes = (*notes, *bag_notes(job, self._bags), *clock_notes(job, self.start_ns))
         if self._observer.note is not None:
             for note in self._notes:
                 self._observer.note(note)
@@ -279,16 +282,16 @@ class Session:
         self.world = world = stack.enter_context(
             kind(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
-        self._processes = process_door(job, world)
+        self._processes = make_process_adapter(job, world)
         stack.callback(self._processes.close)
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
         if self.may_become:
-            world.domain.transport.faults = FaultsOfAll()
-        arm_topics(job.faults, world)
+            world.domain.transport.faults = AllTopicFaults()
+        arm_topic_faults(job.faults, world)
         if has_rules(job):
-            world.domain.entities.census = census = Census()
+            world.domain.entities.census = census = NameRegistry()
             world.domain.dispatcher.add_observer(census)
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
@@ -299,13 +302,13 @@ class Session:
     def _order_events(self, stack: ExitStack) -> None:
         """Say what runs when, if the job does, and for how long."""
         loop = self.loop
-        self._recorded = recorded_run(self.job, self.world.domain, stack)
+        self._recorded = follow_recording(self.job, self.world.domain, stack)
         if isinstance(loop, OrderedLoop):
             recorded = None if self._recorded is None else self._recorded.policy
             with self._guarded.engaged():
                 self.world.use_scheduling(loop, scheduling_plan(self.job, self.start_ns, recorded))
             if switches_at_lines(self.job):
-                self.world.switch_at_lines(loop, packages_of(self.job.nodes))
+                self.world.switch_at_lines(loop, node_packages(self.job.nodes))
 
     def _import_what_is_named(self) -> None:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
@@ -338,7 +341,7 @@ class Session:
     def _record_to(self, writer: TraceWriter) -> None:
         job = self.job
         programs = (entry.make for entry in self._entries)
-        self._late = LateLibraries(one.code for one in programs if isinstance(one, MainProgram))
+        self._late = LateLibraryScan(one.code for one in programs if isinstance(one, MainProgram))
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.record(recorder)
         write_job(writer, job)
@@ -349,7 +352,7 @@ class Session:
         for name, values in self._metadata.items():
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
-        note_choices(self.loop)
+        remember_choices(self.loop)
         if job.stop.size is not None:
             self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
@@ -400,7 +403,7 @@ class Session:
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
             if not self.whole_graph:
-                self._faults = arm_nodes(self.job, self.world, self.start_ns)
+                self._faults = arm_node_faults(self.job, self.world, self.start_ns)
             stop_with(self.world, self._entries)
             self.world.stacks.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
@@ -410,7 +413,7 @@ class Session:
                 if entry in later or (entry.is_component and self.whole_graph):
                     continue
                 if not self.world.construct(entry):
-                    say_where(self.job, entry, self.world.error)
+                    add_job_location(self.job, entry, self.world.error)
                     break
             if not self.ended:
                 self.bag_faults = start_players(
@@ -427,7 +430,7 @@ class Session:
             self.world.go_on()
         failed, self.world.starts.failed = self.world.starts.failed, None
         if failed is not None:
-            say_where(self.job, failed, self.world.error)
+            add_job_location(self.job, failed, self.world.error)
 
     @contextmanager
     def _engaged(self) -> Iterator[None]:
@@ -455,12 +458,14 @@ class Session:
         self.job = job = without_launch_files(job).job
         if isinstance(self.loop, OrderedLoop) and job.policy != old.policy:
             with self._guarded.engaged():
-                self.loop.policy = going_on(policy_of_job(job, self.start_ns), self.loop.policy)
+                self.loop.policy = continued_policy(
+                    policy_of_job(job, self.start_ns), self.loop.policy
+                )
         faults = job.faults[len(old.faults) :]
-        arm_topics(faults, self.world)
+        arm_topic_faults(faults, self.world)
         if self.bag_faults is not None:
             self.bag_faults.add(job, len(old.faults))
-        self._faults = arm_nodes(job, self.world, self.start_ns)
+        self._faults = arm_node_faults(job, self.world, self.start_ns)
 
     def settle(self, path: Path) -> None:
         """Have what the ``writer`` has been given so far, and all to come, in a trace.
@@ -515,7 +520,7 @@ class Session:
         exit_code = error.exit_code if error else self._exit_code(stop)
         if self._writer is not None:
             self._guarded.write(self._writer)
-            keep_choices(self._writer, loop)
+            write_choices(self._writer, loop)
             self._writer.close(
                 result={
                     "start_time": str(self.start_ns),
@@ -525,7 +530,7 @@ class Session:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error, outcome.waits),
-                    **kept_drops(drops(outcome.drops)),
+                    **kept_drops(queue_drops(outcome.drops)),
                     **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,

@@ -23,7 +23,7 @@ from rsltrace.trace.model.texts import format_seconds
 # Listening to a topic from outside of a simulation, without being part of the graph.
 
 
-class Tap:
+class TopicTap:
     """The messages published on a topic since ``Simulation.subscribe`` was called.
 
     ``messages`` are (simulated ns, message), oldest first, the last ``depth`` of them; ``count`` is
@@ -106,7 +106,7 @@ class Simulation:
             self._forking = None
             self._session = Session(loaded, path, force=force, echo=echo)
         self._entered: Driver | None = None
-        self._taps: dict[str, list[Tap]] = {}
+        self._taps: dict[str, list[TopicTap]] = {}
         self._result: RunResult | None = None
 
     # -- from beginning to end ---------------------------------------------------------------------
@@ -386,7 +386,7 @@ class Simulation:
         callback: Callable[[Any], object] | None = None,
         *,
         depth: int | None = 1000,
-    ) -> Tap:
+    ) -> TopicTap:
         """Listen to a topic from outside: the Tap keeps the last ``depth`` messages (None: all).
 
         ``callback(message)`` is called at the end of the time step in which it was published. The
@@ -394,20 +394,20 @@ class Simulation:
         """
         self._check_there()
         topic = _topic(topic)
-        tap = Tap(topic, callback, depth)
+        tap = TopicTap(topic, callback, depth)
         if topic not in self._taps:
             self._taps[topic] = []
             self._session.world.domain.watch(topic, self._watcher(self._taps[topic]))
         self._taps[topic].append(tap)
         return tap
 
-    def unsubscribe(self, tap: Tap) -> None:
+    def unsubscribe(self, tap: TopicTap) -> None:
         """Stop listening."""
         taps = self._taps.get(tap.topic, [])
         if tap in taps:
             taps.remove(tap)
 
-    def _watcher(self, taps: list[Tap]) -> Callable[[Any, bytes], None]:
+    def _watcher(self, taps: list[TopicTap]) -> Callable[[Any, bytes], None]:
         from rsltrace.adapters.rclpy.wire.codec import codec_for
         from rsltrace.adapters.rclpy.wire.interfaces import class_of
 

@@ -17,7 +17,7 @@ from rsltrace.job.values.problem import Loc
 from rsltrace.run.plans.entries import entry_keys
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.entity import Receiver
-from rsltrace.simulation.middleware.events.event import Asker, Census
+from rsltrace.simulation.middleware.events.event import Asker, NameRegistry
 from rsltrace.trace.model.drop import Drop
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
@@ -31,7 +31,7 @@ Counts = Mapping[tuple[Receiver, int], int]
 the full one (else 0)."""
 
 
-def drops(counts: Counts) -> list[Drop]:
+def queue_drops(counts: Counts) -> list[Drop]:
     """Return what full queues dropped, in the order of the entities."""
     found = [
         Drop(receiver.entity_id, held or receiver.keep or 0, count, in_outage=held > 0)
@@ -71,7 +71,7 @@ def has_remappings(job: Job) -> bool:
     return bool(job.ros_arguments) or any(spec.remappings for spec in job.nodes)
 
 
-def unused_remappings(job: Job, census: Census) -> Iterator[str]:
+def unused_remappings(job: Job, census: NameRegistry) -> Iterator[str]:
     """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do.
 
     What several nodes are given alike (``<set_remap>`` of a launch file, an anchor of YAML) has
@@ -104,7 +104,7 @@ def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
             yield index, word.partition(":=")[0]
 
 
-def _is_used(old: str, askers: Iterable[Asker], census: Census) -> bool:
+def _is_used(old: str, askers: Iterable[Asker], census: NameRegistry) -> bool:
     bare = old.rpartition(":")[2]
     if bare.startswith("__") or bare in _USUAL:
         return True
@@ -122,7 +122,7 @@ def _forms(name: str, asker: Asker) -> list[str]:
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
 
-def _remapping_note(old: str, askers: list[Asker], census: Census) -> str:
+def _remapping_note(old: str, askers: list[Asker], census: NameRegistry) -> str:
     names = [
         form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]
@@ -145,7 +145,7 @@ def has_rules(job: Job) -> bool:
 
 
 def unused_rules(
-    job: Job, census: Census, plan: NetworkPlan | None, lasted_ns: int | None = None
+    job: Job, census: NameRegistry, plan: NetworkPlan | None, lasted_ns: int | None = None
 ) -> Iterator[str]:
     """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
     topics = [*census.topics, *QUIET_TOPICS]
@@ -161,7 +161,7 @@ def unused_rules(
                 yield _note(job, place, what, glob, names)
     for rule in plan.table if plan is not None else ():
         if rule.name not in topics:
-            yield f"{rule.where}: no topic is called {rule.name!r}{_instead(rule.name, topics)}"
+            yield f"{rule.where}: no topic is called {rule.name!r}{_suggestion(rule.name, topics)}"
     for place, glob in _record_globs(job):
         names = [*topics, *census.services]
         if not _fits(glob, names):
@@ -218,7 +218,7 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -
 
 
 def unused_ros_parameters(
-    job: Job, census: Census, nodes: dict[str, Parameters], *, lasted: bool
+    job: Job, census: NameRegistry, nodes: dict[str, Parameters], *, lasted: bool
 ) -> Iterator[str]:
     """Yield the parameters among ``ros_arguments`` that no node which gets them has declared.
 
@@ -234,7 +234,7 @@ def unused_ros_parameters(
         place = locate(job, ("ros_arguments", index))
         if name is None:
             who = word.partition(":=")[0].rpartition(":")[0]
-            yield f"{place}: no node is called {who!r}{_instead(who, list(census.nodes))}"
+            yield f"{place}: no node is called {who!r}{_suggestion(who, list(census.nodes))}"
             continue
         who_gets = [node for node, found in given.items() if found]
         if any(node not in nodes or name in nodes[node].declared for node in who_gets):
@@ -289,7 +289,7 @@ def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
                 yield loc, glob
 
 
-def _links(job: Job, census: Census) -> Iterator[str]:
+def _links(job: Job, census: NameRegistry) -> Iterator[str]:
     for index, link in enumerate(job.delay.links if job.delay is not None else ()):
         place: Loc = ("delay", "links", index)
         if not _fits(link.topic, census.topics):
@@ -301,14 +301,14 @@ def _links(job: Job, census: Census) -> Iterator[str]:
         ):
             there = [node for node, topic in ends if fnmatchcase(topic, link.topic)]
             if not _fits(glob, there):
-                near = did_you_mean(glob, there) or _there(there)
+                near = did_you_mean(glob, there) or _available(there)
                 yield (
                     f"{locate(job, (*place, key))}: no node that fits {glob!r} {what} "
                     f"{link.topic!r}{near}"
                 )
 
 
-def _entities(job: Job, census: Census) -> Iterator[str]:
+def _entities(job: Job, census: NameRegistry) -> Iterator[str]:
     """Yield the rules for entities of nodes, in ``execution`` and ``policy``."""
     rules: list[tuple[Loc, str, str, str | None]] = []
     if job.execution is not None:
@@ -324,7 +324,7 @@ def _entities(job: Job, census: Census) -> Iterator[str]:
         elif entity is not None:
             names = [name for owner, name in census.entities if fnmatchcase(owner, node)]
             if not _fits(entity, names):
-                near = did_you_mean(entity, names) or _there(names)
+                near = did_you_mean(entity, names) or _available(names)
                 yield (
                     f"{locate(job, (*place, key))}: no topic, service or timer's callback of "
                     f"{node!r} fits {entity!r}{near}"
@@ -349,14 +349,14 @@ def _fits(glob: str, names: Iterable[str]) -> bool:
 
 
 def _note(job: Job, place: Loc, what: str, glob: str, names: list[str]) -> str:
-    return f"{locate(job, place)}: no {what} fits {glob!r}{_instead(glob, names)}"
+    return f"{locate(job, place)}: no {what} fits {glob!r}{_suggestion(glob, names)}"
 
 
-def _instead(name: str, names: list[str]) -> str:
-    return did_you_mean(name, names) or _there(names)
+def _suggestion(name: str, names: list[str]) -> str:
+    return did_you_mean(name, names) or _available(names)
 
 
-def _there(names: Iterable[str]) -> str:
+def _available(names: Iterable[str]) -> str:
     usual = (*QUIET_TOPICS, *NODE_SERVICES)
     found = sorted({name for name in names if name and not name.endswith(usual)})
     shown = ", ".join(found[:5]) + (", …" if len(found) > 5 else "")

@@ -312,9 +312,9 @@ class Picky(Node):
 def test_an_arrow_back_has_one_head_and_a_way_of_its_own() -> None:
     pytest.importorskip("fast_sugiyama")
     from rsltrace.cli.output.graph_svg import graph_svg
-    from rsltrace.simulation.middleware.overview import End, Link, NodeView, Overview
+    from rsltrace.simulation.middleware.overview import End, GraphNode, Link, Overview
 
-    nodes = tuple(NodeView(name, "", ()) for name in ("/plan", "/drive"))
+    nodes = tuple(GraphNode(name, "", ()) for name in ("/plan", "/drive"))
     plan, drive = End("/plan"), End("/drive")
     links = (
         Link("topic", "/cmd", "", (plan,), (drive,)),

@@ -15,7 +15,7 @@ from typing import Any
 
 from rsltrace.debug.checkpoints import Stopped
 from rsltrace.debug.prompt import show
-from rsltrace.debug.prompt.commands import Commands, Prompt
+from rsltrace.debug.prompt.commands import PromptCommands, PromptContext
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.terminal import say
 
@@ -92,7 +92,7 @@ def _line(prompt: str, read: Callable[[str], str | None]) -> str | None:
             say()
 
 
-COMMANDS = Commands()
+COMMANDS = PromptCommands()
 _add = COMMANDS.add
 
 _CHANGED = re.compile(r"(?P<node>[\w/~]+)(?:\.|\s+)(?P<attribute>\S.*)")
@@ -116,25 +116,25 @@ def _place(text: str) -> int | str:
 
 
 @_add("step", "s", usage="[N]", topic="running", repeats=True)
-def _step(shell: Prompt, rest: str) -> None:
+def _step(shell: PromptContext, rest: str) -> None:
     """Run one event, or N."""
     shell.stopped(shell.session.step(_count(rest)))
 
 
 @_add("next", "n", usage="[NODE]", topic="running", repeats=True)
-def _next(shell: Prompt, rest: str) -> None:
+def _next(shell: PromptContext, rest: str) -> None:
     """Run to the end of the next event of this node, or of NODE."""
     shell.stopped(shell.session.next(rest or None))
 
 
 @_add("finish", "fin", topic="running", repeats=True)
-def _finish(shell: Prompt, rest: str) -> None:
+def _finish(shell: PromptContext, rest: str) -> None:
     """Run to the end of this time step."""
     shell.stopped(shell.session.finish())
 
 
 @_add("continue", "c", "cont", topic="running", repeats=True)
-def _continue(shell: Prompt, rest: str) -> None:
+def _continue(shell: PromptContext, rest: str) -> None:
     """Run to the next breakpoint, or to the end.
 
     Ctrl-C stops the run after its present event.
@@ -143,7 +143,7 @@ def _continue(shell: Prompt, rest: str) -> None:
 
 
 @_add("run-to", "until", "u", usage="PLACE", topic="running")
-def _run_to(shell: Prompt, rest: str) -> None:
+def _run_to(shell: PromptContext, rest: str) -> None:
     """Run to an event (812) or a time of the run (2.5s), or to a breakpoint before it.
 
     At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to then.
@@ -155,25 +155,25 @@ def _run_to(shell: Prompt, rest: str) -> None:
 
 
 @_add("reverse-step", "rs", usage="[N]", topic="going back", repeats=True)
-def _reverse_step(shell: Prompt, rest: str) -> None:
+def _reverse_step(shell: PromptContext, rest: str) -> None:
     """Go back one event, or N."""
     shell.stopped(shell.session.reverse_step(_count(rest)))
 
 
 @_add("reverse-next", "rn", usage="[NODE]", topic="going back", repeats=True)
-def _reverse_next(shell: Prompt, rest: str) -> None:
+def _reverse_next(shell: PromptContext, rest: str) -> None:
     """Go back to the end of the event before, of this node or of NODE."""
     shell.stopped(shell.session.reverse_next(rest or None))
 
 
 @_add("reverse-continue", "rc", topic="going back", repeats=True)
-def _reverse_continue(shell: Prompt, rest: str) -> None:
+def _reverse_continue(shell: PromptContext, rest: str) -> None:
     """Go back to where a breakpoint stops last before here, or to the beginning."""
     shell.stopped(shell.session.reverse_go_on())
 
 
 @_add("goto", "g", usage="PLACE", topic="going back")
-def _goto(shell: Prompt, rest: str) -> None:
+def _goto(shell: PromptContext, rest: str) -> None:
     """Go to an event (812) or a time of the run (2.5s), ahead or back; no breakpoint stops."""
     shell.stopped(shell.session.go_to(_place(rest)))
 
@@ -182,7 +182,7 @@ def _goto(shell: Prompt, rest: str) -> None:
 
 
 @_add("break", "b", usage="CONDITION", topic="breakpoints")
-def _break(shell: Prompt, rest: str) -> None:
+def _break(shell: PromptContext, rest: str) -> None:
     """Set a breakpoint.
 
     812                           before event 812
@@ -207,13 +207,13 @@ def _break(shell: Prompt, rest: str) -> None:
 
 
 @_add("watch", usage="EXPRESSION", topic="breakpoints")
-def _watch(shell: Prompt, rest: str) -> None:
+def _watch(shell: PromptContext, rest: str) -> None:
     """Stop after events that change a value: ekf.P[0][0], node("ekf").P."""
     _break(shell, f"watch {rest}")
 
 
 @_add("delete", "d", usage="[NUMBER]...", topic="breakpoints")
-def _delete(shell: Prompt, rest: str) -> None:
+def _delete(shell: PromptContext, rest: str) -> None:
     """Remove breakpoints, or all."""
     numbers = [_count(word) for word in rest.split()]
     for number in numbers or [one.number for one in shell.session.breakpoints]:
@@ -236,7 +236,7 @@ INFO = {
 
 
 @_add("info", "i", usage="[WHAT]", topic="looking")
-def _info(shell: Prompt, rest: str) -> None:
+def _info(shell: PromptContext, rest: str) -> None:
     """Show breakpoints, nodes, queues, timers, stacks, graph, …; alone, what there is."""
     word, _, more = rest.partition(" ")
     if not word:
@@ -263,7 +263,7 @@ def _info(shell: Prompt, rest: str) -> None:
         shell.show(nothing if value is None else show.value_lines(value))
 
 
-def _node(shell: Prompt) -> str:
+def _node(shell: PromptContext) -> str:
     name = shell.node_here()
     if name is None:
         raise DebugError("the event here is no node's: say which node")
@@ -271,7 +271,7 @@ def _node(shell: Prompt) -> str:
 
 
 @_add("print", "p", usage="EXPRESSION", topic="looking")
-def _print(shell: Prompt, rest: str) -> None:
+def _print(shell: PromptContext, rest: str) -> None:
     """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now.
 
     This is Python, methods of nodes included, in a copy of the run: whatever it does changes
@@ -286,19 +286,19 @@ def _print(shell: Prompt, rest: str) -> None:
 
 
 @_add("list", "l", topic="looking")
-def _list(shell: Prompt, rest: str) -> None:
+def _list(shell: PromptContext, rest: str) -> None:
     """Show the source lines of the callback."""
     shell.show(show.source_lines(shell.session.inspect("source")))
 
 
 @_add("where", "w", "bt", topic="looking")
-def _where(shell: Prompt, rest: str) -> None:
+def _where(shell: PromptContext, rest: str) -> None:
     """Show the event here, its cause and its hashes."""
     shell.show(show.where_lines(shell.session.position))
 
 
 @_add("pdb", topic="looking")
-def _pdb(shell: Prompt, rest: str) -> None:
+def _pdb(shell: PromptContext, rest: str) -> None:
     """Call the next callback under pdb, from its first line on.
 
     It is called in a copy of the run: what it does, or you do there, changes nothing here. "c" or
@@ -311,7 +311,7 @@ def _pdb(shell: Prompt, rest: str) -> None:
 
 
 @_add("debugpy", usage="[PORT]", topic="looking")
-def _debugpy(shell: Prompt, rest: str) -> None:
+def _debugpy(shell: PromptContext, rest: str) -> None:
     """Run on in a copy of the run, for an editor (VS Code) to stop in: port 5678.
 
     The editor stops in the first line of the next callback, and where it has breakpoints; simulated
@@ -326,7 +326,7 @@ def _debugpy(shell: Prompt, rest: str) -> None:
 
 
 @_add("who-changed", "wc", usage="NODE ATTRIBUTE", topic="searching")
-def _who_changed(shell: Prompt, rest: str) -> None:
+def _who_changed(shell: PromptContext, rest: str) -> None:
     """Find the last event up to here that changed an attribute: who-changed ekf P[0][0]."""
     found = _CHANGED.fullmatch(rest)
     if found is None:
@@ -335,7 +335,7 @@ def _who_changed(shell: Prompt, rest: str) -> None:
 
 
 @_add("who-sent", "ws", usage="[EVENT]", topic="searching")
-def _who_sent(shell: Prompt, rest: str) -> None:
+def _who_sent(shell: PromptContext, rest: str) -> None:
     """Find the event that sent what this one (or EVENT) has received."""
     position = shell.session.position
     index = _count(rest, position.index if position.is_next else position.index - 1)
@@ -345,7 +345,7 @@ def _who_sent(shell: Prompt, rest: str) -> None:
 
 
 @_add("when", usage="CONDITION", topic="searching")
-def _when(shell: Prompt, rest: str) -> None:
+def _when(shell: PromptContext, rest: str) -> None:
     """Find the first event up to here at which a condition (see break) is true.
 
     An expression alone is one, too: when ekf.P[0][0] > 1.
@@ -355,7 +355,7 @@ def _when(shell: Prompt, rest: str) -> None:
     shell.show(show.found_lines(shell.session.first_true(_as_condition(rest, shell))))
 
 
-def _as_condition(text: str, shell: Prompt) -> str:
+def _as_condition(text: str, shell: PromptContext) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
     from rsltrace.conditions.expressions import parse_expression
     from rsltrace.conditions.text import parse_condition
@@ -375,7 +375,7 @@ def _as_condition(text: str, shell: Prompt) -> str:
 
 
 @_add("edit", usage="EDIT", topic="what if")
-def _edit(shell: Prompt, rest: str) -> None:
+def _edit(shell: PromptContext, rest: str) -> None:
     """Change something from here on, and go on in the branch that comes of it.
 
     message.data = 3.0                what the event that follows receives
@@ -390,7 +390,7 @@ def _edit(shell: Prompt, rest: str) -> None:
 
 
 @_add("keep", usage="FILE", topic="what if")
-def _keep(shell: Prompt, rest: str) -> None:
+def _keep(shell: PromptContext, rest: str) -> None:
     """Write the trace of the branch in which the session is since an edit."""
     if not rest:
         raise DebugError("where to? keep FILE, as branch.mcap")
@@ -401,12 +401,12 @@ def _keep(shell: Prompt, rest: str) -> None:
 
 
 @_add("help", "h", "?", usage="[COMMAND]", topic="the rest")
-def _help(shell: Prompt, rest: str) -> None:
+def _help(shell: PromptContext, rest: str) -> None:
     """Show this, or more of a command."""
     shell.show(COMMANDS.help(rest))
 
 
 @_add("quit", "q", "exit", topic="the rest")
-def _quit(shell: Prompt, rest: str) -> None:
+def _quit(shell: PromptContext, rest: str) -> None:
     """End the session."""
     shell.is_over = True

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rsltrace.debug.client import DebugSession
 
 
-class Prompt(Protocol):
+class PromptContext(Protocol):
     """What commands need of the prompt. A command that ends the session sets ``is_over``."""
 
     session: DebugSession
@@ -42,7 +42,7 @@ Run = Callable[[Any, str], object]
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class PromptCommand:
     """A command: its names (the first is its own), what follows them, and what it does.
 
     An empty line ``repeats`` it. ``topic`` is the group that help lists it in.
@@ -61,12 +61,12 @@ class Command:
         return self.names[0]
 
 
-class Commands:
+class PromptCommands:
     """The commands there are."""
 
     def __init__(self) -> None:
-        self.all: list[Command] = []
-        self._by_name: dict[str, Command] = {}
+        self.all: list[PromptCommand] = []
+        self._by_name: dict[str, PromptCommand] = {}
 
     def add(
         self, *names: str, topic: str, usage: str = "", repeats: bool = False
@@ -74,7 +74,7 @@ class Commands:
         """Make a function a command, whose help is the function's docstring."""
 
         def added(run: Run) -> Run:
-            command = Command(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
+            command = PromptCommand(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
             assert not self._by_name.keys() & names, "one name, one command"
             self.all.append(command)
             self._by_name.update(dict.fromkeys(names, command))
@@ -82,7 +82,7 @@ class Commands:
 
         return added
 
-    def find(self, word: str) -> Command:
+    def find(self, word: str) -> PromptCommand:
         """Return the command that is meant: by a name, or by the beginning of one.
 
         :raises DebugError: it could be several, or none.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.conditions.names import Names, short_name
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
-from rsltrace.debug.prompt.commands import Prompt
+from rsltrace.debug.prompt.commands import PromptContext
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import Source
@@ -100,7 +100,7 @@ def _readline(complete: Completer) -> Iterator[None]:
 _HEADS = "node topic entity output exception log finding watch when t=".split()
 
 
-def completions(text: str, shell: Prompt) -> list[str]:
+def completions(text: str, shell: PromptContext) -> list[str]:
     """Return what the last word of ``text`` could become."""
     words = text.lstrip().split(" ")
     last = words[-1]
@@ -114,7 +114,7 @@ def completions(text: str, shell: Prompt) -> list[str]:
     return _begin(_arguments(name, words[1:-1], shell), last)
 
 
-def _arguments(command: str, before: list[str], shell: Prompt) -> Iterable[str]:
+def _arguments(command: str, before: list[str], shell: PromptContext) -> Iterable[str]:
     names = shell.names()
     if command in ("break", "when") and not before:
         messages = (f"{topic}:" for topic in names.topics)
@@ -145,7 +145,7 @@ def _arguments(command: str, before: list[str], shell: Prompt) -> Iterable[str]:
     return ()
 
 
-def _nodes_as_names(shell: Prompt) -> tuple[str, ...]:
+def _nodes_as_names(shell: PromptContext) -> tuple[str, ...]:
     return tuple(f"{short_name(node)}." for node in shell.names().nodes)
 
 

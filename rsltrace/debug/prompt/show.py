@@ -10,7 +10,7 @@ from rsltrace.trace.model.texts import format_duration, format_seconds, printabl
 from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:
-    from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped
+    from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped
 
 _CELL_MAX = 60
 _DID_MAX = 160
@@ -38,7 +38,7 @@ def stopped_lines(stopped: Stopped) -> Iterator[str]:
     yield position_line(stopped.position)
 
 
-def position_line(position: Position) -> str:
+def position_line(position: RunPosition) -> str:
     """Return the event that has ended last, or (with an arrow) the one that is about to run."""
     if position.is_next:
         what = _event(position.next or {})
@@ -48,7 +48,7 @@ def position_line(position: Position) -> str:
     return _ended(position.event)
 
 
-def where_lines(position: Position) -> Iterator[str]:
+def where_lines(position: RunPosition) -> Iterator[str]:
     """Yield all that is known of where the run stands."""
     yield position_line(position)
     event = position.event
@@ -64,7 +64,7 @@ def where_lines(position: Position) -> Iterator[str]:
     yield printable(f"   {', '.join(known)}")
 
 
-def found_lines(position: Position) -> Iterator[str]:
+def found_lines(position: RunPosition) -> Iterator[str]:
     """Yield an event that was looked for, and how to get there."""
     yield position_line(position)
     before = f"goto {position.index - 1} before it" if position.index else "step runs it"

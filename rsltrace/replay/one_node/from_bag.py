@@ -15,14 +15,19 @@ from pathlib import Path
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import BagSpec, Job, StopSpec
-from rsltrace.replay.one_node.output_comparison import Key, Put, Side, changes, outputs_of_node
+from rsltrace.replay.one_node.output_comparison import (
+    Key,
+    NodeOutput,
+    NodeOutputs,
+    output_changes,
+    outputs_of_node,
+)
 from rsltrace.replay.one_node.result import NodeReplayResult
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
-from rsltrace.run import Observer
+from rsltrace.run import Observer, run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.process import kept_process
-from rsltrace.run import run
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64
@@ -35,7 +40,7 @@ from rsltrace.trace.recordings.playback import header_stamp_ns
 
 
 @dataclass(frozen=True, slots=True)
-class Ends:
+class NodeTopics:
     """The entry of a job (its place in ``nodes:``) that makes a node, and the node's topics with
     their types."""
 
@@ -45,10 +50,10 @@ class Ends:
     published: dict[str, str]
 
 
-class _Probe(Session):
+class _NodeProbe(Session):
     """Constructs the entries of a job one by one, until one has made the node."""
 
-    def find(self, node: str) -> Ends:
+    def find(self, node: str) -> NodeTopics:
         """Return what there is to know of the node.
 
         :raises RunError: what went wrong in a constructor.
@@ -68,7 +73,7 @@ class _Probe(Session):
             names = [one.fully_qualified_name for one in graph.nodes]
             hint = did_you_mean(node, names, f"its nodes are {', '.join(names)}")
             raise ReplayError(f"the job makes no node {node}: {hint}")
-        return Ends(
+        return NodeTopics(
             node,
             place - hooks,
             {one.topic: one.type_name for one in graph.subscriptions_of(found)},
@@ -76,13 +81,13 @@ class _Probe(Session):
         )
 
 
-def ends_of(job: Job, node: str) -> Ends:
+def node_topics(job: Job, node: str) -> NodeTopics:
     """Construct the nodes of a job until ``node`` is there; return its topics.
 
     :raises ReplayError: no entry of the job makes it.
     :raises JobError, SetupError, RunError: its code cannot be loaded, or fails.
     """
-    probe = _Probe(job, None)
+    probe = _NodeProbe(job, None)
     with kept_process(), probe:
         try:
             return probe.find(node if node.startswith("/") else f"/{node}")
@@ -101,15 +106,15 @@ _NOT_OF_ROBOTS: dict[str, object] = {
 """What a job says of a simulated robot; a recording of a real one has the effects of all that."""
 
 
-class BagSide(Side):
+class BagOutputs(NodeOutputs):
     """What a bag has on the topics of a node, decoded by what a trace says of their types."""
 
     def __init__(self, trace: Trace) -> None:
         super().__init__(trace, [])
-        self.puts: list[Put] = []
+        self.puts: list[NodeOutput] = []
         self.data: list[bytes] = []
 
-    def decoded(self, put: Put) -> object | None:
+    def decoded(self, put: NodeOutput) -> object | None:
         channel = put.key[1]
         if not any(one.topic == channel for one in self.trace.channels.values()):
             return None
@@ -134,7 +139,7 @@ def replay_from_bag(
     :raises RunError: what went wrong in the node.
     """
     alone = job.model_copy(update=_NOT_OF_ROBOTS)
-    ends = ends_of(alone, node)
+    ends = node_topics(alone, node)
     specs = tuple(_specs(bags, ends))
     nodes = (job.nodes[ends.entry],)
     with place_for(output) as path:
@@ -152,7 +157,7 @@ def replay_from_bag(
             here, there = _sides(trace, ends, bags)
             if interruption(done):
                 there.puts = [put for put in there.puts if put.stamp_ns < done.end_ns]
-            found = tuple(changes(there, here, options or DiffOptions()))
+            found = tuple(output_changes(there, here, options or DiffOptions()))
             inputs = sum(int((r["kind"] == EventKind.BAG).sum()) for r in trace.events())
     return NodeReplayResult(
         trace=", ".join(map(str, bags)),
@@ -169,7 +174,7 @@ def replay_from_bag(
     )
 
 
-def _specs(bags: Sequence[Path], ends: Ends) -> Iterator[BagSpec]:
+def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
     """Yield the bags with the topics of which the node hears.
 
     :raises ReplayError: there are none, or of another type.
@@ -198,14 +203,14 @@ def _specs(bags: Sequence[Path], ends: Ends) -> Iterator[BagSpec]:
         )
 
 
-def _compared(ends: Ends) -> list[str]:
+def _compared(ends: NodeTopics) -> list[str]:
     """Return the topics that only the node itself can have filled, as far as one can tell."""
     return [t for t in ends.published if t not in (*_OF_ALL_NODES, *ends.subscribed)]
 
 
-def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSide]:
+def _sides(trace: Trace, ends: NodeTopics, bags: Sequence[Path]) -> tuple[NodeOutputs, BagOutputs]:
     """Return what the node has put out, and what was recorded on these topics."""
-    recorded = BagSide(trace)
+    recorded = BagOutputs(trace)
     headers: dict[str, bool] = {}
     for path in bags:
         with open_bag(path, recover=True, skip=never_plays) as bag:
@@ -220,11 +225,11 @@ def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSid
             payload = trace.payload(put.output)
             data = b"" if payload is None else payload[2]
             at = _at(put.key, data, headers, counts)
-            puts.append(Put(put.stamp_ns, put.key, put.place, put.output, at))
-    return Side(trace, puts), recorded
+            puts.append(NodeOutput(put.stamp_ns, put.key, put.place, put.output, at))
+    return NodeOutputs(trace, puts), recorded
 
 
-def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]) -> None:
+def _read(path: Path, topics: list[str], side: BagOutputs, headers: dict[str, bool]) -> None:
     from rsltrace.adapters.rclpy.wire.codec import codec_for
 
     counts: dict[Key, int] = {}
@@ -238,7 +243,7 @@ def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]
             key: Key = (OutputKind.MESSAGE, bag.topics[index].name)
             output = Output(NO_EVENT, 0, OutputKind.MESSAGE, hash64(data), NO_SEQUENCE)
             at = _at(key, data, headers, counts)
-            side.puts.append(Put(stamp_ns, key, len(side.data), output, at))
+            side.puts.append(NodeOutput(stamp_ns, key, len(side.data), output, at))
             side.data.append(data)
 
 
@@ -250,7 +255,7 @@ def _at(key: Key, data: bytes, headers: dict[str, bool], counts: dict[Key, int])
     return counts[key]
 
 
-def _notes(ends: Ends, there: Side) -> Iterator[str]:
+def _notes(ends: NodeTopics, there: NodeOutputs) -> Iterator[str]:
     both = [t for t in ends.published if t in ends.subscribed and t not in _OF_ALL_NODES]
     if both:
         yield (

@@ -13,20 +13,29 @@ import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
-from rsltrace.replay.one_node.output_comparison import Side, Watch, changes, outputs_of_node
-from rsltrace.replay.one_node.result import Column, Columns, NodeReplayResult
-from rsltrace.replay.one_node.script import RecordedScript, Unit, check_payloads
+from rsltrace.replay.one_node.output_comparison import (
+    NodeOutputs,
+    OutputWatch,
+    output_changes,
+    outputs_of_node,
+)
+from rsltrace.replay.one_node.result import Column, NodeReplayResult, RecordingColumns
+from rsltrace.replay.one_node.script import RecordedScript, ReplayedEntry, check_payloads
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
-from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
-from rsltrace.simulation.loop.recorded_input_loop import FedLoop, FedOrderedLoop, end_of
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.policy import Fifo
+from rsltrace.simulation.loop.recorded_input_loop import (
+    OrderedRecordedInputLoop,
+    RecordedInputLoop,
+    stop_at_recorded_end,
+)
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
@@ -43,10 +52,10 @@ from rsltrace.trace.reader import Trace
 _BEGIN = (EventKind.SERVICE, EventKind.ACTION)
 
 
-class Answers:
+class ServiceAnswers:
     """The requests of the unit's clients that others have taken, until they are answered."""
 
-    def __init__(self, columns: Columns, is_own: Callable[[Column], Column]) -> None:
+    def __init__(self, columns: RecordingColumns, is_own: Callable[[Column], Column]) -> None:
         events, outputs = columns.events, columns.outputs
         self._columns = columns
         self._asked: dict[tuple[int, int], tuple[int, int]] = {}
@@ -107,17 +116,17 @@ class Answers:
         return int(rows["entity"][0]) if drawn else -1
 
 
-class FedSession(Session):
+class NodeReplaySession(Session):
     """Runs ``unit`` alone. The stages are those of ``Session``; bags, stop conditions, policy and
     executors of the job are none of its business: the recording has what came of them."""
 
-    loop: FedLoop
+    loop: RecordedInputLoop
 
     def __init__(
         self,
         plan: Preparation,
-        columns: Columns,
-        unit: Unit,
+        columns: RecordingColumns,
+        unit: ReplayedEntry,
         output: Path,
         *,
         force: bool = False,
@@ -132,7 +141,7 @@ class FedSession(Session):
         self._unit = unit
         self._trace = plan.trace
         self.script = RecordedScript(columns, unit, self._perform)
-        self._answers = Answers(columns, unit.is_own)
+        self._answers = ServiceAnswers(columns, unit.is_own)
 
     # -- what is different from a run of the whole job --------------------------------------------
 
@@ -148,14 +157,14 @@ class FedSession(Session):
 
     def _kind_of_loop(self) -> type[EventLoop]:
         ordered = is_ordered(self.job) or self.job.timer_ties != "creation"
-        return FedOrderedLoop if ordered else FedLoop
+        return OrderedRecordedInputLoop if ordered else RecordedInputLoop
 
     def _order_events(self, stack: ExitStack) -> None:
         loop = self.loop
         self._recorded = None
         loop.script = self.script
         loop.by_steps, loop.min_step_ns = bool(loop.min_step_ns), 0
-        if isinstance(loop, FedOrderedLoop):
+        if isinstance(loop, OrderedRecordedInputLoop):
             plan = scheduling_plan(self.job, self.start_ns, Fifo())
             self.world.use_scheduling(loop, replace(plan, occupies=False))
             loop.has_workers = plan.occupies
@@ -167,7 +176,7 @@ class FedSession(Session):
 
         job, world = self.job, self.world
         self._stand_ins = StandIns(world.domain, self._definition)
-        self.loop.stop_conditions = (end_of(self.script, self.loop),)  # type: ignore[assignment]
+        self.loop.stop_conditions = (stop_at_recorded_end(self.script, self.loop),)  # type: ignore[assignment]
         hooks = int(job.hooks.before is not None)
         nodes = range(hooks, hooks + len(job.nodes))
         with world.importing():
@@ -221,7 +230,7 @@ class FedSession(Session):
                     continue
                 self.script.perform_until(event)
                 if not world.construct(entry):
-                    say_where(self.job, entry, world.error)
+                    add_job_location(self.job, entry, world.error)
                     break
             if not self.ended:
                 self.script.perform_until(last)
@@ -308,7 +317,7 @@ class _Progress(EventObserver):
             self._script.happened(event.kind, event.entity, self._dispatcher.loop.now_ns)
 
 
-def run_fed(session: FedSession, watch: Watch | None = None) -> RunResult:
+def run_node(session: NodeReplaySession, watch: OutputWatch | None = None) -> RunResult:
     """Run a session to its end."""
     with session:
         if watch is not None:
@@ -346,15 +355,21 @@ def replay_node(
             f"{trace.name} was made with threads: {{switch: every_line}}: where a callback gives "
             "way depends on all of its process, so it replays as a whole only; leave out --node"
         )
-    columns = Columns(trace)
-    unit = Unit(columns, plan.job, node, entries_of(trace, columns))
+    columns = RecordingColumns(trace)
+    unit = ReplayedEntry(columns, plan.job, node, entries_of(trace, columns))
     check_payloads(columns, unit)
     recorded = outputs_of_node(trace, unit.node.name)
     with place_for(output) as path:
-        session = FedSession(plan, columns, unit, path, force=force, echo=echo, observer=observer)
-        watch = Watch(recorded, unit.node.name, CHANGED) if until_diverged and not options else None
+        session = NodeReplaySession(
+            plan, columns, unit, path, force=force, echo=echo, observer=observer
+        )
+        watch = (
+            OutputWatch(recorded, unit.node.name, CHANGED)
+            if until_diverged and not options
+            else None
+        )
         with kept_process():
-            run = run_fed(session, watch)
+            run = run_node(session, watch)
         place = run.path or path
         with Trace.open(place) as present:
             puts = outputs_of_node(present, unit.node.name)
@@ -365,7 +380,11 @@ def replay_node(
                 compared = [put for put in recorded if put.stamp_ns < run.end_ns]
                 puts = [put for put in puts if put.stamp_ns < run.end_ns]
             found = tuple(
-                changes(Side(trace, compared), Side(present, puts), options or DiffOptions())
+                output_changes(
+                    NodeOutputs(trace, compared),
+                    NodeOutputs(present, puts),
+                    options or DiffOptions(),
+                )
             )
     return NodeReplayResult(
         trace=trace.name,
@@ -383,14 +402,16 @@ def replay_node(
     )
 
 
-def entries_of(trace: Trace, columns: Columns) -> list[int]:
+def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
     """Return, for each construction in a trace, which entry of the job it was that of."""
     told = trace.metadata(METADATA_FED).get("entries") or trace.result.get("entries", "")
     some = [int(one) for one in told.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))
 
 
-def _notes(unit: Unit, columns: Columns, run: RunResult, differs: bool) -> Iterator[str]:
+def _notes(
+    unit: ReplayedEntry, columns: RecordingColumns, run: RunResult, differs: bool
+) -> Iterator[str]:
     if unit.others:
         yield f"{', '.join(unit.others)} ran with it: the same entry of the job makes them"
     if differs:

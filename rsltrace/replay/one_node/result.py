@@ -26,7 +26,7 @@ SENT = (OutputKind.MESSAGE, OutputKind.LOG, OutputKind.REQUEST, OutputKind.RESPO
 _COLUMNS = ("stamp", "kind", "flags", "entity", "cause_event", "cause_output")
 
 
-class Columns:
+class RecordingColumns:
     """The events of a trace, ``events[i]`` by index, and its outputs in order.
 
     ``first_output[i]`` is where the outputs of event ``i`` begin (one more at the end).
@@ -67,7 +67,7 @@ class Columns:
         return None if found is None else found[2]
 
 
-class Change(Enum):
+class OutputChangeKind(Enum):
     """What has become of an output."""
 
     CHANGED = "changed"
@@ -85,7 +85,7 @@ class OutputChange:
     and ``event`` are the indices of the events in the recording and in the replay, or None.
     """
 
-    change: Change
+    change: OutputChangeKind
     time_ns: int
     kind: str
     name: str

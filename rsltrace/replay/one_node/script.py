@@ -11,8 +11,8 @@ import numpy as np
 
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import Job
-from rsltrace.replay.one_node.result import SENT, Column, Columns
-from rsltrace.simulation.loop.recorded_input_loop import NEVER, Step
+from rsltrace.replay.one_node.result import SENT, Column, RecordingColumns
+from rsltrace.simulation.loop.recorded_input_loop import NEVER, RecordedStep
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
@@ -33,7 +33,7 @@ from rsltrace.trace.model.event import (
 _OF_ALL = (EventKind.CLOCK_JUMP,)
 
 
-class Unit:
+class ReplayedEntry:
     """The entry that made ``node``.
 
     ``entities`` are the recorded ids of all that it made, ``nodes`` the full names of its nodes.
@@ -41,7 +41,9 @@ class Unit:
     and the hooks that made no node.
     """
 
-    def __init__(self, columns: Columns, job: Job, node: str, ordinals: Sequence[int]) -> None:
+    def __init__(
+        self, columns: RecordingColumns, job: Job, node: str, ordinals: Sequence[int]
+    ) -> None:
         self.columns = columns
         self._ordinals = ordinals
         """Which entry each construction of the trace was that of."""
@@ -161,7 +163,7 @@ class Unit:
         return self.entry_of(waiting[0])
 
 
-def find_node(columns: Columns, name: str) -> Entity:
+def find_node(columns: RecordingColumns, name: str) -> Entity:
     """Return the node of a name, with or without the slash before it.
 
     :raises ReplayError: if the recording has none; it names those that there are.
@@ -199,13 +201,13 @@ class RecordedScript:
     pairs of an output's place and its row.
     """
 
-    def __init__(self, columns: Columns, unit: Unit, perform: Performer) -> None:
+    def __init__(self, columns: RecordingColumns, unit: ReplayedEntry, perform: Performer) -> None:
         self._columns = columns
         self._perform = perform
         self.end_ns = columns.trace.end_ns
         self._own = unit.own_events
         self._others = ~unit.is_own(columns.outputs["entity"])
-        self._waiting: deque[Step] = deque()
+        self._waiting: deque[RecordedStep] = deque()
         self._following = self._steps()
         names = columns.trace.entities
         self._recorded: dict[tuple[Key, int], int] = {}
@@ -234,7 +236,7 @@ class RecordedScript:
     # -- for the loop ----------------------------------------------------------------------------
 
     @property
-    def next(self) -> Step | None:
+    def next(self) -> RecordedStep | None:
         """The first step that is not done, None after the last."""
         waiting = self._waiting
         while waiting and waiting[0].done:
@@ -304,7 +306,7 @@ class RecordedScript:
             if step.perform is not None:
                 step.perform()
 
-    def _steps(self) -> Iterator[Step]:
+    def _steps(self) -> Iterator[RecordedStep]:
         columns = self._columns
         outputs = columns.outputs
         kinds = np.isin(outputs["kind"], (*SENT, OutputKind.ENTITY))
@@ -316,10 +318,10 @@ class RecordedScript:
             row = columns.events[index]
             stamp_ns, kind, entity = int(row["stamp"]), int(row["kind"]), int(row["entity"])
             if self._own[index]:
-                yield Step(index, stamp_ns, kind, entity)
+                yield RecordedStep(index, stamp_ns, kind, entity)
             perform = self._performed(index, kind, entity)
             if perform is not None:
-                yield Step(index, stamp_ns, kind, entity, perform)
+                yield RecordedStep(index, stamp_ns, kind, entity, perform)
 
     def _performed(self, index: int, kind: int, entity: int) -> Callable[[], None] | None:
         entities = self._columns.trace.entities
@@ -345,7 +347,7 @@ class RecordedScript:
         return partial(self._perform, index, created, sent, busy_ns)
 
 
-def _is(step: Step, kind: int, entity: int) -> bool:
+def _is(step: RecordedStep, kind: int, entity: int) -> bool:
     return step.perform is None and step.kind == kind and step.entity == entity
 
 
@@ -353,7 +355,7 @@ def _key(entity: Entity, entities: dict[int, Entity]) -> Key:
     return entities[entity.node].name, entity.kind, entity.name
 
 
-def check_payloads(columns: Columns, unit: Unit) -> None:
+def check_payloads(columns: RecordingColumns, unit: ReplayedEntry) -> None:
     """See that the trace has what the unit's nodes have got.
 
     :raises ReplayError: saying what it does not have, and how to record it.

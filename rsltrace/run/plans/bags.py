@@ -116,7 +116,7 @@ def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
     )
 
 
-def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
+def bag_notes(job: Job, bags: list[BagInput]) -> Iterator[str]:
     """Yield what somebody should know about the bags: what is missing, what does not play."""
     for index, entry in enumerate(bags):
         yield from entry.bag.notes
@@ -142,10 +142,10 @@ def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
                     f"{entry.spec.path}: recorded {what} are not played: {', '.join(names)} (only "
                     "topics play; what a server answers, its node must answer again)"
                 )
-    yield from _apart(job, bags)
+    yield from _time_gaps(job, bags)
 
 
-def _apart(job: Job, bags: list[BagInput]) -> Iterator[str]:
+def _time_gaps(job: Job, bags: list[BagInput]) -> Iterator[str]:
     """Yield the bags that were recorded at another time than what plays before them."""
     start_ns = start_ns_of(job, bags)
     run_ends_ns = end_ns_of(job, start_ns)

@@ -20,7 +20,7 @@ from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
 from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
-from rsltrace.run.plans.executables import Mains
+from rsltrace.run.plans.executables import MainFinder
 from rsltrace.run.plans.processes import Processes
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.simulation.middleware.graph import Graph
@@ -103,7 +103,7 @@ _KEY = re.compile(r"\x1b(?:\[[0-9;]*[ -/]*[@-~]|O[A-Za-z]|[^\x1b])?|.", re.DOTAL
 _LINE_MAX = 4000
 
 
-def typed_at(job: Job, index: int) -> list[Typed] | None:
+def terminal_input(job: Job, index: int) -> list[Typed] | None:
     """Return what is typed at the terminal of an entry, None if it has none.
 
     :raises JobError: if a file cannot be read or has lines that no terminal takes.
@@ -160,7 +160,7 @@ def node_entries(
     a line if something takes long.
     """
     entries = []
-    mains = Mains(job)
+    mains = MainFinder(job)
     processes = Processes(job, told)
     for_all = arguments_for_all(job)
     keys = entry_keys(job.nodes)
@@ -197,7 +197,7 @@ def node_entries(
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
                 start_after=start_rule(job, index, keys),
-                stdin=typed_at(job, index),
+                stdin=terminal_input(job, index),
                 program=program,
                 is_component=spec.component is not None,
                 respawn=None
@@ -316,7 +316,7 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
             takes = f"it takes {', '.join(names)}" if names else "it takes none"
             hint = did_you_mean(name, names, takes)
             wrong = f"{spec.target} takes no argument {name!r}: {hint}"
-            raise _shown(job, ("nodes", index, "arguments", name), wrong)
+            raise _error_with_line(job, ("nodes", index, "arguments", name), wrong)
     try:
         signature.bind(**spec.arguments)
     except TypeError as error:
@@ -324,7 +324,7 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
         raise JobError(f"{spec.target}: {error}; give it in 'arguments:'", where=where) from error
 
 
-def _shown(job: Job, loc: Loc, message: str) -> JobError:
+def _error_with_line(job: Job, loc: Loc, message: str) -> JobError:
     try:
         with showing_line(job, loc):
             raise JobError(message, where=locate(job, loc))
@@ -344,7 +344,7 @@ def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
     return keys
 
 
-def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
+def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
     """Add to the error of a constructor the line of the job at which the parameter stands that it
     refused, or the node, if there are several that are made in the same way."""
     if error is None:

@@ -118,7 +118,7 @@ def module_program(name: str, folder: Path, *, where: str) -> MainProgram:
     return MainProgram(Path(spec.origin), code, str(folder), spec)
 
 
-class Mains:
+class MainFinder:
     """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
 
     def __init__(self, job: Job) -> None:
@@ -163,7 +163,7 @@ class Mains:
             folders = [str(self._job.resolve(folder)) for folder in self._job.search_path]
             for name in user_modules(folders).keys() - before:
                 del sys.modules[name]
-            return ImportedMain(target, again=again)
+            return DeferredMain(target, again=again)
         return function
 
     def _without_process(self) -> AbstractContextManager[None]:
@@ -175,10 +175,10 @@ class Mains:
         """Let a package be imported once more if somebody else has it already."""
         again = package in self._packages
         self._packages.add(package)
-        return _own_copy(package) if again else nullcontext()
+        return _imported_again(package) if again else nullcontext()
 
 
-class ImportedMain:
+class DeferredMain:
     """A main whose module is imported when it starts, in its own program."""
 
     def __init__(self, target: str, *, again: bool) -> None:
@@ -191,7 +191,7 @@ class ImportedMain:
         module, _, name = self._target.partition(":")
         package = module.partition(".")[0]
         again, self._again = self._again, True  # a program that is restarted imports it once more
-        with _own_copy(package) if again else nullcontext():
+        with _imported_again(package) if again else nullcontext():
             function = attrgetter(name)(importlib.import_module(module))
         return function()
 
@@ -208,7 +208,7 @@ def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
 
 
 @contextmanager
-def _own_copy(package: str) -> Iterator[None]:
+def _imported_again(package: str) -> Iterator[None]:
     """Import a package once more than it is: who has it already keeps what it has."""
 
     def modules() -> dict[str, ModuleType]:
@@ -274,9 +274,9 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     known = _packages() | unbuilt_names()
     if not scripts and not files and package not in known:
         raise JobError(
-            f"there is no package {package!r}{_near(package, known, 'install')} it for this Python "
-            "(pip install), add its sources to search_path, source the workspace it is built in, "
-            "or name its function with 'main:'",
+            f"there is no package {package!r}{_did_you_mean_or(package, known, 'install')} it for "
+            "this Python (pip install), add its sources to search_path, or source the workspace "
+            "it is built in",
             where=where,
         )
     available = sorted({*scripts, *files, *sources})
@@ -293,7 +293,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         has += f"; once it is built (colcon build): {listed}"
     if fault := unbuilt_fault(package):
         has += f"; {fault}"
-    it = _near(name, {*available, *compiled}, "it")
+    it = _did_you_mean_or(name, {*available, *compiled}, "it")
     raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 
 
@@ -326,7 +326,7 @@ def process_command(target: str, *, where: str) -> list[str]:
     return [sys.executable, str(found)] if is_python(found) else [str(found)]
 
 
-def _same(name: str) -> str:
+def _normalized(name: str) -> str:
     """Return a distribution's name as package indexes compare it."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
@@ -337,7 +337,7 @@ def _console_scripts(package: str) -> dict[str, str]:
     from importlib import metadata
 
     for entry in metadata.entry_points(group="console_scripts"):
-        if entry.dist is not None and _same(entry.dist.name) == _same(package):
+        if entry.dist is not None and _normalized(entry.dist.name) == _normalized(package):
             found.setdefault(entry.name, f"{entry.module}:{entry.attr}")
     return found
 
@@ -373,7 +373,7 @@ def _packages() -> set[str]:
     return names
 
 
-def _near(name: str, names: Iterable[str], word: str) -> str:
+def _did_you_mean_or(name: str, names: Iterable[str], word: str) -> str:
     """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near, to go on from."""
     near = nearest(name, sorted(names))
     if near in (None, name):
@@ -399,15 +399,3 @@ def _python_script(path: Path, target: str, where: str) -> MainProgram:
         "the graph what it publishes from a bag",
         where=where,
     )
-
-
-__all__ = [
-    "MainProgram",
-    "Mains",
-    "compiled_file",
-    "find_executable",
-    "module_program",
-    "process_command",
-    "script_program",
-    "source_of",
-]

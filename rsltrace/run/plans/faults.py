@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rsltrace.run.plans.bag_faults import BagFaults
 
 
-def arm_topics(faults: Sequence[FaultSpec], world: World) -> None:
+def arm_topic_faults(faults: Sequence[FaultSpec], world: World) -> None:
     """Let single messages go wrong. Before the first node is made, or later where
     ``FaultsOfAll`` have been there from the beginning."""
     by_topic: dict[str, list[MessageFault]] = {}
@@ -26,7 +26,7 @@ def arm_topics(faults: Sequence[FaultSpec], world: World) -> None:
         world.domain.transport.faults.setdefault(topic, TopicFaults(())).add(found)
 
 
-def arm_nodes(job: Job, world: World, start_ns: int) -> NodeFaults | None:
+def arm_node_faults(job: Job, world: World, start_ns: int) -> NodeFaults | None:
     """Let nodes crash, hang or start again; None if the job has nothing of the kind. Before the
     first one is made."""
     if not any(spec.of_node for spec in job.faults):

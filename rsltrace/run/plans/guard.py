@@ -104,7 +104,7 @@ class RunGuard:
                 GuardContext(world.stacks, world.clocks),
                 policy=policy_of(job.guard),
                 seed=job.seed,
-                packages=packages_of(job.nodes),
+                packages=node_packages(job.nodes),
                 on_finding=on_finding,
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
@@ -208,7 +208,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
             if name in sys.modules:
                 begin()
         on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(user_modules(packages_of(job.nodes), on_loaded, rewrites=orders))
+        stack.enter_context(user_modules(node_packages(job.nodes), on_loaded, rewrites=orders))
     return made
 
 
@@ -220,6 +220,6 @@ def _orders_sets(job: Job) -> bool:
     return any(mode is not Mode.ALLOW for mode in modes)
 
 
-def packages_of(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+def node_packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
     """Return the packages that nodes are in: the user's, wherever they are."""
     return frozenset(spec.package for spec in nodes) - {"", "rsltrace", "rclpy"}

@@ -81,13 +81,13 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
         return None
     return NetworkPlan(
         links=tuple(
-            LinkRule(spec.topic, spec.sender, spec.receiver, model_of(job, spec))
+            LinkRule(spec.topic, spec.sender, spec.receiver, link_model(job, spec))
             for spec in delay.links
         ),
-        topics=tuple(NameRule(name, model_of(job, s)) for name, s in delay.topics.items()),
+        topics=tuple(NameRule(name, link_model(job, s)) for name, s in delay.topics.items()),
         table=_table(job, delay.file),
-        services=tuple(NameRule(name, model_of(job, s)) for name, s in delay.services.items()),
-        default=None if delay.default is None else model_of(job, delay.default),
+        services=tuple(NameRule(name, link_model(job, s)) for name, s in delay.services.items()),
+        default=None if delay.default is None else link_model(job, delay.default),
         outages=tuple(
             OutageRule(*spec.what, Outage(start_ns + spec.from_ns, start_ns + spec.to_ns))
             for spec in delay.outages
@@ -103,12 +103,12 @@ def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
     name = job.shown(file)
     rows = read_rslcpp(job.resolve(file), name)
     return tuple(
-        NameRule(topic, model_of(job, spec), f"{name}:{line}")
+        NameRule(topic, link_model(job, spec), f"{name}:{line}")
         for topic, (line, spec) in rows.items()
     )
 
 
-def model_of(job: Job, spec: DelaySpec) -> Model:
+def link_model(job: Job, spec: DelaySpec) -> Model:
     """Return the model that a job describes."""
     burst = spec.burst
     return Model(

@@ -206,7 +206,7 @@ def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
     return shown_ns, not clocks.advances(node)
 
 
-def process_door(job: Job, world: World) -> ProcessDoor:
+def make_process_adapter(job: Job, world: World) -> ProcessDoor:
     """Return the door through which a job's processes take part in its world."""
     interfaces = Interfaces(_message_type, _service_type)
     door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)

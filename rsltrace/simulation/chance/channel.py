@@ -1,6 +1,6 @@
 """One way from a sender to a receiver: how long a message takes, whether it arrives, in what order.
 
-``Model`` describes, ``Channel`` is one link's state in a run. Each purpose (delay, drop, burst,
+``Model`` describes, ``LinkChannel`` is one link's state in a run. Each purpose (delay, drop, burst,
 duplicate, the delay of the copy) has a stream of its own, so that switching one on does not change
 what others draw.
 """
@@ -59,10 +59,10 @@ class Outage:
     to_ns: int
 
 
-NO_MODEL = Model()
+PERFECT_LINK = Model()
 
 
-class Channel:
+class LinkChannel:
     """The messages of one link, in the order in which they are sent.
 
     ``transmit`` returns the delay in ns, or one of the ``LOST_…`` codes. After it ``duplicate_ns``
@@ -87,7 +87,7 @@ class Channel:
         self.held_until_ns = -1
         self._model = model
         self._reliable = reliable
-        self.outages = _joined(outages)
+        self.outages = _merge_outages(outages)
         self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
         self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
         self._drop = Stream(seed, f"{name}\0drop").uniform
@@ -177,7 +177,7 @@ class Channel:
         return None
 
 
-def _joined(outages: Sequence[Outage]) -> tuple[Outage, ...]:
+def _merge_outages(outages: Sequence[Outage]) -> tuple[Outage, ...]:
     """Return outages in order, those that overlap or touch as one."""
     found: list[Outage] = []
     for outage in sorted(outages, key=lambda outage: outage.from_ns):
@@ -239,7 +239,7 @@ class NetworkPlan:
 
     def topic_channel(
         self, topic: str, sender: tuple[str, int], receiver: tuple[str, int], *, reliable: bool
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         """Return the channel of a link, or None if nothing is ever the matter with it.
 
         Ends are (node, which of its endpoints of that topic, from 0).
@@ -267,7 +267,7 @@ class NetworkPlan:
 
     def service_channel(
         self, service: str, client: tuple[str, int], server: tuple[str, int], direction: str
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         """Return the channel of requests or responses (``direction``) of a client to a server."""
         model = self.service_model(service)
         if model is not None and model.duplicate > 0.0:
@@ -278,11 +278,11 @@ class NetworkPlan:
 
     def _channel(
         self, model: Model | None, outages: tuple[Outage, ...], name: str, *, reliable: bool
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         if model is None and not outages:
             return None
-        return Channel(
-            model or NO_MODEL,
+        return LinkChannel(
+            model or PERFECT_LINK,
             seed=self.seed,
             name=name,
             start_ns=self.start_ns,

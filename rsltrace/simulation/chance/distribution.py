@@ -99,7 +99,7 @@ def _ratio(pair: tuple[tuple[float, ...], tuple[float, ...]], r: float) -> float
     return above / below
 
 
-def quantile(p: float) -> float:
+def normal_quantile(p: float) -> float:
     """Return x with P(X <= x) = p for a standard normal X; 0 < p < 1."""
     q = p - 0.5
     if -0.425 <= q <= 0.425:
@@ -160,7 +160,7 @@ class Normal:
 
         def draw(now_ns: int) -> int:
             while True:
-                value = mean + sd * quantile(uniform())
+                value = mean + sd * normal_quantile(uniform())
                 if value >= 0.0:
                     return int(min(value, LONGEST_NS) + 0.5)
 
@@ -185,7 +185,9 @@ class Lognormal:
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:
         uniform, median, sigma = stream.uniform, self.median_ns, self.sigma
-        return lambda now_ns: int(min(median * exp(sigma * quantile(uniform())), LONGEST_NS) + 0.5)
+        return lambda now_ns: int(
+            min(median * exp(sigma * normal_quantile(uniform())), LONGEST_NS) + 0.5
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,7 +215,7 @@ class Gamma:
 
         def draw(now_ns: int) -> int:
             while True:
-                x = quantile(uniform())
+                x = normal_quantile(uniform())
                 v = 1.0 + c * x
                 if v <= 0.0:
                     continue

@@ -14,7 +14,7 @@ from typing import Any
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
-from rsltrace.simulation.loop.policy import Candidate, Choices, Fifo, Moment, Policy
+from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy, PolicyChoices
 from rsltrace.simulation.loop.timer_queue import TimerState
 
 
@@ -47,7 +47,7 @@ class Place:
     told: bool = False
 
 
-class Charge:
+class ExecutionCharge:
     """How long the callback under way will have taken; the middleware adds to it."""
 
     __slots__ = ("duration_ns",)
@@ -56,7 +56,7 @@ class Charge:
         self.duration_ns = 0
 
 
-class _Waiting:
+class _ReadyQueue:
     """Stands in for the plain loop's queues: what became ready, in order of arrival."""
 
     def __init__(self, place: Callable[[Dispatchable], Place], runs: Callable[[Place], bool]):
@@ -106,8 +106,8 @@ class OrderedLoop(EventLoop):
         super().__init__(**options)
         self.policy: Policy = Fifo()
         self.place: Callable[[Dispatchable], Place]
-        self.charge = Charge()
-        self.choices: Choices | None = None
+        self.charge = ExecutionCharge()
+        self.choices: PolicyChoices | None = None
         """What the policy has chosen so far, where somebody wants to know."""
         self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
         """Told of every choice, of one alone, too, if somebody has to know."""
@@ -121,8 +121,8 @@ class OrderedLoop(EventLoop):
         self._forced: Place | None = None
         self._held_until_ns = -1
         self._held: dict[object, None] = {}
-        self._ready = _Waiting(lambda item: self.place(item), self._runs)
-        self._tasks = _Waiting(lambda item: self.place(item), self._runs)
+        self._ready = _ReadyQueue(lambda item: self.place(item), self._runs)
+        self._tasks = _ReadyQueue(lambda item: self.place(item), self._runs)
         self.ready = self._ready  # type: ignore[assignment]
         self.tasks = self._tasks  # type: ignore[assignment]
 
@@ -289,7 +289,7 @@ class OrderedLoop(EventLoop):
         if workers is None:
             item.dispatch()
             return
-        charge = self.charge = Charge()
+        charge = self.charge = ExecutionCharge()
         workers.running += 1
         item.dispatch()  # comes back later in time if the callback has waited for something
         if charge.duration_ns == 0:

@@ -25,7 +25,7 @@ _LARGE = 255
 """Stands for a choice that needs more than one byte, which follows in four."""
 
 
-class Choices:
+class PolicyChoices:
     """The choices of a run so far, in order. Where only one could run there was none."""
 
     def __init__(self) -> None:
@@ -48,7 +48,7 @@ class Choices:
 
 
 def decoded(data: bytes) -> Iterator[int]:
-    """Yield the choices that ``Choices.encoded`` wrote."""
+    """Yield the choices that ``PolicyChoices.encoded`` wrote."""
     at = 0
     while at < len(data):
         index, at = data[at], at + 1
@@ -178,7 +178,7 @@ _SHOWN = 5
 class Departure:
     """At choice number ``choice`` (from 0) the candidate number ``run`` runs, not the first.
 
-    ``of`` is its name as ``name_of`` gives it, where that is to be checked.
+    ``of`` is its name as ``candidate_name`` gives it, where that is to be checked.
     """
 
     choice: int
@@ -186,7 +186,7 @@ class Departure:
     of: str | None = None
 
 
-def name_of(candidate: Candidate) -> str:
+def candidate_name(candidate: Candidate) -> str:
     """Name a candidate: node and entity, ``/planner /scan``; what has neither by its kind."""
     return " ".join(filter(None, (candidate.node, candidate.entity))) or candidate.kind
 
@@ -210,7 +210,7 @@ class Departures:
         if departure is None:
             return 0
         fits = departure.run < len(ready)
-        if not fits or departure.of not in (None, name_of(ready[departure.run])):
+        if not fits or departure.of not in (None, candidate_name(ready[departure.run])):
             raise _cannot_depart(departure, ready, moment)
         return departure.run
 
@@ -221,7 +221,7 @@ class Departures:
 
 def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Moment) -> RunError:
     what = f"candidate {departure.run}" + (f" ({departure.of})" if departure.of else "")
-    names = ", ".join(f"{i}: {name_of(one)}" for i, one in enumerate(ready[:_SHOWN]))
+    names = ", ".join(f"{i}: {candidate_name(one)}" for i, one in enumerate(ready[:_SHOWN]))
     more = ", …" if len(ready) > _SHOWN else ""
     return RunError(
         f"policy: departures: choice {departure.choice} cannot be {what}: at "
@@ -230,7 +230,7 @@ def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Mom
     )
 
 
-class After:
+class FifoUntil:
     """First come, first served up to ``time_ns``; what comes later is for another policy, which is
     not asked before."""
 

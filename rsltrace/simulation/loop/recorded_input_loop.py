@@ -20,11 +20,19 @@ from rsltrace.trace.model.event import EventKind
 
 NEVER = 1 << 64
 _QOS_EVENT = "qos_event"
-_HELD = ("subscription", "timer", "client", "service", "guard_condition", "task", _QOS_EVENT)
+_WAITING_KINDS = (
+    "subscription",
+    "timer",
+    "client",
+    "service",
+    "guard_condition",
+    "task",
+    _QOS_EVENT,
+)
 
 
 @dataclass(slots=True)
-class Step:
+class RecordedStep:
     """A recorded event. ``perform`` does what it did, and is None for one that happens by itself:
     then ``kind`` and ``entity`` (of the recording) say which it is."""
 
@@ -36,14 +44,14 @@ class Step:
     done: bool = False
 
 
-class Script(Protocol):
+class StepScript(Protocol):
     """The recorded events that matter, in their order."""
 
     end_ns: int
     """When the recorded run ended."""
 
     @property
-    def next(self) -> Step | None:
+    def next(self) -> RecordedStep | None:
         """The first step that is not done, None after the last."""
 
     def entity(self, entity: int) -> int:
@@ -53,7 +61,7 @@ class Script(Protocol):
         """Return the index of the next event of a recorded entity, NEVER if none is to come."""
 
 
-def end_of(script: Script, loop: EventLoop) -> Callable[[Progress], Stop | None]:
+def stop_at_recorded_end(script: StepScript, loop: EventLoop) -> Callable[[Progress], Stop | None]:
     """Return the stop condition of a run that ends when its recording did."""
 
     def condition(progress: Progress) -> Stop | None:
@@ -66,10 +74,10 @@ def end_of(script: Script, loop: EventLoop) -> Callable[[Progress], Stop | None]
     return condition
 
 
-class FedLoop(EventLoop):
+class RecordedInputLoop(EventLoop):
     """The plain loop, fed from ``script``, which is set before it runs."""
 
-    script: Script
+    script: StepScript
     by_steps = False
     """Whether time moves on from step to step (``min_time_step``); what is due between is late."""
 
@@ -78,7 +86,7 @@ class FedLoop(EventLoop):
         step = self.script.next
         if step is not None and self.by_steps:
             return step.stamp_ns
-        return _sooner(super().next_ns(), step)
+        return _earlier_ns(super().next_ns(), step)
 
     def run_step(self) -> None:
         """Run everything that is due at the present time."""
@@ -122,12 +130,12 @@ class FedLoop(EventLoop):
         step.done = True  # what should have happened does not: the code has changed
         return True
 
-    def _run_task(self, step: Step | None) -> bool:
+    def _run_task(self, step: RecordedStep | None) -> bool:
         """Run what the last event has left to do at once."""
         self.tasks.popleft().dispatch()
         return True
 
-    def _dispatch_one(self, step: Step | None) -> bool:
+    def _dispatch_one(self, step: RecordedStep | None) -> bool:
         """Dispatch what is ready or due; ``step`` is the event that the recording has next."""
         if self.ready:
             self.ready.popleft().dispatch()
@@ -140,7 +148,7 @@ class FedLoop(EventLoop):
         return True
 
 
-class FedOrderedLoop(FedLoop, OrderedLoop):
+class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
     """The loop of jobs that say who runs next, fed: policies, executors, execution times, ties.
 
     The recording says what ran when, so neither policy nor executors are asked. Where callbacks
@@ -158,7 +166,7 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
         free = (timer for timer in due if not self._is_held(self.place(timer.owner)))  # type: ignore[arg-type]
         return next(free, after)
 
-    def _run_task(self, step: Step | None) -> bool:
+    def _run_task(self, step: RecordedStep | None) -> bool:
         for index, place in enumerate(self._tasks.places):
             if not self._is_held(place) or (step is not None and self._is_that_of(place, step)):
                 del self._tasks.places[index]
@@ -167,7 +175,7 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
                 return True
         return False
 
-    def _dispatch_one(self, step: Step | None) -> bool:
+    def _dispatch_one(self, step: RecordedStep | None) -> bool:
         due, _ = self.timers.due(self.now_ns)
         waiting = self._ready.places
         places = [*waiting, *(self.place(timer.owner) for timer in due)]  # type: ignore[arg-type]
@@ -182,28 +190,28 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
         item.dispatch()
         return True
 
-    def _recorded_choice(self, places: list[Place], step: Step | None) -> Place | None:
+    def _recorded_choice(self, places: list[Place], step: RecordedStep | None) -> Place | None:
         if step is not None:
             for place in places:
-                if not _goes_elsewhere(place.candidate.item) and self._is_that_of(place, step):
+                if not _has_no_event(place.candidate.item) and self._is_that_of(place, step):
                     return place
         free = [place for place in places if not self._is_held(place)]
-        if not free or not _goes_elsewhere(free[0].candidate.item):
+        if not free or not _has_no_event(free[0].candidate.item):
             return free[0] if free else None
-        if _looks(free[0]):
+        if _is_poll(free[0]):
             return self._looked_for(free, step) if self.by_policy else free[0]
         # An executor of the user's own takes them in the order in which it gets them.
-        others = [p for p in free if _goes_elsewhere(p.candidate.item) and not _looks(p)]
+        others = [p for p in free if _has_no_event(p.candidate.item) and not _is_poll(p)]
         entity, following = self.script.entity, self.script.following
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
 
-    def _looked_for(self, free: list[Place], step: Step | None) -> Place:
+    def _looked_for(self, free: list[Place], step: RecordedStep | None) -> Place:
         """Return what the recording has next, if that is here: its policy let the look wait."""
         if step is None:
             return free[0]
         return next((place for place in free if self._is_that_of(place, step)), free[0])
 
-    def _is_that_of(self, place: Place, step: Step) -> bool:
+    def _is_that_of(self, place: Place, step: RecordedStep) -> bool:
         candidate = place.candidate
         recorded = self.script.entity(candidate.entity_id)
         if recorded < 0 and candidate.kind == _QOS_EVENT:  # which has its id when it runs first
@@ -213,7 +221,11 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
     def _is_held(self, place: Place) -> bool:
         """Whether it waits until the recording has it."""
         candidate = place.candidate
-        if not self.has_workers or candidate.kind not in _HELD or _is_handed_over(candidate.item):
+        if (
+            not self.has_workers
+            or candidate.kind not in _WAITING_KINDS
+            or _is_handed_over(candidate.item)
+        ):
             return False
         return candidate.kind == _QOS_EVENT or self.script.entity(candidate.entity_id) >= 0
 
@@ -223,17 +235,17 @@ def _is_handed_over(item: Any) -> bool:
     return getattr(getattr(item, "node", None), "mailbox", None) is not None
 
 
-def _looks(place: Place) -> bool:
+def _is_poll(place: Place) -> bool:
     """Whether it is a call that only looks whether something has come, and has no event then."""
     return bool(getattr(place.candidate.item, "quiet", False))
 
 
-def _goes_elsewhere(item: Any) -> bool:
+def _has_no_event(item: Any) -> bool:
     """Whether it is no event itself: it is handed over, or a blocked call goes on."""
     return _is_handed_over(item) or hasattr(item, "quiet")
 
 
-def _sooner(own_ns: int | None, step: Step | None) -> int | None:
+def _earlier_ns(own_ns: int | None, step: RecordedStep | None) -> int | None:
     if step is None:
         return own_ns
     return step.stamp_ns if own_ns is None else min(own_ns, step.stamp_ns)

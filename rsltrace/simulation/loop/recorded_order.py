@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.loop.policy import After, Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, FifoUntil, Moment
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
@@ -35,7 +35,7 @@ class RecordedEvent(NamedTuple):
         return event_text(self.kind, self.name, self.stamp_ns)
 
 
-def described(entity: Entity, node: str) -> str:
+def entity_text(entity: Entity, node: str) -> str:
     """Name an entity, of the node of that name, as ``RecordedEvent.name`` does."""
     if entity.kind is EntityKind.SYSTEM:
         return THE_RUN
@@ -53,7 +53,7 @@ def event_text(kind: int, name: str, stamp_ns: int) -> str:
     return f"{name}{goes_on} at {format_seconds(stamp_ns)} s"
 
 
-class Recorded:
+class RecordedOrder:
     """The order of a recording.
 
     ``event`` returns the recording's event of an index, or None after its end; from there on it is
@@ -84,7 +84,7 @@ class Recorded:
         self.polls_from_ns: int | None = None
         self.forget: Callable[[str], None] | None = None
 
-    def poll_as(self, policy: RclpyWaitSet | After) -> None:
+    def poll_as(self, policy: RclpyWaitSet | FifoUntil) -> None:
         """Have executors poll as in the recording: of that policy's choices, all follow from what
         has happened."""
         self._chosen = policy.choose
@@ -157,14 +157,14 @@ CALLBACKS = frozenset(
 """What has a place in the order; everything else runs as soon as it can."""
 
 
-class ObservedCallback(NamedTuple):
+class NativeCallback(NamedTuple):
     """A callback of the native run: which of its events, and what ran."""
 
     number: int
     event: RecordedEvent
 
 
-class ObservedOrder:
+class NativeOrder:
     """The order of a native run, as far as it can be followed.
 
     Who is ready before its turn is held back until those are ready that came before, but no longer
@@ -173,7 +173,7 @@ class ObservedOrder:
     """
 
     def __init__(
-        self, file: str, observed: Sequence[ObservedCallback], name_of: Callable[[int], str | None]
+        self, file: str, observed: Sequence[NativeCallback], name_of: Callable[[int], str | None]
     ) -> None:
         self.file = file
         self.name_of = name_of
@@ -186,12 +186,14 @@ class ObservedOrder:
         self._ahead_ns: int | None = None
         self._ran = bytearray(len(observed))
         self._in_turn = self._late = self._others = 0
-        self._first: tuple[ObservedCallback, str] | None = None
+        self._first: tuple[NativeCallback, str] | None = None
 
     def hold_until(self, ready: Sequence[Candidate], moment: Moment) -> int | None:
         """Return until when all that is ready is to wait for who comes before; None: one runs."""
         places = [self._place(one) for one in ready]
-        first = min(place for place in places if place is not None) if all_known(places) else None
+        first = (
+            min(place for place in places if place is not None) if all_have_places(places) else None
+        )
         if first is None or first <= self._next or self._ahead_ns is None:
             return None
         until_ns = self._observed[first].event.stamp_ns - self._ahead_ns
@@ -227,7 +229,7 @@ class ObservedOrder:
             self._first = missed, self._why(missed, name, now_ns)
         self._next = place + 1
 
-    def _why(self, missed: ObservedCallback, name: str, now_ns: int) -> str:
+    def _why(self, missed: NativeCallback, name: str, now_ns: int) -> str:
         """Say why what was missed did not run before an event of that name."""
         there = sum(place < self._next for place in self._places[missed.event.name])
         return (
@@ -267,6 +269,6 @@ class ObservedOrder:
             )
 
 
-def all_known(places: Sequence[int | None]) -> bool:
+def all_have_places(places: Sequence[int | None]) -> bool:
     """Whether all have a place."""
     return None not in places

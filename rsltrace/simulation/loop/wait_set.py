@@ -60,7 +60,7 @@ class RclpyWaitSet(WaitSet):
 
     def __init__(self) -> None:
         super().__init__()
-        self._rounds: dict[str, _Round] = {}
+        self._rounds: dict[str, _PollingRound] = {}
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         for index, one in enumerate(ready):
@@ -70,7 +70,7 @@ class RclpyWaitSet(WaitSet):
         mine = [index for index, one in enumerate(ready) if one.executor == executor]
         tasks = {ready[index].thread: index for index in mine if ready[index].kind == "task"}
         places = [(self.place(ready[i]), i) for i in mine if ready[i].kind != "task"]
-        present = self._rounds.setdefault(executor, _Round())
+        present = self._rounds.setdefault(executor, _PollingRound())
         left = present.left(places, ready)
         if left is not None:
             return left
@@ -97,7 +97,7 @@ class RclpyWaitSet(WaitSet):
         return min(rank, 0), node, rank, candidate.entity_id
 
 
-class _Round:
+class _PollingRound:
     """How far an executor is, with the tasks or with what it has found."""
 
     def __init__(self) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.event import Door
-from rsltrace.simulation.middleware.events.failure import FailuresEndTheRun
+from rsltrace.simulation.middleware.events.failure import RunEndingExceptionHandler
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
@@ -40,7 +40,7 @@ class Domain:
         self.outcome = self.dispatcher.outcome
         self.transport = Transport(self.dispatcher)
         self.graph = Graph()
-        self._door = FailuresEndTheRun(self.dispatcher)
+        self._door = RunEndingExceptionHandler(self.dispatcher)
         self.dispatcher.door = self._door
 
     def watch(self, topic: str, watcher: Watcher) -> None:

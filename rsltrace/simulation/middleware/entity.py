@@ -42,7 +42,7 @@ def on_no_executor(node: Any, name: str, kind: str = "thread", *, told: bool = F
     return Runnable(kind, name, 0, node, period_ns=period_ns, executor=False, told=told)
 
 
-class Membership(Protocol):
+class GraphMembership(Protocol):
     """The graph, as a member sees it."""
 
     def remove(self, member: Any) -> None:
@@ -63,7 +63,7 @@ class DomainEntity:
     announced = True
     """Whether the trace is told of the entity when it is created."""
     begins_active = True
-    graph: Membership | None = None
+    graph: GraphMembership | None = None
     """The graph it has joined."""
 
     def __init__(self, dispatcher: Dispatcher, node: Any) -> None:

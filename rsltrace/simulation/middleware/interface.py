@@ -64,7 +64,7 @@ class TopicFaults:
         )
 
 
-class FaultsOfAll(dict[str, TopicFaults]):
+class AllTopicFaults(dict[str, TopicFaults]):
     """Faults of every topic that somebody asks for: there may be some later."""
 
     def get(self, topic: str, default: object = None) -> TopicFaults:

@@ -14,7 +14,7 @@ from rsltrace.simulation.chance.channel import (
     LOST_BURST,
     LOST_DROP,
     LOST_OUTAGE,
-    Channel,
+    LinkChannel,
     NetworkPlan,
 )
 from rsltrace.simulation.chance.distribution import Sampler
@@ -39,12 +39,12 @@ from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
-_QUICK_LINK_DELAY = encode_draw(Draw.DELAY)
+_FAST_LINK_DELAY = encode_draw(Draw.DELAY)
 _DRAW = int(OutputKind.DRAW)
 _pack_output = OUTPUT_CONTENT.pack
 
 
-class OrderedLink(Protocol):
+class FastLink(Protocol):
     """A link that keeps the order; ``last_ns`` is when the last message arrives."""
 
     subscription: Subscription
@@ -54,7 +54,7 @@ class OrderedLink(Protocol):
         """Whether a message is due now that has not arrived yet."""
 
 
-def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Send:
+def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
     """Return how ``link`` sends, if it does nothing but delay and keeps the order."""
     loop = dispatcher.loop
     under_way = dispatcher.event
@@ -88,7 +88,7 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
         link.last_ns = arrival_ns
         recorder = dispatcher.recorder
         if recorder is not None:  # what Recorder.draw does
-            packed = _pack_output(_QUICK_LINK_DELAY | delay_ns, entity, _DRAW)
+            packed = _pack_output(_FAST_LINK_DELAY | delay_ns, entity, _DRAW)
             recorder.output_hash = hash64(packed, recorder.output_hash)
             add_output = recorder.add_output
             add_output(packed)
@@ -105,7 +105,7 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
     return send
 
 
-def direct_send(dispatcher: Dispatcher, link: OrderedLink) -> Send:
+def direct_send(dispatcher: Dispatcher, link: FastLink) -> Send:
     """Return how ``link`` sends, if there is nothing the matter with it.
 
     Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
@@ -148,10 +148,12 @@ _LOST = {
 }
 
 
-class Exchanges:
+class ServiceLink:
     """The requests of one client to one server, or the responses."""
 
-    def __init__(self, dispatcher: Dispatcher, receiver: Receiver, channel: Channel | None) -> None:
+    def __init__(
+        self, dispatcher: Dispatcher, receiver: Receiver, channel: LinkChannel | None
+    ) -> None:
         self._dispatcher = dispatcher
         self._receiver = receiver
         self._entity = receiver.entity_id
@@ -194,7 +196,7 @@ class Exchanges:
             self._receiver.deliver(exchange)
 
 
-class Link:
+class PublisherLink:
     """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
 
     What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
@@ -207,7 +209,7 @@ class Link:
         dispatcher: Dispatcher,
         offered: Qos,
         subscription: Subscription,
-        channel: Channel | None,
+        channel: LinkChannel | None,
         faults: TopicFaults | None = None,
     ) -> None:
         self.subscription = subscription
@@ -239,7 +241,7 @@ class Link:
         if channel is None:
             self.send = direct_send(dispatcher, self)
         elif channel.plain and channel.keep_order:
-            self.send = quick_send(dispatcher, self, channel.plain)
+            self.send = fast_send(dispatcher, self, channel.plain)
 
     def _send(
         self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
@@ -396,8 +398,8 @@ class Network:
         self._plan = plan
         self._counts: dict[tuple[str, str, str], int] = {}
         self._ends: dict[int, tuple[str, int]] = {}
-        self._requests: dict[tuple[int, int], Exchanges] = {}
-        self._responses: dict[tuple[int, int], Exchanges] = {}
+        self._requests: dict[tuple[int, int], ServiceLink] = {}
+        self._responses: dict[tuple[int, int], ServiceLink] = {}
 
     def link(
         self,
@@ -406,7 +408,7 @@ class Network:
         qos: Qos,
         subscription: Subscription,
         faults: TopicFaults | None,
-    ) -> Link:
+    ) -> PublisherLink:
         """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
         channel = self._plan.topic_channel(
             topic,
@@ -414,7 +416,7 @@ class Network:
             self._end("subscription", topic, subscription),
             reliable=subscription.qos.reliability is Reliability.RELIABLE,
         )
-        return Link(self._dispatcher, qos, subscription, channel, faults)
+        return PublisherLink(self._dispatcher, qos, subscription, channel, faults)
 
     def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
         """Bring a request to the server."""
@@ -422,7 +424,7 @@ class Network:
         way = self._requests.get(key)
         if way is None:
             channel = self._service_channel(service, client, server, "request")
-            way = self._requests[key] = Exchanges(self._dispatcher, server, channel)
+            way = self._requests[key] = ServiceLink(self._dispatcher, server, channel)
         way.send(exchange)
 
     def response(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
@@ -431,12 +433,12 @@ class Network:
         way = self._responses.get(key)
         if way is None:
             channel = self._service_channel(service, client, server, "response")
-            way = self._responses[key] = Exchanges(self._dispatcher, client, channel)
+            way = self._responses[key] = ServiceLink(self._dispatcher, client, channel)
         way.send(exchange)
 
     def _service_channel(
         self, service: str, client: Receiver, server: Receiver, what: str
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         return self._plan.service_channel(
             service,
             self._end("client", service, client),

@@ -45,7 +45,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeView:
+class GraphNode:
     """A node, its class, and its timers as (callback, period in ns)."""
 
     name: str
@@ -58,7 +58,7 @@ class Overview:
     """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
     program that waits for work has)."""
 
-    nodes: tuple[NodeView, ...]
+    nodes: tuple[GraphNode, ...]
     links: tuple[Link, ...]
     waiting: tuple[str, ...] = ()
     problems: tuple[str, ...] = field(default=())
@@ -68,7 +68,7 @@ class Overview:
         return [link for link in self.links if link.kind == kind]
 
 
-def overview(
+def graph_overview(
     graph: Graph,
     waiting: Iterable[str],
     *,
@@ -97,7 +97,7 @@ def overview(
     )
 
 
-def _namesakes(nodes: Iterable[NodeView]) -> Iterator[str]:
+def _namesakes(nodes: Iterable[GraphNode]) -> Iterator[str]:
     """Yield the names that several nodes have: a mistake, most often."""
     for name, count in Counter(node.name for node in nodes).items():
         if count > 1:
@@ -107,8 +107,8 @@ def _namesakes(nodes: Iterable[NodeView]) -> Iterator[str]:
             )
 
 
-def _node(node: Participant) -> NodeView:
-    return NodeView(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
+def _node(node: Participant) -> GraphNode:
+    return GraphNode(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
 
 
 def _topics(graph: Graph) -> Iterator[Link]:

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import Door, State
+from rsltrace.simulation.middleware.events.event import Door, ParticipantState
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
 from rsltrace.simulation.middleware.timer import Timer
 from rsltrace.trace.model.entity import EntityKind
@@ -16,7 +16,7 @@ from rsltrace.trace.model.event import NO_EVENT
 # QoS events: news of an endpoint's status, for whoever wants to hear of it.
 
 
-class Endpoint(Protocol):
+class QosEndpoint(Protocol):
     """A publisher or subscription, as its QoS events see it."""
 
     topic: str
@@ -31,7 +31,7 @@ class QosEvent(DomainEntity):
 
     kind = EntityKind.QOS_EVENT
 
-    def listen(self, endpoint: Endpoint, status: str) -> None:
+    def listen(self, endpoint: QosEndpoint, status: str) -> None:
         """Hear of a status from now on, by its name."""
         self.announced = False
         self.endpoint = endpoint
@@ -67,7 +67,7 @@ class QosEvent(DomainEntity):
         return f"{self.endpoint.topic} {self.status}"
 
 
-class ActionEnd(Protocol):
+class ActionEndpoint(Protocol):
     """A client or a server of an action, which is made of other endpoints."""
 
     name: str
@@ -78,7 +78,7 @@ class ActionEnd(Protocol):
         """The name of the action's type."""
 
 
-_THINGS_PER_NODE = 1 << 20
+_ENTITIES_PER_NODE_MAX = 1 << 20
 
 
 class Participant(DomainEntity):
@@ -101,8 +101,8 @@ class Participant(DomainEntity):
         self.namespace = namespace
         self.fully_qualified_name = full_name(namespace, name)
         self.door = door
-        self.state: State | None = None
-        self.actions: list[ActionEnd] = []
+        self.state: ParticipantState | None = None
+        self.actions: list[ActionEndpoint] = []
         self.timers: list[Timer] = []
 
     @property
@@ -113,7 +113,7 @@ class Participant(DomainEntity):
 
     def ordinal(self, count: int) -> int:
         """Return a number for one of its things that no other node of its name gives."""
-        return count + (self.number - 1) * _THINGS_PER_NODE
+        return count + (self.number - 1) * _ENTITIES_PER_NODE_MAX
 
     def timer_periods(self) -> Iterable[tuple[str, int]]:
         """Yield (callback, period in ns) of its timers."""

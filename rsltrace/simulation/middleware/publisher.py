@@ -10,10 +10,10 @@ from typing import Any
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, TopicFaults
-from rsltrace.simulation.middleware.links import Link, Network
+from rsltrace.simulation.middleware.links import Network, PublisherLink
 from rsltrace.simulation.middleware.qos.policies import Durability, Qos, Reliability
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import Offers, finite
+from rsltrace.simulation.middleware.qos.timing import OfferedQosTimers, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
@@ -91,9 +91,9 @@ class Publisher(DomainEntity):
         self.type = type
         self.qos = qos.resolved(publisher=True, peers=[])
         self.subscriptions: list[Subscription] = []
-        self.links: list[Link] | None = None if transport.network is None else []
+        self.links: list[PublisherLink] | None = None if transport.network is None else []
         self.events = EndpointEvents()
-        self._offers = Offers.of(self.dispatcher.loop, self.qos, self.events)
+        self._offers = OfferedQosTimers.of(self.dispatcher.loop, self.qos, self.events)
         self._faults = transport.faults.get(topic)
         if finite(self.qos.lifespan_ns) or self._faults is not None:
             self.links = []
@@ -184,11 +184,11 @@ class Publisher(DomainEntity):
             link = self._link_to(subscription)
             insort(self.links, link, key=lambda link: link.subscription.entity_id)
 
-    def _link_to(self, subscription: Subscription) -> Link:
+    def _link_to(self, subscription: Subscription) -> PublisherLink:
         """Make the link to a subscription, with the model that the job has for it."""
         network = self._transport.network
         if network is None:
-            return Link(self.dispatcher, self.qos, subscription, None, self._faults)
+            return PublisherLink(self.dispatcher, self.qos, subscription, None, self._faults)
         return network.link(self, self.topic, self.qos, subscription, self._faults)
 
     def disconnect(self, subscription: Subscription) -> None:

@@ -14,7 +14,7 @@ from rsltrace.simulation.loop.ordered import OrderedLoop, Place, Workers
 from rsltrace.simulation.loop.policy import Candidate, Policy
 from rsltrace.simulation.middleware.entity import Receiver, Runnable
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import OutsideEvent, Owner
+from rsltrace.simulation.middleware.events.event import EventOwner, OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import Draw, EventKind, encode_draw
@@ -29,11 +29,11 @@ _UNKNOWN = -1
 
 
 def follows_chains(policy: object) -> bool:
-    """Whether a policy wants the periods of chains (``Rates``)."""
+    """Whether a policy wants the periods of chains (``ChainPeriods``)."""
     return bool(getattr(policy, "follows_chains", False))
 
 
-class Rates(EventObserver):
+class ChainPeriods(EventObserver):
     """Follows which period each event goes back to."""
 
     order = ObserverOrder.RATES
@@ -135,9 +135,9 @@ class Scheduling:
         self._workers: dict[object, Workers] = {}
         loop.policy = plan.policy
         loop.place = self.place
-        self._rates: Rates | None = None
+        self._rates: ChainPeriods | None = None
         if follows_chains(plan.policy):
-            self._rates = Rates(dispatcher)
+            self._rates = ChainPeriods(dispatcher)
         if plan.execution:
             dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
 
@@ -209,7 +209,7 @@ class ExecutionTimes(EventObserver):
         call.on_end.append(ended)
         return True
 
-    def _duration_of(self, handle: Any, entity: int, node: Owner | None) -> Sampler | None:
+    def _duration_of(self, handle: Any, entity: int, node: EventOwner | None) -> Sampler | None:
         if entity in self._durations:
             return self._durations[entity]
         sampler = None

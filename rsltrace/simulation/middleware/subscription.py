@@ -11,7 +11,7 @@ from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.qos.policies import Qos
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import Deadline, finite
+from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, finite
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
@@ -52,9 +52,9 @@ class Subscription(Receiver):
         self.timed = any(map(finite, (qos.deadline_ns, qos.lifespan_ns, qos.lease_ns)))
         self.publishers: list[DomainEntity] = []
         self.events = EndpointEvents()
-        self.deadline: Deadline | None = None
+        self.deadline: DeadlineTimer | None = None
         if finite(qos.deadline_ns):
-            self.deadline = Deadline(dispatcher.loop, qos.deadline_ns, self.events)
+            self.deadline = DeadlineTimer(dispatcher.loop, qos.deadline_ns, self.events)
 
     @property
     def type_name(self) -> str:

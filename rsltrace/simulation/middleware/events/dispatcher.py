@@ -13,12 +13,12 @@ from typing import Any, Protocol
 from rsltrace.errors import OutputError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.events.event import (
-    Census,
     Door,
     Event,
+    EventOwner,
+    NameRegistry,
     Outcome,
     OutsideEvent,
-    Owner,
 )
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, overrides
 from rsltrace.trace.chain import hash64
@@ -42,7 +42,7 @@ class Recordable(Protocol):
         """Return it as the trace describes it."""
 
 
-class EntityBook:
+class EntityRegistry:
     """Gives out ids, and keeps what has been created until it can be written down.
 
     ``pending`` was created in the event under way, ``unowned`` still has no owner (a timer that no
@@ -53,7 +53,7 @@ class EntityBook:
     def __init__(self) -> None:
         self.pending: list[Recordable] = []
         self.unowned: list[Recordable] = []
-        self.census: Census | None = None
+        self.census: NameRegistry | None = None
         self.observers: tuple[EventObserver, ...] = ()
         self._count = 0
 
@@ -97,7 +97,7 @@ class Dispatcher:
     def __init__(self, loop: EventLoop) -> None:
         self.loop = loop
         self.event = Event()
-        self.entities = EntityBook()
+        self.entities = EntityRegistry()
         self.outcome = Outcome()
         self.recorder: Recorder | None = None
         self.unrecorded = 0
@@ -151,7 +151,7 @@ class Dispatcher:
         self,
         handle: Dispatchable,
         entity: int,
-        node: Owner | None,
+        node: EventOwner | None,
         kind: int,
         callback: Callable[..., object],
         args: tuple[Any, ...],

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable
-from rsltrace.simulation.loop.recorded_order import THE_RUN, described
+from rsltrace.simulation.loop.recorded_order import THE_RUN, entity_text
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
@@ -35,7 +35,7 @@ class Asker(NamedTuple):
     namespace: str
 
 
-class Census(EventObserver):
+class NameRegistry(EventObserver):
     """The names there have been, each once, in the order of their coming."""
 
     order = ObserverOrder.CENSUS
@@ -52,7 +52,7 @@ class Census(EventObserver):
         self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
         self.described: dict[int, str] | None = None
-        """Every entity as in ``described``, by its id, if somebody wants to know: a run may make
+        """Every entity as in ``entity_text``, by its id, if somebody wants to know: a run may make
         a thread in each of a million callbacks."""
 
     def entity_created(self, entity: Entity) -> None:
@@ -82,7 +82,7 @@ class Census(EventObserver):
 
     def _describe(self, entity: Entity, node: str) -> None:
         if self.described is not None:
-            self.described[entity.id] = described(entity, node)
+            self.described[entity.id] = entity_text(entity, node)
 
     @property
     def topics(self) -> dict[str, None]:
@@ -119,19 +119,19 @@ class Door(Protocol):
         """Decide what becomes of the run now that the event under way has raised ``error``."""
 
 
-class State(Protocol):
+class ParticipantState(Protocol):
     """The state of a participant, where it is hashed after each of its events."""
 
     def after_event(self) -> int:
         """Return its hash now, 0 if there is none."""
 
 
-class Owner(Protocol):
+class EventOwner(Protocol):
     """A participant as those see it who record what its code does."""
 
     entity_id: int
     fully_qualified_name: str
-    state: State | None
+    state: ParticipantState | None
     door: Door
 
 
@@ -140,7 +140,7 @@ class Event:
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
     ``took_ns``. A ``quiet`` event is recorded only if something comes of it. ``on_end`` is called
-    once it is over. ``node`` is a participant (an ``Owner``), whose door may know more of it.
+    once it is over. ``node`` is a participant (an ``EventOwner``), whose door may know more of it.
     """
 
     __slots__ = (

@@ -97,7 +97,7 @@ def end_run(dispatcher: Dispatcher, raised: Raised, error: RunError) -> None:
     dispatcher.loop.stop(Stop(f"{raised.label} raised {raised.kind}", error.exit_code))
 
 
-class FailuresEndTheRun:
+class RunEndingExceptionHandler:
     """The door of participants that have no other: what they raise ends the run."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:

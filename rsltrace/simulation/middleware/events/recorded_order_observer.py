@@ -10,7 +10,12 @@ from collections.abc import Iterator
 
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.ordered import OrderedLoop
-from rsltrace.simulation.loop.recorded_order import ObservedOrder, Recorded, RecordedEvent, event_text
+from rsltrace.simulation.loop.recorded_order import (
+    NativeOrder,
+    RecordedEvent,
+    RecordedOrder,
+    event_text,
+)
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
@@ -19,12 +24,12 @@ from rsltrace.trace.model.texts import format_seconds
 # A run that follows the order of a native one as far as it can.
 
 
-class ObservedRun(EventObserver):
+class NativeOrderObserver(EventObserver):
     """Tells an order of what has run, and lets the loop wait for whose turn it is."""
 
     order = ObserverOrder.RECORDED_ORDER
 
-    def __init__(self, dispatcher: Dispatcher, order: ObservedOrder) -> None:
+    def __init__(self, dispatcher: Dispatcher, order: NativeOrder) -> None:
         self.policy = order
         self._dispatcher = dispatcher
         dispatcher.add_observer(self)
@@ -43,7 +48,7 @@ class ObservedRun(EventObserver):
         yield from self.policy.notes()
 
 
-class RecordedRun(EventObserver):
+class RecordedOrderObserver(EventObserver):
     """Compares the events of a run with those of a recording; the first that differs ends it.
 
     ``is_whole`` says that the recording was not cut off.
@@ -51,7 +56,7 @@ class RecordedRun(EventObserver):
 
     order = ObserverOrder.RECORDED_ORDER
 
-    def __init__(self, dispatcher: Dispatcher, order: Recorded, *, is_whole: bool) -> None:
+    def __init__(self, dispatcher: Dispatcher, order: RecordedOrder, *, is_whole: bool) -> None:
         self._dispatcher = dispatcher
         self.policy = order
         self._is_whole = is_whole

@@ -59,7 +59,7 @@ _KINDS: dict[str, type] = {
 }
 
 
-class Listener(Protocol):
+class StatusListener(Protocol):
     """Wants to hear of one status."""
 
     def trigger(self) -> None:
@@ -72,7 +72,7 @@ class EndpointEvents:
     __slots__ = ("_statuses", "listeners")
 
     def __init__(self) -> None:
-        self.listeners: dict[str, Listener] = {}
+        self.listeners: dict[str, StatusListener] = {}
         self._statuses: dict[str, Any] = {}
 
     def matched(self, change: int) -> None:

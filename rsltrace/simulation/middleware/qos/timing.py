@@ -19,7 +19,7 @@ from rsltrace.simulation.middleware.qos.status import (
 )
 
 
-class _Watch(ABC):
+class _QosTimer(ABC):
     """Calls ``_up`` when nothing was seen for ``period_ns``."""
 
     def __init__(self, loop: EventLoop, period_ns: int) -> None:
@@ -58,7 +58,7 @@ class _Watch(ABC):
         """Say that the time is up."""
 
 
-class Deadline(_Watch):
+class DeadlineTimer(_QosTimer):
     """Counts the periods without a message, from the first message on."""
 
     def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
@@ -74,7 +74,7 @@ class Deadline(_Watch):
         self._schedule()
 
 
-class OfferedLease(_Watch):
+class OfferedLease(_QosTimer):
     """Notices that a publisher with manual liveliness has not shown life in time."""
 
     def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
@@ -88,7 +88,7 @@ class OfferedLease(_Watch):
         self._events.add(LIVELINESS_LOST, total=1)
 
 
-class RequestedLease(_Watch):
+class RequestedLease(_QosTimer):
     """Whether a subscription holds one publisher for alive.
 
     With automatic liveliness the publisher is alive as long as it exists and can be heard; with
@@ -148,20 +148,20 @@ def finite(duration_ns: int) -> bool:
     return 0 < duration_ns < INFINITE_NS
 
 
-class Offers:
+class OfferedQosTimers:
     """What a publisher promises: its deadline, and its liveliness if that is manual."""
 
     def __init__(self, loop: EventLoop, qos: Qos, events: EndpointEvents) -> None:
-        self._watches: list[_Watch] = []
+        self._watches: list[_QosTimer] = []
         self._lease: OfferedLease | None = None
         if finite(qos.deadline_ns):
-            self._watches.append(Deadline(loop, qos.deadline_ns, events))
+            self._watches.append(DeadlineTimer(loop, qos.deadline_ns, events))
         if qos.liveliness is Liveliness.MANUAL_BY_TOPIC and finite(qos.lease_ns):
             self._lease = OfferedLease(loop, qos.lease_ns, events)
             self._watches.append(self._lease)
 
     @classmethod
-    def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> Offers | None:
+    def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> OfferedQosTimers | None:
         """Return the promises of a profile, or None if it makes none."""
         offers = cls(loop, qos, events)
         return offers if offers._watches else None
