@@ -23,7 +23,7 @@ _HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")
 
 
 class EditBranches:
-    """The branches of the run of a trace or job; ``path`` is the trace of the last one."""
+    """Branches of the run of a trace or job. ``path`` is the trace of the last one."""
 
     def __init__(
         self, source: str | Path, job_folder: str | Path | None, overrides: Sequence[str]
@@ -38,11 +38,10 @@ class EditBranches:
 
     @property
     def job_folder(self) -> str:
-        """The folder of the job, once there is a branch."""
+        """The folder of the job; known once a branch exists."""
         return str(self._job_folder)
 
     def close(self) -> None:
-        """Forget them all."""
         self._processes.kill()
         if self._temporary is not None:
             self._temporary.cleanup()
@@ -98,7 +97,7 @@ class EditBranches:
         return Path(self._temporary.name)
 
     def _first(self, folder: Path) -> Path:
-        """Return the trace to branch off: the session's, or one of its job, recorded for that."""
+        """Return the trace to branch from: the session's, or a recording of its job."""
         from rsltrace.diff.file_kind import is_trace
 
         if is_trace(os.fspath(self._source)):
@@ -124,6 +123,6 @@ class EditBranches:
 
 
 def _said(done: Done) -> str:
-    """Return what a command has said of its failure."""
+    """Return the error message of a failed command."""
     before, error, message = done.errors.partition(_ERROR)
     return (message if error else before).strip() or f"it ended with status {done.exit_code}"

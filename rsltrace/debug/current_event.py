@@ -33,7 +33,7 @@ _PACKAGES = f"{os.sep}site-packages{os.sep}"
 
 
 def code_of(callback: Any) -> CodeType | None:
-    """Return the code of a callback, None if it is not written in Python."""
+    """Return the Python code of a callback, or None."""
     callback = getattr(callback, "func", callback)
     callback = inspect.unwrap(getattr(callback, "__func__", callback))
     code = getattr(callback, "__code__", None)
@@ -41,9 +41,9 @@ def code_of(callback: Any) -> CodeType | None:
 
 
 def source(view: CurrentEventView, ledger: EventLedger) -> dict[str, Any] | None:
-    """Return file, first line, name and lines of what the present event calls of the user's.
+    """Return file, first line, name and lines of the user function of the current event.
 
-    ``at`` is the line at which that waits, or is about to go on; None where it does neither.
+    ``at`` is the line where it waits or is about to resume, else None.
     """
     frame = _frame(view) if _is_inside(view, ledger) else None
     code = code_of(_function(view)) if frame is None else frame.f_code
@@ -63,7 +63,7 @@ def source(view: CurrentEventView, ledger: EventLedger) -> dict[str, Any] | None
 
 
 def _function(view: CurrentEventView) -> Any:
-    """Return what is called: of an event that has made a node, its constructor."""
+    """Return the called function; for the construction of a node, its constructor."""
     if view.kind == EventKind.CONSTRUCT:
         made = view.nodes().get(view.node or view.entity_name)
         return None if made is None else type(made).__init__
@@ -71,14 +71,14 @@ def _function(view: CurrentEventView) -> Any:
 
 
 def _is_inside(view: CurrentEventView, ledger: EventLedger) -> bool:
-    """Say whether the run stands in the middle of the callback: it waits, or goes on."""
+    """Whether the run stands inside the callback: it waits, or is about to resume."""
     if view.is_next:
         return view.kind == EventKind.RESUME
     return bool(ledger.rest) and bool(EVENT_REST.unpack(ledger.rest)[_FLAGS] & _SUSPENDED)
 
 
 def _frame(view: CurrentEventView) -> FrameType | None:
-    """Return the innermost frame of the user's, on this stack or of a coroutine."""
+    """Return the innermost user frame, on this stack or in the coroutine."""
     if view.call.task is not None:
         found = None
         coroutine = view.call.task.task._handler
@@ -93,7 +93,7 @@ def _frame(view: CurrentEventView) -> FrameType | None:
 
 
 def is_users(code: CodeType) -> bool:
-    """Say whether code is the user's: neither Python's own, nor rclpy's, nor ours."""
+    """Whether code is the user's: not Python's, rclpy's or rsltrace's."""
     file = code.co_filename
     if file.startswith(("<frozen", *_between())):
         return False
@@ -102,7 +102,7 @@ def is_users(code: CodeType) -> bool:
 
 @cache
 def _between() -> tuple[str, ...]:
-    """Return the folders of what stands between a run and its callbacks."""
+    """Return the folders of rsltrace and rclpy."""
     import rclpy
 
     import rsltrace
@@ -122,10 +122,9 @@ NO_CALL = CallbackCall(None, ())
 
 
 class CurrentEventView:
-    """An ``EventView``: ``is_next`` says that the event is about to run, else it has just ended.
+    """The ``EventView`` of a run: the event that has just ended, or (``is_next``) is about to run.
 
-    One object serves a whole run; what it says is what is true when it is asked.
-    ``call`` is what is called then.
+    One object serves the whole run. ``call`` is the function that the event calls.
     """
 
     def __init__(self, session: Session, ledger: EventLedger) -> None:
@@ -138,11 +137,9 @@ class CurrentEventView:
 
     @property
     def stamp_ns(self) -> int:
-        """Simulated time."""
         return self._domain.loop.now_ns
 
     def nodes(self) -> Mapping[str, object]:
-        """Return the nodes there are, by their full names."""
         found = {}
         for handle in self._domain.graph.nodes:
             node = getattr(handle, "wrapper", None)
@@ -152,34 +149,29 @@ class CurrentEventView:
 
     @property
     def index(self) -> int:
-        """Its number, counted from 0."""
         return self._ledger.events - (not self.is_next)
 
     @property
     def kind(self) -> int:
-        """Its ``EventKind``."""
         return self._event.kind
 
     @property
     def entity(self) -> int:
-        """The id of what runs."""
         return self._event.entity
 
     @property
     def entity_name(self) -> str:
-        """Its name: a topic, a service, a timer's callback."""
         entity = self._ledger.entities.get(self._event.entity)
         return entity.name if entity is not None else ""
 
     @property
     def entity_kind(self) -> str:
-        """``subscription``, ``timer``, …; empty for none."""
         entity = self._ledger.entities.get(self._event.entity)
         return entity.kind.label if entity is not None and entity.id else ""
 
     @property
     def node(self) -> str:
-        """The full name of its node, empty for the run itself."""
+        """The full name of its node, or ""."""
         node = self._event.node
         if self._event.kind == EventKind.RESUME:  # a main is no node's, whichever it has made
             entity = self._ledger.entities.get(self._event.entity)
@@ -189,21 +181,17 @@ class CurrentEventView:
 
     @property
     def output_hash(self) -> int:
-        """The hash of its outputs; of an event that is about to run, 0."""
         return 0 if self.is_next else self._ledger.output_hash
 
     def received(self) -> tuple[str, object] | None:
-        """Return topic (or service) and message of its input, None if it has no message.
-
-        Of a callback that goes on, that with which it began.
-        """
+        """Return (topic or service, message) of its input, or None; for a callback that resumes,
+        the input it began with."""
         message = self.call.args[0] if self.call.args else None
         if not hasattr(message, "get_fields_and_field_types"):
             return None
         return self.entity_name, message
 
     def sent(self) -> Sequence[Sent]:
-        """Return its outputs, in order; of an event that is about to run, none."""
         if self.is_next:
             return ()
         return [self._sent(*output) for output in self._ledger.outputs_of_last()]
@@ -225,12 +213,11 @@ class CurrentEventView:
         return Sent(kind, name, content_hash, message=partial(_decoded, type_name, kept[1]))
 
     def findings(self) -> Sequence[str]:
-        """Return what the guard found in it (``clock``, ``random``); before it runs, nothing."""
         return () if self.is_next else [one.source.value for one in self._ledger.findings]
 
 
 def call_of(callback: Any, args: tuple[Any, ...]) -> CallbackCall:
-    """Return what of the user's an event calls: a task calls a coroutine."""
+    """Return the user function that an event calls; a task calls a coroutine."""
     task = getattr(callback, "__self__", None)
     return (
         CallbackCall(*task.called, task)

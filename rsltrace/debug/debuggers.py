@@ -33,9 +33,9 @@ Outside = Callable[[], AbstractContextManager[object]]
 
 
 class DebugpyServer:
-    """An editor's view of this process. Made and used ``outside`` of the run.
+    """An editor's debug adapter in this process. Made and used ``outside`` of the run.
 
-    :raises DebugError: debugpy is missing, or nobody can listen at the port.
+    :raises DebugError: debugpy is missing, or the port is taken.
     """
 
     def __init__(self, port: int, outside: Outside) -> None:
@@ -70,7 +70,7 @@ class DebugpyServer:
         self._pydb.do_wait_suspend = do_wait_suspend
 
     def _trace(self, function: Trace | None) -> None:
-        """Stand in for ``sys.settrace``: what debugpy does at each line is no part of the run."""
+        """Replace ``sys.settrace``, so that debugpy's own work is not part of the run."""
         self._settrace(None if function is None else self._apart(function))
 
     def _apart(self, function: Trace) -> Trace:
@@ -83,15 +83,13 @@ class DebugpyServer:
 
     @property
     def is_connected(self) -> bool:
-        """Whether an editor is there."""
         return bool(self._debugpy.is_client_connected())
 
     def wait(self) -> None:
-        """Wait until an editor has connected, and set its breakpoints."""
         self._debugpy.wait_for_client()
 
     def stop_in(self, code: CodeType) -> None:
-        """Stop at the first line of a function when it is called next."""
+        """Set a breakpoint at the first line of a function, for its next call."""
         from _pydevd_bundle.pydevd_api import PyDevdAPI
 
         PyDevdAPI().add_breakpoint(
@@ -109,14 +107,13 @@ class DebugpyServer:
         )
 
     def call(self, callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Call a callback in sight of the editor, whatever stack it is on."""
+        """Call a callback with tracing on, on any stack."""
         with self._outside():
             self._pydb.enable_tracing()
         callback(*args)
 
 
 def first_line(code: CodeType) -> int:
-    """Return the line of a function's first statement."""
     lines = {line for _, _, line in code.co_lines() if line}
     return min((line for line in lines if line > code.co_firstlineno), default=code.co_firstlineno)
 
@@ -187,7 +184,7 @@ def _under_debugpy(copy: DebuggedCopy, port: int) -> Calls:
 
 
 def _end_when_told(copy: DebuggedCopy) -> None:
-    """End the copy as soon as somebody says so, or is gone, whatever it does then."""
+    """End the copy when its client asks for it or disconnects."""
 
     def wait() -> None:
         poll = select.poll()  # any descriptor, unlike select

@@ -50,7 +50,7 @@ class ForkedCopy(NamedTuple):
 
 
 class Engine(EventObserver):
-    """One process of a debugged run, and where it stands."""
+    """The observer that runs, stops and forks one process of a debugged run."""
 
     order = ObserverOrder.DEBUGGER
 
@@ -64,7 +64,7 @@ class Engine(EventObserver):
         checkpoints: bool,
         idle: frozenset[int],
     ) -> None:
-        """``idle`` are threads of the middleware that do nothing here, and need not be copied."""
+        """``idle`` are middleware threads that do nothing here, and need not be copied."""
         self.session = session
         self.ledger = ledger
         self.lines = lines
@@ -95,12 +95,10 @@ class Engine(EventObserver):
     # -- where it is called ------------------------------------------------------------------------
 
     def after_event(self) -> None:
-        """See whether to stop after an event."""
         if self.ledger.events >= self._mark:
             self._attend()
 
     def before_event(self, call: EventCall) -> bool:
-        """See whether to stop before an event."""
         here = getcurrent()
         outer = self._calls.get(here)
         self._calls[here] = self.view.call = call_of(call.callback, call.args)
@@ -123,7 +121,7 @@ class Engine(EventObserver):
         return True
 
     def resumed(self) -> None:
-        """See, on the stack of a callback that goes on, whether to stop before it does."""
+        """Decide, on the stack of a callback that resumes, whether to stop before it."""
         self.view.call = self._calls.get(getcurrent(), NO_CALL)
         self._is_unasked = False
         if not self._goal.asks_before:
@@ -136,8 +134,8 @@ class Engine(EventObserver):
             self._is_unasked, self._mark = True, 0
 
     def _is_event(self) -> bool | None:
-        """Say whether a callback that goes on makes an event; None if nobody knows: one that spins
-        does so only if something comes of it."""
+        """Whether a resuming callback makes an event; None if unknown: one that spins makes an
+        event only if something comes of it."""
         event = self.event
         if not event.quiet:
             return True
@@ -154,7 +152,7 @@ class Engine(EventObserver):
         self._mark = 0
 
     def _attend(self) -> None:
-        """See what is to be done after an event: stop, answer, fork."""
+        """Stop, answer or fork after an event, as needed."""
         index, goal = self.ledger.events, self._goal
         with engage(None):
             if self.diverged:
@@ -178,7 +176,7 @@ class Engine(EventObserver):
                 self._set_mark(index)
 
     def _meanwhile(self, index: int) -> None:
-        """Do what is to be done on the way."""
+        """Leave checkpoints, and look for a request to pause."""
         goal = self._goal
         if goal.ladder and index >= goal.ladder[0]:
             while goal.ladder and index >= goal.ladder[0]:
@@ -201,7 +199,6 @@ class Engine(EventObserver):
         self._mark = mark
 
     def _about_to_run(self) -> None:
-        """See whether to stop before a callback."""
         goal, index = self._goal, self.ledger.events
         with engage(None):
             now_ns = self.session.loop.now_ns
@@ -216,8 +213,8 @@ class Engine(EventObserver):
                 self.view.is_next = False
 
     def _ask(self, watched: list[WatchedCondition], index: int, *, before: bool = False) -> bool:
-        """Ask conditions; True if one of them has stopped the run. ``before`` asks what was to be
-        asked before the event that has ended."""
+        """Evaluate conditions; return whether one has stopped the run. ``before`` evaluates those
+        that apply before an event, after it has ended."""
         is_next = self.view.is_next
         for one in watched:
             ask = one.armed.before if is_next or before else one.armed.after
@@ -252,7 +249,7 @@ class Engine(EventObserver):
     # -- stopping ----------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Run the whole session, stopping as requests say. Does not return."""
+        """Run the whole session, stopping as requested. Does not return."""
         session = self.session
         with engage(None):
             self._serve()
@@ -269,7 +266,6 @@ class Engine(EventObserver):
                 self._stop("end", text=self.over)
 
     def position(self) -> Message:
-        """Return where the run stands, as an answer has it."""
         found: Message = {
             "index": self.ledger.events,
             "stamp_ns": self.session.loop.now_ns,
@@ -289,7 +285,7 @@ class Engine(EventObserver):
         return found
 
     def _stop(self, reason: str, **more: Any) -> None:
-        """Answer the request to run, and serve others until there is another one."""
+        """Answer the request to run, then serve requests."""
         answer = {"reason": reason, "position": self.position(), **more}
         if self._hit is not None:
             answer["hit"], self._hit = self._hit, None
@@ -300,7 +296,7 @@ class Engine(EventObserver):
         self._serve()
 
     def _serve(self) -> None:
-        """Answer requests until one says to run."""
+        """Serve requests until one says to run."""
         while True:
             request = self.lines.receive()
             if request is None:
@@ -324,7 +320,7 @@ class Engine(EventObserver):
                 self._answer(error=error_answer(error))
 
     def _begin(self, request: Message) -> bool:
-        """Set off for a goal; False if nothing follows any more, or it is here."""
+        """Start running towards a goal; return False if it is reached or the run is over."""
         if self.diverged:
             self._answer(ok={"reason": "diverged", "position": self.position(), "text": self.over})
             return False
@@ -377,13 +373,11 @@ class Engine(EventObserver):
     # -- copies ------------------------------------------------------------------------------------
 
     def _fork_for(self, request: Message) -> None:
-        """Answer with a copy of this process that stands where this one does."""
         other = self._forked()
         if other is not None:
             self._hand_over(other, {"id": self._id, "ok": {"pid": other.pid}})
 
     def _leave_checkpoint(self) -> None:
-        """Leave a copy asleep here, and go on."""
         began_s = _cpu_s()
         try:
             other = self._forked()
@@ -432,7 +426,7 @@ class Engine(EventObserver):
         return None
 
     def _hand_over(self, copy: ForkedCopy, message: Message) -> None:
-        """Send a message with the socket to a copy, which is then the supervisor's."""
+        """Give the supervisor a copy's socket."""
         with copy.end:
             self.lines.send(message, copy.end.fileno())
 
@@ -440,7 +434,7 @@ class Engine(EventObserver):
         return [self.lines.fileno(), *self.ledger.history.descriptors]
 
     def _apart(self, work: Callable[[], Any]) -> None:
-        """Do what runs a user's code in a copy, so that it changes nothing here."""
+        """Run user code in a copy, so that it cannot change this process."""
         try:
             ours = self._forked()
         except DebugError:
@@ -459,9 +453,9 @@ class Engine(EventObserver):
         self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
 
     def _begin_apart(self, request: Message) -> bool:
-        """Let a copy call what follows under a debugger; True in the copy.
+        """Let a copy call the next callbacks under a debugger; return True in the copy.
 
-        :raises DebugError: there can be no copy, or nothing follows.
+        :raises DebugError: the process cannot be copied, or the run is over.
         """
         if self.over:
             raise DebugError(f"nothing follows: {self.over}")
@@ -479,12 +473,11 @@ class Engine(EventObserver):
 
     @contextmanager
     def outside(self) -> Iterator[None]:
-        """Do what is no part of the run, on whatever stack."""
+        """Do work that is not part of the run, on any stack."""
         with engage(None), self.session.world.domain.dispatcher.outside_events():
             yield
 
     def end_apart(self, **answer: Any) -> None:
-        """End this copy with an answer."""
         with self.outside(), suppress(BaseException):
             self.lines.send(answer)
         end_process(0)
@@ -507,14 +500,12 @@ class Engine(EventObserver):
         )
 
     def names(self) -> Names:
-        """Return the names in the run: those of its trace, or as far as it has come."""
         trace = self.ledger.history.trace
         entities = self.ledger.entities if trace is None else trace.entities
         return names_of(entities.values(), are_all=trace is not None, fields=loaded_fields)
 
 
 def error_answer(error: BaseException) -> Message:
-    """Return an error as an answer has it."""
     kind = type(error).__name__
     text = str(error)
     if not isinstance(error, RsltraceError):

@@ -123,7 +123,6 @@ class RunHistory:
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """What is open for it, and meant to be shared."""
         return (self._number,)
 
     @property
@@ -162,11 +161,12 @@ DID_MAX = 100
 
 
 class EventLedger(TraceWriter):
-    """Stands in for the writer of a trace. ``on_difference`` is called when an event differs.
+    """The trace writer of a debugged run: keeps the last event and compares each one.
 
-    ``entities`` and ``channels`` (topic and type) are those so far, by id. Of the last event there
-    are ``rest`` (packed), ``chain_hash``, ``outputs`` (packed), ``payloads``, ``details`` and
-    ``findings``. ``events`` is how many have ended.
+    ``on_difference`` is called when an event differs from its first run. ``entities`` and
+    ``channels`` (topic and type) are by id. ``rest`` (packed), ``chain_hash``, ``outputs``
+    (packed), ``payloads``, ``details`` and ``findings`` are those of the last event, ``events`` is
+    the number of events.
     """
 
     def __init__(self, history: EventHistory, *, ends_at_size_after: int | None = None) -> None:
@@ -199,7 +199,6 @@ class EventLedger(TraceWriter):
         self._sequences_under_way.append(sequence)
 
     def add_event(self, rest: bytes, chain_hash: int) -> None:
-        """Take the event that has ended, and compare it with what it was before."""
         outputs = self.outputs
         self.outputs, self._outputs_under_way = self._outputs_under_way, outputs
         outputs.clear()
@@ -222,7 +221,7 @@ class EventLedger(TraceWriter):
             self.on_difference()
 
     def _on_new_ground(self, index: int, rest: bytes, chain_hash: int) -> int | None:
-        """Have the history learn an event that it does not know."""
+        """Add an event that the history does not know yet."""
         self._known = self.history.hashes(index)  # another process may have been here meanwhile
         known = next(self._known, None)
         if known is None and self.history.learn(index, rest, chain_hash):
@@ -237,23 +236,19 @@ class EventLedger(TraceWriter):
         return len(self._payloads_under_way) - 1
 
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
-        """Keep a text."""
         self._payloads_under_way.append(text)
         return len(self._payloads_under_way) - 1
 
     def add_finding(self, finding: Finding, stamp_ns: int) -> int:
-        """Keep a finding."""
         self._findings_under_way.append(finding)
         return 0
 
     def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
-        """Keep nothing: whoever wants to know asks the node."""
         return 0
 
     # -- what is kept ------------------------------------------------------------------------------
 
     def add_entity(self, entity: Entity) -> int:
-        """Keep an entity."""
         self.entities[entity.id] = entity
         return 0
 
@@ -266,7 +261,6 @@ class EventLedger(TraceWriter):
         qos_yaml: str = "",
         type_hash: str = "",
     ) -> int:
-        """Return the id of a topic's channel."""
         key = (topic, type_name)
         found = self._ids.get(key)
         if found is None:
@@ -288,24 +282,22 @@ class EventLedger(TraceWriter):
 
     @property
     def event_count(self) -> int:
-        """How many events have ended."""
         return self.events
 
     @property
     def size(self) -> int:
-        """What ends a run that ends with the size of its trace: there, and not before."""
+        """Enough to end a run that ends by trace size, where the recorded one ended."""
         after = self._ends_at_size_after
         return _ENOUGH if after is not None and self.events >= after else 0
 
     @property
     def output_hash(self) -> int:
-        """The hash of the outputs of the last event."""
         return int(EVENT_REST.unpack(self.rest)[4]) if self.rest else 0
 
     # -- in words ----------------------------------------------------------------------------------
 
     def event(self) -> dict[str, Any] | None:
-        """Return the last event as an answer has it, None before the first."""
+        """Return the last event as an answer, None before the first."""
         if not self.rest:
             return None
         event = event_values(self.rest, self.chain_hash, self.entities)
@@ -328,7 +320,7 @@ class EventLedger(TraceWriter):
 
 
 def event_values(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
-    """Return a packed event as an answer has it."""
+    """Return a packed event as an answer."""
     index, stamp, cause, _, _, state, entity_id, cause_output, outputs, kind, flags = (
         EVENT_REST.unpack(rest)
     )

@@ -17,7 +17,7 @@ NOWHERE = 1 << 62
 
 @dataclass
 class WatchedCondition:
-    """A condition that counts in a run, with the number of its breakpoint (0: of a request)."""
+    """A condition with the number of its breakpoint (0: of a request)."""
 
     number: int
     text: str
@@ -46,27 +46,25 @@ class RunGoal:
 
     @property
     def asks_before(self) -> bool:
-        """Whether to look at events that are about to run."""
+        """Whether to look at events before they run."""
         return bool(self.before) or self.until_ns is not None or self.is_next_at is not None
 
     def is_reached(self, index: int) -> bool:
-        """Say whether so many events are enough."""
         return self.until is not None and index >= self.until and self.is_next_at is None
 
     def notes(self) -> list[str]:
-        """Say of conditions which could not be evaluated why."""
+        """Return why conditions could not be evaluated."""
         found = {one.number: one for one in (*self.before, *self.after)}
         return [f"{one.text}: {one.armed.note}" for one in found.values() if one.armed.note]
 
 
 class AfterNodeEvent(Armed):
-    """After an event of a node."""
+    """True after each event of one node."""
 
     def __init__(self, node: str) -> None:
         self._node = node
 
     def after(self, view: EventView) -> str:
-        """Compare names."""
         return self._node if view.node == self._node else ""
 
 

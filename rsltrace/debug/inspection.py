@@ -59,13 +59,13 @@ _REFUSED: Mapping[type[ast.AST], str] = {
 
 
 def python_value(text: str, names: Names, view: EventView, *, message: object, node: object) -> Any:
-    """Return what a Python expression is worth.
+    """Return the value of a Python expression.
 
-    Names are looked for in ``message`` (its fields), in ``node`` (its attributes), then among the
-    run's own, nodes by their short names, and what Python has built in.
+    Names are looked up in ``message`` (its fields), ``node`` (its attributes), the run's nodes by
+    short name, and Python's builtins.
 
-    :raises ConditionError: it is none, or names what is not there.
-    :raises PythonError: it raised.
+    :raises ConditionError: it is not an expression, or uses an unknown name.
+    :raises PythonError: it raised an exception.
     """
     text = text.strip()
     tree = parsed(text, text, 0)
@@ -88,7 +88,7 @@ def python_value(text: str, names: Names, view: EventView, *, message: object, n
 
 
 class PythonError(Exception):
-    """What an expression has raised, in words."""
+    """The exception that an expression raised, as text."""
 
 
 def _look_up(name: str, view: EventView, message: object, node: object) -> Any:
@@ -151,7 +151,7 @@ _short.maxlevel = 6
 
 
 class StoppedRun(Protocol):
-    """A run that stands still."""
+    """A run that is stopped between two events."""
 
     view: CurrentEventView
     session: Session
@@ -164,7 +164,7 @@ class StoppedRun(Protocol):
 def live_node(run: StoppedRun, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
-    :raises DebugError: there is none, or several, or it is not there now.
+    :raises DebugError: none or several match, or it does not exist now.
     """
     full = full_name(run, name)
     node = run.view.nodes().get(full)
@@ -176,9 +176,9 @@ def live_node(run: StoppedRun, name: str) -> Any:
 
 
 def full_name(run: StoppedRun, name: str) -> str:
-    """Return the full name of the node that is meant.
+    """Return the full name of a node given by any unique part.
 
-    :raises DebugError: there is none, or several.
+    :raises DebugError: none or several match.
     """
     nodes = dict.fromkeys((*run.view.nodes(), *run.names().nodes))
     found = nodes_called(name, nodes)
@@ -192,10 +192,10 @@ def full_name(run: StoppedRun, name: str) -> str:
 
 
 def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, Any]:
-    """Return the value of a Python expression as JSON, and how Python shows it.
+    """Return the value of a Python expression as JSON, and its ``repr``.
 
-    :raises ConditionError: it is no expression, or names what is not there.
-    :raises DebugError: it raised.
+    :raises ConditionError: it is not an expression, or uses an unknown name.
+    :raises DebugError: it raised an exception.
     """
     owner = None if node is None else live_node(run, node)
     received = run.view.received()
@@ -215,7 +215,7 @@ def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, An
 
 
 def short_repr(value: object) -> str:
-    """Return how Python shows a value, cut where it is long."""
+    """Return a value's ``repr``, shortened."""
     try:
         return _short.repr(value)
     except Exception as error:
@@ -223,9 +223,9 @@ def short_repr(value: object) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """Return a value as JSON knows it: arrays are lists, messages objects.
+    """Return a value as JSON has it: arrays are lists, messages are objects.
 
-    :raises TypeError: it cannot be.
+    :raises TypeError: JSON has no such value.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -245,9 +245,9 @@ def json_value(value: Any) -> Any:
 
 
 def attributes(run: StoppedRun, name: str) -> dict[str, str]:
-    """Return a node's own attributes and parameters as Python shows them.
+    """Return a node's own attributes and parameters with their ``repr``.
 
-    Of objects that Python shows by their address only there are the attributes: ``_ekf.P``.
+    An object without a ``repr`` of its own is listed by its attributes: ``_ekf.P``.
     """
     from rsltrace.adapters.rclpy.handles.node_state import own_attributes
 
@@ -266,7 +266,7 @@ def _within(values: Mapping[str, Any], prefix: str, depth: int) -> Iterator[tupl
 
 
 def _plain_parts(value: object) -> Mapping[str, Any]:
-    """Return the attributes of an object of the user's that has no text of its own."""
+    """Return the attributes of a user object without a ``repr`` of its own."""
     kind = type(value)
     of = {one.__module__.partition(".")[0] for one in kind.__mro__[:-1]}
     if kind.__repr__ is not object.__repr__ or not of.isdisjoint(_NO_USERS):
@@ -280,7 +280,6 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
 
 
 def nodes(run: StoppedRun) -> list[dict[str, Any]]:
-    """Return the nodes there are."""
     return [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
         for name, node in run.view.nodes().items()
@@ -288,7 +287,6 @@ def nodes(run: StoppedRun) -> list[dict[str, Any]]:
 
 
 def queues(run: StoppedRun) -> list[dict[str, Any]]:
-    """Return what waits in the queues of subscriptions, services and clients."""
     graph = run.session.world.domain.graph
     found = []
     for node in graph.nodes:
@@ -307,7 +305,7 @@ def queues(run: StoppedRun) -> list[dict[str, Any]]:
 
 
 def timers(run: StoppedRun) -> list[dict[str, Any]]:
-    """Return the timers, those that are due first before others; cancelled ones come last."""
+    """Return the timers, the next due first, cancelled ones last."""
     found = []
     for node in run.session.world.domain.graph.nodes:
         for timer in _timers_of(node):
@@ -329,21 +327,19 @@ def _timers_of(node: Any) -> list[Any]:
 
 
 def stacks(run: StoppedRun) -> list[str]:
-    """Return who waits for what, with the lines of user code that led there."""
     stacks = run.session.world.stacks
     waits = [one.waits_for() for one in stacks.coroutines.suspended]
     return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
 
 
 def graph(run: StoppedRun) -> dict[str, Any]:
-    """Return nodes, topics, services and actions with their ends."""
     values = asdict(graph_overview(run.session.world.domain.graph, ()))
     del values["waiting"]
     return values
 
 
 def message(run: StoppedRun) -> dict[str, Any] | None:
-    """Return what the callback of the present event gets: the next one's, if it is about to run."""
+    """Return the input message of the current (or next) callback."""
     received = run.view.received()
     if received is None:
         return None
@@ -367,10 +363,6 @@ INSPECTED: dict[str, Callable[[StoppedRun], Any]] = {
 
 
 def inspect_run(run: StoppedRun, what: str) -> Any:
-    """Return the answer to a request to inspect.
-
-    :raises DebugError: there is no such thing to see.
-    """
     if what not in INSPECTED:
         there = ", ".join(INSPECTED)
         raise DebugError(f"nothing is called {what!r}; {did_you_mean(what, INSPECTED, there)}")

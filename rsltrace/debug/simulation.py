@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Serve the supervisor until it is gone."""
     pin()
     number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
     die_with_parent(spec["supervisor"])
@@ -49,7 +48,7 @@ def main() -> None:
 def _opened(
     spec: dict[str, Any], stack: ExitStack
 ) -> tuple[Job, EventHistory, tuple[Edit, ...], list[str]]:
-    """Return the job to run, what is known of its run, the edits in it, and notes.
+    """Return the job to run, its event history, the edits in it, and notes.
 
     :raises RsltraceError: it cannot be run here.
     """
@@ -125,7 +124,7 @@ def _serve(
 
 
 def _middleware_threads() -> frozenset[int]:
-    """Return the threads that DDS starts when it is loaded, and nobody uses in a simulation."""
+    """Return the threads that DDS starts when it is loaded; a simulation does not use them."""
     from rsltrace.adapters.rclpy.boundary.installation import check_free
     from rsltrace.forking import other_threads
 

@@ -21,8 +21,6 @@ from rsltrace.line_protocol import Lines, Message
 
 
 class Supervisor:
-    """Answers requests of one client."""
-
     def __init__(self, client: Lines, spec: dict[str, Any]) -> None:
         self.client = client
         self.waiting: deque[Message] = deque()
@@ -57,7 +55,7 @@ class Supervisor:
         }
 
     def serve(self) -> None:
-        """Answer until the client is gone; then end everything."""
+        """Answer requests until the client disconnects, then end all processes."""
         try:
             self.client.send({"notice": "ready", **self.tree.start()})
             while True:
@@ -110,7 +108,7 @@ class Supervisor:
         return answer
 
     def _node(self, request: Message) -> str:
-        """Return the full name of the node that is meant: by default that of the last event."""
+        """Return the full name of the requested node, by default that of the last event."""
         name = request.get("node")
         if name is not None:
             return str(self.tree.ask_cursor({"do": "node name", "name": name}))
@@ -123,7 +121,7 @@ class Supervisor:
         return self._forward(until_ns=self.tree.position["stamp_ns"])
 
     def _place(self, place: int | str) -> Message:
-        """Return the goal of an index (an int, or digits) or a time of the run."""
+        """Return the goal for an index (an int, or digits) or a time of the run."""
         text = str(place).strip()
         if text.isascii() and text.isdigit():
             return {"until": int(text)}
@@ -213,7 +211,7 @@ class Supervisor:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
 
     def _debug(self, request: Message) -> Any:
-        """Let a copy run on under a debugger of Python, until that is told to end."""
+        """Let a copy continue under a Python debugger, until that ends."""
         answer = self.tree.ask_apart({k: v for k, v in request.items() if k != "id"}, None)
         if "raised" not in answer:
             return {"ended": answer.get("text", "the end of the run"), "raised": ""}
@@ -236,7 +234,6 @@ def _said(error: RsltraceError) -> Message:
 
 
 def main() -> None:
-    """Serve a client."""
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
     os.set_inheritable(number, False)

@@ -21,15 +21,15 @@ _PIECE_BYTES = 1 << 16
 
 
 class ClientGoneError(DebugError):
-    """Nobody is there to answer."""
+    """The client has disconnected."""
 
 
 class SessionOverError(DebugError):
-    """The session cannot go on. The message says why."""
+    """The session cannot continue. The message says why."""
 
 
 class RefusedRequestError(DebugError):
-    """An error that a process of the simulation has answered; ``kind`` is the class it names."""
+    """An error that a simulation process returned; ``kind`` is its class."""
 
     def __init__(self, message: str, kind: str) -> None:
         super().__init__(message)
@@ -37,7 +37,7 @@ class RefusedRequestError(DebugError):
 
 
 class CheckpointTree:
-    """Where a session stands, and how it gets elsewhere. ``position`` is that of the cursor."""
+    """The processes of a session: the cursor, and checkpoints. ``position`` is the cursor's."""
 
     def __init__(self, spec: dict[str, Any], client: Lines, waiting: deque[Message]) -> None:
         self.family = Family()
@@ -78,7 +78,7 @@ class CheckpointTree:
         return {key: value for key, value in ready.items() if key != "notice"}
 
     def _new_root(self) -> tuple[SimProcess, Message]:
-        """Start a process at the begin of the run."""
+        """Start a process at the beginning of the run."""
         root = self.family.start(self._spec, self._output_end)
         try:
             while True:
@@ -95,9 +95,9 @@ class CheckpointTree:
     # -- the cursor --------------------------------------------------------------------------------
 
     def ask_cursor(self, request: Message) -> Any:
-        """Ask the process that stands where the session does.
+        """Send a request to the process at the session's position.
 
-        :raises Lost: it has ended; the session is back there.
+        :raises Lost: that process ended; another one stands there now.
         """
         return self._ask_cursor(request)
 
@@ -108,7 +108,7 @@ class CheckpointTree:
             raise self._come_back(self.position, error) from None
 
     def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
-        """Ask for what runs a user's code: a copy does it, and may be killed."""
+        """Have a copy run user code; the copy may be killed."""
         answer = self._ask_cursor(request, whole=True)
         if "with" not in answer:
             return answer["ok"]
@@ -121,7 +121,7 @@ class CheckpointTree:
     def run(self, goal: Message) -> Message:
         """Run the cursor forward; return where and why it stopped.
 
-        :raises Lost: its process has ended; the session is back where it was.
+        :raises Lost: its process ended; the session is back where it was.
         """
         before = self.position
         request = {"do": "run", "interval_s": self._interval(), **goal}
@@ -132,9 +132,9 @@ class CheckpointTree:
         return answer
 
     def _come_back(self, before: Message, error: Lost) -> Lost:
-        """Put the session back where it was before its process ended.
+        """Return the session to its position after its process ended.
 
-        :raises Over: that cannot be done.
+        :raises SessionOverError: that failed.
         """
         self.family.kill(self._cursor)
         index = int(before["index"])
@@ -156,7 +156,6 @@ class CheckpointTree:
     # -- going back --------------------------------------------------------------------------------
 
     def go_to(self, goal: Message) -> Message:
-        """Go to an index or a time, wherever that is."""
         if "until" in goal:
             here = int(self.position["index"])
             if goal["until"] == here and not self.position["is_next"]:
@@ -172,12 +171,12 @@ class CheckpointTree:
         return answer
 
     def _jumps_ahead(self, goal: Message) -> bool:
-        """Say whether a checkpoint lies between here and a goal ahead."""
+        """Whether a checkpoint lies between here and a goal ahead."""
         found = self._bases(goal)
         return bool(found) and found[0].index > int(self.position["index"])
 
     def _leave_cursor(self) -> None:
-        """Have the process that stood here sleep as a checkpoint, or end."""
+        """Keep the cursor's process as a checkpoint, or end it."""
         position = self.position
         if self._checkpoints.count_max and self._copies and not position["is_next"]:
             one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), self._cursor)
@@ -186,7 +185,7 @@ class CheckpointTree:
         self.family.kill(self._cursor)
 
     def _at(self, goal: Message) -> tuple[SimProcess, Message]:
-        """Return a new process at a goal, and its answer."""
+        """Return a new process that stands at a goal, and its answer."""
         process, index = self._awake(self._bases(goal))
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
@@ -203,7 +202,7 @@ class CheckpointTree:
         return self._checkpoints.before_time(goal["until_ns"])
 
     def _awake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
-        """Return a copy of the first checkpoint that can be woken, or a process at the begin."""
+        """Return a copy of the first usable checkpoint, or a process at the beginning."""
         for one in bases:
             try:
                 return self._copy_of(one.process), one.index
@@ -218,7 +217,7 @@ class CheckpointTree:
         return root, 0
 
     def go_back(self, conditions: Message) -> Message:
-        """Go back to the last place at which one of the conditions was true; else to the begin."""
+        """Go back to the last place where a condition was true, else to the beginning."""
         # Where it stands before a callback, what ended just before that is behind, too.
         hit = self.last_hit(conditions, int(self.position["index"]) + self.position["is_next"])
         if hit is None:
@@ -234,7 +233,7 @@ class CheckpointTree:
         return answer
 
     def last_hit(self, conditions: Message, below: int) -> Message | None:
-        """Return the last place at an index ``below`` so many where a condition was true."""
+        """Return the last place before index ``below`` where a condition was true."""
         end = min(below, int(self.position["index"]))
         while True:
             bases = self._checkpoints.before(max(end - 1, 0))
@@ -298,7 +297,7 @@ class CheckpointTree:
         self.family.kill(one.process)
 
     def thin(self) -> None:
-        """Keep number and memory of checkpoints within their bounds, after a move."""
+        """Keep checkpoints within their limits of number and memory, after a move."""
         cursor = int(self.position["index"])
         if cursor == self._thinned_at:
             return
@@ -318,7 +317,7 @@ class CheckpointTree:
         return worst is not None
 
     def _weigh_next(self) -> None:
-        """Look at the memory of one checkpoint, in turns: all of them would take long."""
+        """Measure the memory of one checkpoint, in turn: all at once would be slow."""
         everyone = self._checkpoints.all()
         if everyone:
             self._weighed += 1
@@ -329,13 +328,12 @@ class CheckpointTree:
         return sum(one.bytes for one in self._checkpoints.all())
 
     def memory(self) -> int:
-        """Return how much memory the checkpoints take, in bytes (PSS)."""
+        """Measure the memory of all checkpoints, in bytes (PSS)."""
         for one in self._checkpoints.all():
             one.bytes = memory_bytes(one.process.pid)
         return self._memory_known()
 
     def described(self) -> Message:
-        """Return what checkpoints there are, as an answer has it."""
         return {
             "indices": [one.index for one in self._checkpoints.all()],
             "bytes": self.memory(),
@@ -345,7 +343,7 @@ class CheckpointTree:
     # -- talking -----------------------------------------------------------------------------------
 
     def next_request(self) -> Message | None:
-        """Wait for the client's next request; None once it is gone."""
+        """Wait for the client's next request; None once it has disconnected."""
         while not self._waiting:
             if self._client.ended:
                 return None
@@ -353,7 +351,7 @@ class CheckpointTree:
         return self._waiting.popleft()
 
     def _quietly(self, process: SimProcess, request: Message) -> Message:
-        """Ask a process that repeats what has been seen: what it prints is dropped."""
+        """Send a request to a process that repeats known events: its output is dropped."""
         self._is_quiet = True
         try:
             answer: Message = self._ask(process, request)
@@ -372,10 +370,10 @@ class CheckpointTree:
         whole: bool = False,
         limit_s: float | None = None,
     ) -> Any:
-        """Send a request to a process and wait for its answer.
+        """Send a request to a process and return its answer.
 
-        :raises Refused: the error that it answered.
-        :raises Lost: it has ended, or does not answer in time.
+        :raises RefusedRequestError: it returned an error.
+        :raises Lost: it ended, or did not answer in time.
         """
         if request is not None:
             try:
@@ -391,7 +389,7 @@ class CheckpointTree:
                 return message if whole else message["ok"]
 
     def _message_of(self, process: SimProcess, limit_s: float | None = None) -> Message:
-        """Wait for what a process says that is no notice to us."""
+        """Wait for a message of a process that is not a notice."""
         while True:
             message = process.lines.next()
             if message is None:
@@ -423,7 +421,7 @@ class CheckpointTree:
             self._drop_one(one.index)
 
     def _wait_for(self, process: SimProcess | None, limit_s: float | None) -> None:
-        """Wait until somebody says something: a process, the client, a node that prints."""
+        """Wait for a process, the client, or output of a node."""
         ends: list[Any] = [self._output]
         if process is not None:
             ends.append(process.lines)
@@ -455,7 +453,7 @@ class CheckpointTree:
             raise ClientGoneError("the client is gone")
 
     def _pass_output_on(self) -> None:
-        """Give the client what nodes have printed."""
+        """Send what nodes have printed to the client."""
         while True:
             try:
                 data = os.read(self._output, _PIECE_BYTES)

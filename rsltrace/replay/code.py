@@ -43,7 +43,7 @@ class JobCodeFile:
 
 
 def code_of(job: Job, sources: dict[str, str]) -> tuple[JobCodeFile, ...]:
-    """Return the code of a job; ``sources`` are the hashes that a trace has of it."""
+    """Return the code files of a job; ``sources`` are their hashes in a trace."""
     places = [job.resolve(folder) for folder in job.search_path]
     if any(spec.executable is not None for spec in job.nodes):
         places += module_folders(places, ask=False)  # nothing is run to find out
@@ -68,7 +68,7 @@ def _code(name: str, file: Path | None, recorded: str) -> JobCodeFile:
 
 
 def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
-    """Yield what a job names itself, rather than what that imports."""
+    """Yield the modules and files that the job itself names, not what they import."""
     targets: list[Any] = [job.hooks.before, job.hooks.after, job.stop.function]
     targets.append(None if job.policy is None else job.policy.function)
     targets += [spec.node or spec.main for spec in job.nodes]
@@ -104,8 +104,8 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
 
 
 def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
-    """Return the file that a module would be loaded from: of ``folders``, or, if it may be an
-    ``installed`` one, then of Python's own path."""
+    """Return the file a module would be loaded from: of ``folders``, then (``installed``) of
+    Python's path."""
     if installed:
         spec = find_module(module, [*folders, *sys.path], _editable_spec)
     else:
@@ -116,7 +116,7 @@ def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> P
 
 
 def _editable_spec(module: str) -> ModuleSpec | None:
-    """Ask the finders of packages that are installed in place, which know files of their own."""
+    """Ask the finders of packages installed in editable mode."""
     for finder in sys.meta_path:
         if finder is not PathFinder and "editable" in f"{finder!r}".lower():
             with suppress(Exception):

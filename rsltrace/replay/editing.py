@@ -41,9 +41,9 @@ if TYPE_CHECKING:
 
 
 def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
-    """Return the message (canonical CDR) of a publisher or subscription, edited.
+    """Return an edited message (canonical CDR) of a publisher or subscription.
 
-    :raises EditError: it has no such field, or that cannot have such a value.
+    :raises EditError: there is no such field, or the value does not fit.
     """
     from rsltrace.adapters.rclpy.wire.codec import codec_for
     from rsltrace.adapters.rclpy.wire.interfaces import class_of
@@ -52,9 +52,9 @@ def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
 
 
 def receive_edited(edit: Edit, call: EventCall) -> None:
-    """Let an event that is about to run receive another message.
+    """Change the message that an event is about to receive.
 
-    :raises EditError: it receives none, or that cannot be edited so.
+    :raises EditError: it receives none, or the edit does not fit.
     """
     from rsltrace.adapters.rclpy.wire.codec import codec_for
 
@@ -80,8 +80,8 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 
 
 def arrived_for_action(handle: Any, kind: int) -> Any:
-    """Return the part of an action of which a coroutine is going to take what has arrived: a goal,
-    a response, feedback. None if it is going to do something else."""
+    """Return the part of an action (goal, response, feedback) whose arrival a coroutine is about to
+    take, or None."""
     from rsltrace.adapters.rclpy.actions.parts import Part
 
     parts = (one for one in _begun_with(handle, kind) if isinstance(one, Part) and one.queue)
@@ -89,14 +89,14 @@ def arrived_for_action(handle: Any, kind: int) -> Any:
 
 
 def _begun_with(run: Any, kind: int) -> list[Any]:
-    """Return what a coroutine is going to be called with; nothing if it is under way already."""
+    """Return the arguments of a coroutine that has not begun yet, else nothing."""
     frame = getattr(run.task._handler, "cr_frame", None)
     is_under_way = kind in (EventKind.RESUME, EventKind.TASK)
     return [] if frame is None or is_under_way else list(frame.f_locals.values())
 
 
 def _change_arrival(part: Any, edit: Edit) -> int:
-    """Change what has arrived first; return its hash."""
+    """Change the first arrival in a queue; return its hash."""
     from rsltrace.adapters.rclpy.actions.parts import GoalClient, GoalService
     from rsltrace.adapters.rclpy.wire.codec import codec_for
 
@@ -150,9 +150,9 @@ FAILED = Stop("an edit could not be made", 2)
 
 
 class EditObserver(EventObserver):
-    """The edits of one run. ``error`` says which of them could not be made, and why.
+    """Makes the edits of one run. ``error`` says which edit failed, and why.
 
-    ``on_new`` is called before the first edit, from number ``known`` on, that is made.
+    ``on_new`` is called before the first edit with number ``known`` or higher is made.
     """
 
     order = ObserverOrder.EDITS
@@ -176,16 +176,14 @@ class EditObserver(EventObserver):
 
     @property
     def branches(self) -> bool:
-        """Whether there are new edits."""
         return bool(self._new)
 
     @property
     def unmade(self) -> list[Edit]:
-        """The edits that have not been made so far."""
         return [*self._pending, *(edit for edits in self._armed.values() for edit in edits)]
 
     def failure(self) -> EditError | None:
-        """Return what is wrong with a run that is over: a new edit that has not been made."""
+        """Return what is wrong after the run: an error, or a new edit that was never made."""
         late = [edit for edit in self.unmade if edit in self._new]
         if self.error is not None or not late:
             return self.error
@@ -195,7 +193,6 @@ class EditObserver(EventObserver):
         )
 
     def attach(self, session: Session) -> None:
-        """Make the edits in an open session from now on."""
         self._session = session
         self._loop = session.loop
         self._dispatcher = session.world.domain.dispatcher
@@ -203,7 +200,7 @@ class EditObserver(EventObserver):
         self._dispatcher.add_observer(self)
 
     def before_event(self, call: EventCall) -> bool:
-        """Make the edits that are due before an event, and those of the event itself."""
+        """Make the edits due before an event, and those of the event itself."""
         if not self._pending or call.handle is self._setting:
             return True
         due = [edit for edit in self._pending if self._is_due(edit)]
@@ -219,7 +216,7 @@ class EditObserver(EventObserver):
         return happens and self.error is None
 
     def after_event(self) -> None:
-        """Make what is due before the next event, and let those run that have waited enough."""
+        """Make the edits due before the next event, and release deferred events."""
         for edit in [edit for edit in self._pending if self._is_due(edit)]:
             if edit.of_event:
                 self._check_is_to_come(edit)
@@ -228,8 +225,8 @@ class EditObserver(EventObserver):
         self._deferred.release()
 
     def _check_is_to_come(self, edit: Edit) -> None:
-        """End the run if the event of an edit is over, unless an edit was an event of that number
-        itself: then the next one is meant."""
+        """End the run if the event of an edit is over. After an edit that was itself an event of
+        that number, the next one is meant."""
         if edit.index is None or edit.index >= self._loop.events:
             return
         if self._dispatcher.event.handle is not self._setting:
@@ -242,7 +239,7 @@ class EditObserver(EventObserver):
         return self._loop.now_ns >= edit.time.stamp_ns(self._session.start_ns)
 
     def _try(self, edit: Edit, make: Callable[..., Any], *args: Any) -> Any:
-        """Make an edit, or end the run and say why not."""
+        """Make an edit, or end the run with the reason why not."""
         if self._on_new is not None and edit in self._new:
             on_new, self._on_new = self._on_new, None
             on_new()
@@ -285,7 +282,7 @@ class EditObserver(EventObserver):
             self._setting = None
 
     def _set_parameter(self, edit: Edit, node: Any, action: SetParameterEdit) -> None:
-        """Set a parameter; what is wrong with it is no exception of a node's."""
+        """Set a parameter; an error is the edit's, not an exception of the node."""
         try:
             _set_parameter(node, action)
         except EditError as error:
@@ -299,7 +296,7 @@ class EditObserver(EventObserver):
         raise EditError(f"there is no node {name} by then")
 
     def _arm(self, edit: Edit, topic: str) -> None:
-        """Wait for the next message on a topic, whoever publishes it."""
+        """Wait for the next message on a topic, from any publisher."""
         domain = self._session.world.domain
         if not domain.graph.publishers(topic):
             return  # nobody yet
@@ -320,7 +317,7 @@ class EditObserver(EventObserver):
     # -- the event that is about to run ----------------------------------------------------------
 
     def _event(self, edit: Edit, call: EventCall) -> bool:
-        """Make an edit of an event; return whether it happens now."""
+        """Make an edit of an event; return whether the event runs now."""
         self._pending.remove(edit)
         handle, kind, action = call.handle, call.kind, edit.action
         if isinstance(action, SetMessageEdit):
@@ -367,11 +364,10 @@ def _set_parameter(node: Any, action: SetParameterEdit) -> None:
 
 
 class DeferredEvents:
-    """Events that others run before: so many of them, or all that are due at the present time.
+    """Events deferred until so many others, or all that are due at the current time, have run.
 
-    They wait in order of the event before which they run, those that let all others go first at
-    the end, and else in the order in which they were deferred. The first runs next when it is time
-    for it, or when nothing else can run at the present time: so no event is lost.
+    They wait in order of the event before which they run; the first also runs when nothing else can
+    run at the current time, so no event is lost.
     """
 
     def __init__(self, loop: EventLoop) -> None:
@@ -380,7 +376,7 @@ class DeferredEvents:
         self._count = 0
 
     def add(self, item: Dispatchable, others: int | None) -> None:
-        """Let ``others`` events run before ``item``; None: all."""
+        """Let ``others`` events (None: all) run before ``item``."""
         if not self._waiting:
             self._loop.idle.append(self._release_first)
         self._count += 1  # no two are the same, so items are not compared
@@ -388,7 +384,7 @@ class DeferredEvents:
         insort(self._waiting, (before, self._count, item))
 
     def release(self) -> None:
-        """Have those run next for which it is time."""
+        """Run those that have waited long enough next."""
         due = 0
         while due < len(self._waiting) and self._waiting[due][0] <= self._loop.events:
             due += 1
@@ -404,7 +400,7 @@ class DeferredEvents:
             self._loop.idle.remove(self._release_first)
 
     def _release_first(self) -> bool:
-        """Have the first run now that nothing else is ready; True: go on."""
+        """Run the first deferred event when nothing else is ready."""
         loop = self._loop
         if loop.idle[-1] != self._release_first:  # others have a look first
             loop.idle.remove(self._release_first)
@@ -417,7 +413,7 @@ class DeferredEvents:
 
 
 class _LaterEvent:
-    """An event that runs later than it would have."""
+    """An event that runs later than recorded."""
 
     def __init__(self, dispatcher: Dispatcher, call: EventCall) -> None:
         self._dispatcher = dispatcher
@@ -425,7 +421,7 @@ class _LaterEvent:
         self._handle = call.handle
 
     def dispatch(self) -> None:
-        """Run the event, unless whose it is has gone; a busy callback group is waited for."""
+        """Run the event, unless its entity is gone; a busy callback group is waited for."""
         handle = self._handle
         if getattr(handle, "destroyed", False):
             return
@@ -435,9 +431,7 @@ class _LaterEvent:
         self._dispatcher.execute(*self._event)
 
     def describe(self) -> str:
-        """Name it for an error message."""
         return str(self._handle.describe())
 
     def runnable(self) -> Any:
-        """Describe it to a policy."""
         return self._handle.runnable()

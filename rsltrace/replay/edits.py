@@ -100,7 +100,7 @@ class Edit:
 
     @property
     def of_event(self) -> bool:
-        """Whether it changes what an event is, rather than what there is before it."""
+        """Whether it changes the event itself, not the state before it."""
         action = self.action
         if isinstance(action, (SetMessageEdit, DropEdit)):
             return action.topic is None
@@ -108,34 +108,34 @@ class Edit:
 
     @property
     def topic(self) -> str | None:
-        """The topic whose next message it is about, if it is."""
+        """The topic whose next message it changes, or None."""
         return self.action.topic if isinstance(self.action, (SetMessageEdit, DropEdit)) else None
 
 
 def parse_edit(text: str) -> Edit:
-    """Return the edit that a text says.
+    """Parse the text of an edit.
 
-    :raises EditError: it says none, with the place in the text.
+    :raises EditError: with the position in the text.
     """
     return _EditParser(text).edit()
 
 
 def edits_of(trace: Trace) -> tuple[str, ...]:
-    """Return the edits that a branch was made with; none of a trace that is no branch."""
+    """Return the edits of a branch; none of any other trace."""
     return tuple(
         text for key, text in sorted(trace.metadata(METADATA_EDITS).items()) if key != "of"
     )
 
 
 def edits_metadata(edits: Iterable[Edit], trace: Trace) -> dict[str, str]:
-    """Return what a branch says of itself: its edits, and the digest of what it is a branch of."""
+    """Return a branch's metadata: its edits, and the digest of the trace it branches from."""
     return {**{f"{n:06}": edit.text for n, edit in enumerate(edits)}, "of": trace.digest}
 
 
 def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
-    """See that what edits name is in a trace.
+    """Check that the trace has what the edits name.
 
-    :raises EditError: an event, topic or node is not.
+    :raises EditError: it lacks an event, topic or node.
     """
     names: dict[EntityKind, set[str]] = {}
     for entity in trace.entities.values():
@@ -249,7 +249,7 @@ class _EditParser:
         raise self._at(target, f"an edit is one of {_FORMS}")
 
     def _named(self, root: ast.expr) -> tuple[str, str]:
-        """Return what is called with a name: ``node("/ekf")``."""
+        """Return function and name of ``node("/ekf")``."""
         if (
             isinstance(root, ast.Call)
             and isinstance(root.func, ast.Name)
@@ -282,7 +282,7 @@ class _EditParser:
 
 
 def combine(old: Any, operator: str, value: Any) -> Any:
-    """Return what ``old`` becomes: ``value``, or the two combined by an operator."""
+    """Return ``value``, or ``old`` and ``value`` combined by an operator."""
     if operator == "+":
         return old + value
     if operator == "-":
@@ -295,9 +295,9 @@ def combine(old: Any, operator: str, value: Any) -> Any:
 
 
 def set_path(root: Any, path: Sequence[PathStep], operator: str, value: Any) -> None:
-    """Change what a path leads to from an object.
+    """Set what a path leads to from an object.
 
-    :raises Exception: whatever the objects on the way raise; AttributeError if there is none.
+    :raises Exception: whatever the objects on the way raise.
     """
     for kind, key in path[:-1]:
         root = getattr(root, key) if kind == "." else root[key]
@@ -309,5 +309,4 @@ def set_path(root: Any, path: Sequence[PathStep], operator: str, value: Any) -> 
 
 
 def path_text(path: Iterable[PathStep]) -> str:
-    """Return a path as it is written."""
     return "".join(f".{key}" if kind == "." else f"[{key!r}]" for kind, key in path)

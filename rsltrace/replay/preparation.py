@@ -1,4 +1,4 @@
-"""What a replay is going to run, known before any of it runs."""
+"""What a replay is going to run, known before it starts."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ _NAME_MAX = 255
 
 
 def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
-    """Return a job without its bags, which need not be there. ``load`` gets overrides.
+    """Return a job without its bags, which need not exist. ``load`` gets overrides.
 
-    :raises JobError: if it cannot be used otherwise.
+    :raises JobError: it cannot be used.
     """
     try:
         return load(("bags=[]",))
@@ -44,11 +44,11 @@ def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
 
 
 def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
-    """Return the job that a trace holds, as if its file were in ``folder``. Nothing is run.
+    """Return the job in a trace, resolved in ``folder``. Nothing is run.
 
-    Without ``bags`` it is that job without them, and they need not be there.
+    Without ``bags``, the job has none and they need not exist.
 
-    :raises ReplayError: if the trace holds none, or one of another version.
+    :raises ReplayError: the trace holds no job, or one of another version.
     """
     try:
         resolved = _resolved(trace)
@@ -78,7 +78,7 @@ def _resolved(trace: Trace) -> dict[str, Any]:
 
 
 def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
-    """Let a job that followed a recording which is gone follow the trace: it has that order."""
+    """Let a job that followed a missing recording follow the trace, which has its order."""
     policy = resolved.get("policy")
     if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
         return
@@ -87,15 +87,15 @@ def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) ->
 
 
 def job_name(trace: Trace) -> str:
-    """Return the name of the file that a trace's job was read from, empty if it was none."""
+    """Return the file name of a trace's job, or ""."""
     name = Path(trace.job.get("name", "")).name
     return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
 
 
 def job_folder_of(trace: Trace, given: Path | None) -> Path:
-    """Return the folder of a trace's job: the one that is given, or one in which the job is.
+    """Return the folder of a trace's job: the given one, or one where the job is found.
 
-    :raises ReplayError: saying what was looked for, and where.
+    :raises ReplayError: with what was looked for, and where.
     """
     if given is not None:
         if not given.is_dir():
@@ -120,14 +120,14 @@ def _shown(place: Path) -> str:
 
 
 def _folder_markers(trace: Trace) -> list[str]:
-    """Return what shows that a folder is the job's: its file, or else the modules of its nodes."""
+    """Return the files that identify the job's folder: its file, or its nodes' modules."""
     if job_name(trace):
         return [job_name(trace)]
     return [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
 
 
 def _match_folder(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
-    """Say whether a folder has what is wanted, and whether the job file says what it said."""
+    """Return whether a folder has the files, and whether the job file is unchanged."""
     if not job_name(trace):
         folders = _search(trace, folder)
         return all(file_of(name, folders, installed=False) for name in wanted), False
@@ -175,10 +175,9 @@ _MAY_DIFFER = frozenset(
 
 
 def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: bool = True) -> str:
-    """Return why a trace runs only if somebody says so, empty if it may.
+    """Return why replaying a trace needs ``trust``, or "". Nothing is run to find out.
 
-    ``named``: the job's folder has been named by whoever runs it. Nothing is run to find out.
-    ``bags``: those of the job will play.
+    ``named``: the user has named the job's folder. ``bags``: the job's bags will play.
     """
     name = job_name(trace)
     if not named and folder.resolve() != Path.cwd():
@@ -202,7 +201,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
 
 
 def _own_job(file: Path, *, bags: bool) -> Job | None:
-    """Return the job of a job file or launch file, None if that takes running a program."""
+    """Return the job of a job or launch file, None if that needs running a program."""
     if file.name.endswith(_LAUNCH):
         spec = json.dumps({"file": file.name, "arguments": {}})
         job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
@@ -240,7 +239,7 @@ Position = int | str
 
 @dataclass(frozen=True, slots=True)
 class EnvironmentChange:
-    """A version, or a setting of the process, that is another one than when a trace was made."""
+    """A version or setting of the process that differs from the recording."""
 
     name: str
     recorded: str
@@ -249,9 +248,9 @@ class EnvironmentChange:
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """A replay that could begin. ``distrust`` says why somebody has to agree, if so.
+    """A replay that is ready to start. ``distrust`` says why it needs ``trust``, or is "".
 
-    ``code`` is what would run, ``changes`` what else is not as it was. ``trace`` is open.
+    ``code`` is what would run, ``changes`` are differences of the environment. ``trace`` is open.
     """
 
     trace: Trace
@@ -273,13 +272,12 @@ def prepared(
     *,
     bags: bool = True,
 ) -> Iterator[Preparation]:
-    """Open a trace and see what replaying it takes. Runs nothing, imports nothing.
+    """Open a trace and find out what replaying it needs. Runs and imports nothing.
 
-    Without ``bags``, those of the job need not be there: they are not going to play.
+    Without ``bags``, those of the job need not exist. A given ``job`` replaces the trace's own, and
+    is trusted.
 
-    ``job`` stands in for the trace's own, which then has to be trusted by whoever gives it.
-
-    :raises TraceError, ReplayError: the trace is damaged, or something that it needs is not here.
+    :raises TraceError, ReplayError: the trace is damaged, or something it needs is missing.
     """
     if "://" in str(path):
         raise ReplayError(f"{path}: download a trace to replay it")
@@ -307,7 +305,7 @@ def prepared(
 
 
 def _changes(trace: Trace) -> Iterator[EnvironmentChange]:
-    """Yield what of the environment is not as recorded; libraries are known once they are there."""
+    """Yield the differences of environment, as far as known before libraries are loaded."""
     recorded, present = trace.environment, environment()
     for name in sorted({*recorded, *present} - {"numerics", "ros_distro", "addresses"}):
         if recorded.get(name) != present.get(name):
@@ -322,9 +320,9 @@ def _notes(trace: Trace) -> Iterator[str]:
 
 
 def count_to(trace: Trace, position: Position) -> int:
-    """Return how many events there are up to a position, that event (or time) included.
+    """Return the number of events up to and including a position.
 
-    :raises ReplayError: if it is no position, or before the first event.
+    :raises ReplayError: it is not a position, or before the first event.
     """
     from rsltrace.job.values.times import parse_time_in_run
 

@@ -1,4 +1,4 @@
-"""Running a trace's job again and checking every event on the way."""
+"""Run a trace's job again and check every event."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def replay_prepared(
 
 @contextmanager
 def place_for(output: Path | None) -> Iterator[Path]:
-    """Give a place for the replay's trace: what is not asked for is gone afterwards."""
+    """Yield the path for the replay's trace: ``output``, or a temporary file."""
     if output is not None:
         yield output
         return
@@ -126,14 +126,14 @@ def _run(
 
 
 def _diverged(trace: Trace, verification: EventVerification) -> bool:
-    """Say whether a run that is over did something else, or ended where the trace goes on."""
+    """Whether a finished run did something else, or ended before the trace does."""
     if verification.diverged:
         return True
     return not verification.has_cut_short and verification.verified < trace.event_count
 
 
 def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
-    """Return the diff of the trace and the replay, which ends with the event that differs."""
+    """Return the diff of the trace and the replay, which ends at the first differing event."""
     with Trace.open(place) as replayed:
         found = diff_traces(trace, replayed, DiffOptions(context=_CONTEXT, window=1))
     name = str(place) if kept else THE_REPLAY
@@ -159,7 +159,7 @@ def _branch(
     place: Path,
     kept: Path | None,
 ) -> ReplayResult:
-    """Compare a branch with the run that it branches off."""
+    """Compare a branch with the trace it branches from."""
     trace = plan.trace
     with Trace.open(place) as branch:
         found = diff_traces(trace, branch, DiffOptions(context=_CONTEXT))

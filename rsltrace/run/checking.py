@@ -1,4 +1,4 @@
-"""What a job is, found out without running it: nodes are constructed, the loop never runs."""
+"""Check a job without running it: nodes are constructed, the loop never runs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_eve
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A job that could run: when it starts (simulated ns), its graph, and notes on its bags."""
+    """A job that could run: its start time (ns), graph and notes."""
 
     job: Job
     start_ns: int
@@ -39,12 +39,12 @@ class Checked:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What looks wrong."""
         return (*self.overview.problems, *self.unused)
 
 
 def check_job(job: Job, *, everything: bool = False) -> Checked:
-    """Construct a job's nodes and return their graph; ``everything`` with what every node has.
+    """Construct a job's nodes and return their graph (``everything``: with each node's default
+    topics).
 
     :raises JobError, SetupError, BagError: the job cannot run.
     :raises RunError: a constructor raised.
@@ -103,7 +103,7 @@ def _divisions_by_nothing(job: Job) -> Iterator[str]:
 
 
 def _played_and_published(found: Overview) -> Iterator[str]:
-    """Yield what a bag plays although a node makes it anew: its readers would get both."""
+    """Yield the topics that both a bag and a node publish."""
     for link in found.of_kind("topic"):
         nodes = list(dict.fromkeys(end.node for end in link.senders))
         others = [node for node in nodes if node != f"/{PLAYER}"]

@@ -1,8 +1,7 @@
-"""Driving a run from outside: how far the loop may go, and standing still between two steps.
+"""Drive a run from outside: say how far the loop may go, and stop it between two steps.
 
-The loop asks its gate between time steps. The gate hands control to the driver's stack where the
-driver wants it, and the run must not notice: a run that is driven and otherwise left alone does
-the same, event by event, as one that is recorded at once.
+The loop asks its gate between time steps. The gate switches to the driver's stack when the driver
+wants control. The run must not notice: it is the same, event by event, as one recorded at once.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class _ActiveCode(Enum):
 
 
 def next_step_ns(loop: EventLoop, next_ns: int | None) -> int | None:
-    """Return when the next time step of a loop is, at whose gate ``next_ns`` is due next."""
+    """Return the time of the loop's next step; ``next_ns`` is what its gate was given."""
     if next_ns is not None and loop.min_step_ns and next_ns > loop.now_ns:
         return loop.stepped(next_ns, quiet_until_ns(loop.stop_conditions))
     return next_ns
@@ -65,7 +64,7 @@ class Driver:
     def begin(self) -> None:
         """Construct the nodes and jump to the start.
 
-        :raises RunError: what went wrong.
+        :raises RunError: that failed.
         """
         self.session.begin()
         self.outside.enter()
@@ -73,11 +72,10 @@ class Driver:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over."""
         return self.session.ended
 
     def position(self) -> tuple[int, int]:
-        """Return how far the run is: events and time. Unchanged: nothing is left to happen."""
+        """Return (events, time). If it has not changed, nothing is left to happen."""
         return self.loop.events, self.loop.now_ns
 
     def go(
@@ -89,10 +87,10 @@ class Driver:
     ) -> None:
         """Let the loop run ``steps`` time steps (None: any number), none after ``until_ns``.
 
-        With ``until_ns``, time stands still there afterwards. Unless ``to_the_end``, the loop also
-        stops where nothing is left to happen.
+        With ``until_ns``, time then stands there. Unless ``to_the_end``, the loop also stops when
+        nothing is left to happen.
 
-        :raises RunError: what went wrong in the run.
+        :raises RunError: the run failed.
         """
         self.check_driver()
         if self.ended:
@@ -113,10 +111,10 @@ class Driver:
             self.leave()
 
     def leave(self) -> None:
-        """Go back from the outside to the run.
+        """Return control to the run.
 
-        Where time stood still between two steps and nothing was done there, the clock is put back
-        to the last step.
+        If time stood between two steps and nothing was done there, the clock is set back to the
+        last step.
         """
         self.outside.leave()
         if self._held is not None:
@@ -126,7 +124,7 @@ class Driver:
             self._held = None
 
     def _activity(self) -> tuple[int, int, int]:
-        """Return what changes when somebody outside does something."""
+        """Return values that change when the driver does something."""
         loop = self.loop
         return loop.events, len(loop.ready), len(loop.tasks)
 
@@ -163,11 +161,10 @@ class Driver:
     # -- who listens -------------------------------------------------------------------------------
 
     def tell_later(self, callback: Callable[[Any], object], message: Any) -> None:
-        """Have ``callback(message)`` called at the end of the present time step."""
         self._news.append((callback, message))
 
     def _tell(self) -> bool:
-        """Call who listens; return whether the loop has to go on from where it was stopped."""
+        """Call the listeners; return whether the loop has to continue."""
         news, self._news = self._news, []
         self._who = _ActiveCode.LISTENER
         try:
@@ -180,13 +177,13 @@ class Driver:
     # -- checks ------------------------------------------------------------------------------------
 
     def check_driver(self) -> None:
-        """Raise RunError unless the present code may move time."""
+        """Raise RunError unless the calling code may move time."""
         self.check_outside()
         if self._who is _ActiveCode.LISTENER:
             raise RunError("a callback of subscribe cannot move time; it may publish")
 
     def check_outside(self) -> None:
-        """Raise RunError if the present code is a node's, or that of another thread."""
+        """Raise RunError if a node, or another thread, calls."""
         if threading.get_ident() != self.session.world.stacks.runners.thread:
             raise RunError("a simulation is driven by the thread that has entered it")
         if self._who is _ActiveCode.RUN:

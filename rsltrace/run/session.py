@@ -1,7 +1,7 @@
 """One run of a job in stages: open, begin, go on, finish.
 
-The one way to run a job: ``record`` goes through the stages at once, ``Simulation`` lets somebody
-outside say how far to go.
+This is the one way to run a job: ``record`` goes through the stages at once, ``Simulation`` lets a
+driver decide how far to go.
 """
 
 from __future__ import annotations
@@ -160,10 +160,8 @@ class Session:
         writer: TraceWriter | None = None,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        """``writer`` takes what is recorded where there is no ``output``, and stays open: who gives
-        it looks after the run, too, so that nobody else watches for callbacks that hang.
-        ``metadata`` is written into the trace besides what a run writes.
-        """
+        """``writer`` records the run without an ``output``, and stays open; its owner also watches
+        for callbacks that hang. ``metadata`` is added to the trace."""
         self.job = job
         self._metadata = metadata or {}
         self._replay = replay
@@ -194,13 +192,12 @@ class Session:
         return self._has_begun
 
     def inner_pairs(self) -> list[tuple[int, int]]:
-        """Return the pipes and pairs of sockets that nodes have made, and keep both ends of."""
+        """Return the pipes and socket pairs of which nodes hold both ends."""
         guard = self._guarded.guard
         return [] if guard is None else guard.descriptors.inner_pairs()
 
     def changes_process(self, pid: int, pairs: Sequence[tuple[int, int]]) -> None:
-        """Take note that the run goes on in a copy of its process, which has these ``pairs`` of
-        descriptors anew."""
+        """Continue in a copy of the process, which has new ``pairs`` of descriptors."""
         self.world.stacks.runners.process = pid
         guard = self._guarded.guard
         if guard is not None:
@@ -255,7 +252,7 @@ class Session:
             stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
-        """Open the bags, from which the run may have its start and its end."""
+        """Open the bags, which may set the start and the end of the run."""
         job = self.job
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
@@ -268,7 +265,7 @@ class Session:
                 self._observer.note(note)
 
     def _make_world(self, stack: ExitStack, kind: type[World]) -> None:
-        """Make the loop and the world that the job describes, still without nodes."""
+        """Make the loop and the world of the job, without nodes."""
         job = self.job
         self.loop = loop = self._kind_of_loop()(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
@@ -300,7 +297,7 @@ class Session:
         return OrderedLoop if is_ordered(self.job) else EventLoop
 
     def _order_events(self, stack: ExitStack) -> None:
-        """Say what runs when, if the job does, and for how long."""
+        """Set the scheduling policy, executors and execution times of the job."""
         loop = self.loop
         self._recorded = follow_recording(self.job, self.world.domain, stack)
         if isinstance(loop, OrderedLoop):
@@ -311,7 +308,7 @@ class Session:
                 self.world.switch_at_lines(loop, node_packages(self.job.nodes))
 
     def _import_what_is_named(self) -> None:
-        """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
+        """Import stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
         self.loop.stop_conditions = tuple(
             stop_conditions(job, self.start_ns, world.domain.dispatcher.outside_events)
@@ -324,7 +321,7 @@ class Session:
             ]
 
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
-        """Create the file, and write down what is known before the run."""
+        """Create the file, and write what is known before the run."""
         job = self.job
         for place in (path, unfinished(path)):
             check_output(job, place, self._replay)
@@ -360,7 +357,7 @@ class Session:
         return payload_filter(self.job)
 
     def _interrupt(self, stop: Stop) -> None:
-        """End the run after the present event, or within it if it does not come back.
+        """End the run after the current event, or within it if it does not return.
 
         :raises KeyboardInterrupt: in the second case, on the stack of the event.
         """
@@ -370,27 +367,25 @@ class Session:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over, for whatever reason."""
         return self.stop is not None or self.loop.stopped is not None
 
     @property
     def place(self) -> Path | None:
-        """Where the trace is being written, None if there is none."""
+        """Where the trace is being written, or None."""
         return None if self._writer is None else self._writer.place
 
     @property
     def error(self) -> RunError | None:
-        """What went wrong in the run, if anything did."""
         return self.world.error
 
     @property
     def digest(self) -> str:
-        """The digest so far, empty for a run that records nothing."""
+        """The digest so far, "" if nothing is recorded."""
         recorder = self.world.domain.dispatcher.recorder
         return "" if recorder is None else recorder.digest
 
     def begin(self) -> None:
-        """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
+        """Construct the nodes and jump to the start. Failures are in ``error``."""
         if self.job.stop.topic is not None:
             from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 
@@ -425,7 +420,7 @@ class Session:
                 self.world.starts.begin(self.start_ns)
 
     def go_on(self) -> None:
-        """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
+        """Run the loop until it ends or its gate pauses it. Failures are in ``error``."""
         with self._failures(), self._engaged():
             self.world.go_on()
         failed, self.world.starts.failed = self.world.starts.failed, None
@@ -448,9 +443,9 @@ class Session:
             self.stop = Stop(str(error).splitlines()[0], failed.exit_code)
 
     def becomes(self, job: Job) -> None:
-        """Go on as the run of another job, which is like this one's but for what is yet to come:
-        its policy, and faults beside those of this one's. ``why_not`` of ``rsltrace.run.branching``
-        says if that can be.
+        """Continue as the run of another job that differs only in what is still to come: its
+        policy, and additional faults. ``why_not`` of ``rsltrace.run.branching`` says if that is
+        possible.
 
         :raises JobError: its policy cannot be made.
         """
@@ -468,7 +463,7 @@ class Session:
         self._faults = arm_node_faults(job, self.world, self.start_ns)
 
     def settle(self, path: Path) -> None:
-        """Have what the ``writer`` has been given so far, and all to come, in a trace.
+        """Write what the ``writer`` was given so far, and all that follows, to a trace file.
 
         :raises OutputError: the trace cannot be written.
         """
@@ -480,7 +475,7 @@ class Session:
         self._writer = self._stack.enter_context(writer)
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
-        """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
+        """Return the parts of the job without effect so far; ``lasted``: the run is over."""
         from rsltrace.adapters.rclpy.parameters import parameters_of
 
         domain = self.world.domain
@@ -501,10 +496,10 @@ class Session:
         return (*rules, *parameter_notes, *starts, *faults)
 
     def finish(self, *, cut_short: bool = False) -> RunResult:
-        """Destroy the nodes, close the trace, and say how it went. Of a run that somebody has
-        ``cut_short`` nobody knows what in its job would have had nothing to do.
+        """Destroy the nodes, close the trace, and return the result. A run that was ``cut_short``
+        gets no notes on unused parts of its job.
 
-        :raises OutputError: if the rest of the trace cannot be written.
+        :raises OutputError: the rest of the trace cannot be written.
         """
         loop, outcome = self.loop, self.world.domain.outcome
         stop = self.stop or loop.stopped
@@ -556,7 +551,7 @@ class Session:
         return stop.exit_code or self.world.exit_code or self._processes.exit_code
 
     def _order_of_starts(self) -> dict[str, str]:
-        """Return what a trace keeps of the order of its constructions where it is not the job's."""
+        """Return the order of constructions, where it is not the job's."""
         in_order = all(one.start_after is None and one.respawn is None for one in self._entries)
         if in_order and not any(fault.restart for fault in self.job.faults):
             return {}
@@ -567,18 +562,17 @@ class Session:
         return {"entries": ",".join(places)}
 
     def _late_numerics(self) -> dict[str, str]:
-        """Return which kernels numerical libraries chose that the run has imported itself."""
+        """Return the kernels of numerical libraries that the run imported itself."""
         late = "" if self._numerics_known else self._late.find()
         return {"numerics": late} if late else {}
 
 
 def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
-    """Return what a trace keeps of a deadlock, and of who waited until the end: nothing else in it
-    tells who waits for what."""
+    """Return the texts of a deadlock and of calls that still waited at the end, for the trace."""
     told = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
     return told | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
 
 
 def _without_folders(text: str) -> str:
-    """Return a text without the paths of the machine that a trace was made on."""
+    """Return a text without the folders of this machine."""
     return shortened(_FOLDER.sub("", text), _WAITS_MAX)

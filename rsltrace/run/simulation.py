@@ -40,22 +40,18 @@ class TopicTap:
 
     @property
     def latest(self) -> Any:
-        """The newest message, or None."""
         return self.messages[-1][1] if self.messages else None
 
     def take(self) -> Any:
-        """Remove and return the oldest message, or return None."""
         return self.messages.popleft()[1] if self.messages else None
 
     def __iter__(self) -> Iterator[Any]:
-        """Iterate over the messages, oldest first."""
         return iter([message for _, message in self.messages])
 
     def __len__(self) -> int:
         return len(self.messages)
 
     def add(self, stamp_ns: int, message: Any) -> None:
-        """Take note of a message."""
         self.count += 1
         self.messages.append((stamp_ns, message))
 
@@ -186,7 +182,6 @@ class Simulation:
     def stop(
         self, reason: str = "stopped by the driver of the simulation", exit_code: int = 0
     ) -> None:
-        """End the run."""
         if not self.done:
             self._driver.loop.stop(Stop(reason, exit_code))
 
@@ -194,7 +189,6 @@ class Simulation:
 
     @property
     def now_ns(self) -> int:
-        """Simulated time."""
         return self._driver.loop.now_ns
 
     @property
@@ -402,7 +396,6 @@ class Simulation:
         return tap
 
     def unsubscribe(self, tap: TopicTap) -> None:
-        """Stop listening."""
         taps = self._taps.get(tap.topic, [])
         if tap in taps:
             taps.remove(tap)

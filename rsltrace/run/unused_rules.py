@@ -1,7 +1,8 @@
-"""Rules of a job that had nothing to do: they name a topic, service or node that never was.
+"""Notes on rules of a job that had no effect: they name a topic, service or node that never
+existed; and on messages that full queues dropped.
 
-ROS ignores what fits nothing, and so does a run; whoever wrote the rule wants to know. Names that
-nodes create later than a run lasts are not seen, so these are notes, no errors.
+ROS ignores such rules, and so does a run. Names that nodes create after the end of a run are not
+seen, so these are notes, not errors.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ the full one (else 0)."""
 
 
 def queue_drops(counts: Counts) -> list[Drop]:
-    """Return what full queues dropped, in the order of the entities."""
+    """Return the drops of full queues, ordered by entity."""
     found = [
         Drop(receiver.entity_id, held or receiver.keep or 0, count, in_outage=held > 0)
         for (receiver, held), count in counts.items()
@@ -41,7 +42,7 @@ def queue_drops(counts: Counts) -> list[Drop]:
 
 
 def drop_notes(counts: Counts) -> list[str]:
-    """Name the queues that dropped most, in one note."""
+    """Return one note that names the queues that dropped most."""
     most = sorted(counts.items(), key=lambda item: (-item[1], item[0][0].entity_id))
     if not most:
         return []
@@ -67,15 +68,13 @@ _ELSEWHERE = "/rsltrace/elsewhere"
 
 
 def has_remappings(job: Job) -> bool:
-    """Say whether a job has remappings that might remap nothing."""
     return bool(job.ros_arguments) or any(spec.remappings for spec in job.nodes)
 
 
 def unused_remappings(job: Job, census: NameRegistry) -> Iterator[str]:
-    """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do.
+    """Yield the remappings of ``nodes`` and ``ros_arguments`` without effect.
 
-    What several nodes are given alike (``<set_remap>`` of a launch file, an anchor of YAML) has
-    something to do if one of them uses it.
+    A remapping given to several nodes (``<set_remap>``, a YAML anchor) is used if one node uses it.
     """
     everybody: list[Asker] = []
     given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
@@ -98,7 +97,7 @@ def unused_remappings(job: Job, census: NameRegistry) -> Iterator[str]:
 
 
 def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
-    """Yield (index, name to be replaced) of the remappings among ROS arguments."""
+    """Yield (index, replaced name) of the remappings among ROS arguments."""
     for index, word in enumerate(words[1:], start=1):
         if words[index - 1] in ("-r", "--remap"):
             yield index, word.partition(":=")[0]
@@ -117,7 +116,7 @@ def _is_used(old: str, askers: Iterable[Asker], census: NameRegistry) -> bool:
 
 
 def _forms(name: str, asker: Asker) -> list[str]:
-    """Return how a rule may name what is called ``name`` in full."""
+    """Return the names by which a rule may refer to the full name ``name``."""
     folder = asker.namespace.rstrip("/") + "/"
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
@@ -133,7 +132,6 @@ def _remapping_note(old: str, askers: list[Asker], census: NameRegistry) -> str:
 
 
 def has_rules(job: Job) -> bool:
-    """Say whether a job has rules that might fit nothing."""
     parts = (job.delay, job.execution, job.executors, job.policy, job.stop.topic)
     return bool(
         any(part is not None for part in parts)
@@ -147,7 +145,7 @@ def has_rules(job: Job) -> bool:
 def unused_rules(
     job: Job, census: NameRegistry, plan: NetworkPlan | None, lasted_ns: int | None = None
 ) -> Iterator[str]:
-    """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
+    """Yield the names in a job's rules that did not exist; ``lasted_ns`` is the run's duration."""
     topics = [*census.topics, *QUIET_TOPICS]
     nodes = list(census.nodes)
     for place, glob, names, what in _single(job, topics, list(census.services), nodes):
@@ -181,10 +179,11 @@ def unused_rules(
 
 
 def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -> Iterator[str]:
-    """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared.
+    """Yield the parameters of an entry that none of its nodes has declared.
 
-    What a launch file gives several nodes alike (``<set_parameter>``) is meant for who has it.
-    Until the run has ``lasted``, an unconfigured node is passed over: it may still declare them.
+    A parameter that a launch file gives to several nodes (``<set_parameter>``) need only be
+    declared by one. Until the run has ``lasted``, unconfigured nodes are skipped: they may still
+    declare it.
     """
     entries = []
     used_alike: set[tuple[str, str]] = set()
@@ -220,9 +219,9 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -
 def unused_ros_parameters(
     job: Job, census: NameRegistry, nodes: dict[str, Parameters], *, lasted: bool
 ) -> Iterator[str]:
-    """Yield the parameters among ``ros_arguments`` that no node which gets them has declared.
+    """Yield the parameters among ``ros_arguments`` that no receiving node has declared.
 
-    Unconfigured nodes are passed over as ``unused_parameters`` does it.
+    Unconfigured nodes are skipped as in ``unused_parameters``.
     """
     words = job.ros_arguments
     for index, word in enumerate(words[1:], start=1):
@@ -249,7 +248,7 @@ def unused_ros_parameters(
 def _single(
     job: Job, topics: list[str], services: list[str], nodes: list[str]
 ) -> Iterator[tuple[Loc, str, list[str], str]]:
-    """Yield (place, glob, what it may fit, what that is) of the rules with one name."""
+    """Yield (place, glob, candidates, kind) of the rules with one name."""
     if job.delay is not None:
         for glob in job.delay.topics:
             yield ("delay", "topics", glob), glob, topics, "topic"
@@ -279,8 +278,8 @@ def _single(
 
 
 def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
-    """Yield (place, glob) of what the trace keeps. A glob that begins with ``*``, or stands in a
-    file that several jobs share, is a habit: about whatever there may be, here or elsewhere."""
+    """Yield (place, glob) of what the trace keeps, except globs that begin with ``*`` or stand in a
+    shared file: they are meant for other jobs, too."""
     for key, globs in (("topics", job.record.topics), ("exclude", job.record.exclude)):
         for index, glob in enumerate(globs):
             loc: Loc = ("record", key, index)
@@ -309,7 +308,7 @@ def _links(job: Job, census: NameRegistry) -> Iterator[str]:
 
 
 def _entities(job: Job, census: NameRegistry) -> Iterator[str]:
-    """Yield the rules for entities of nodes, in ``execution`` and ``policy``."""
+    """Yield the unmatched rules for entities, in ``execution`` and ``policy``."""
     rules: list[tuple[Loc, str, str, str | None]] = []
     if job.execution is not None:
         for index, spec in enumerate(job.execution.entities):
@@ -332,7 +331,7 @@ def _entities(job: Job, census: NameRegistry) -> Iterator[str]:
 
 
 def _hidden(job: Job, nodes: list[str]) -> Iterator[str]:
-    """Yield the clocks and executors whose nodes all have an earlier entry."""
+    """Yield the clocks and executors whose nodes all match an earlier entry."""
     clocks = [(("clocks", i), (spec.node,)) for i, spec in enumerate(job.clocks)]
     executors = [(("executors", i), spec.nodes) for i, spec in enumerate(job.executors or ())]
     for entries in (clocks, executors):

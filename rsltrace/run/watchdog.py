@@ -1,12 +1,11 @@
-"""A word about a callback that does not come back: which one, and at which line it is.
+"""Warn about a callback that does not return: which one, and at which line it is.
 
-Simulated time stands still while a callback runs, so one that loops forever would hang a run in
-silence. A thread looks every two seconds of real time whether anything has happened.
+Simulated time stands still during a callback, so an endless one would hang a run in silence. A
+thread looks every two seconds of real time whether anything has happened.
 
-It must leave no mark. So it takes no part in the run, touches nothing but numbers as long as all
-is well, and keeps no object of the run alive from one look to the next: where the memory of an
-object lies decides the order of some sets. It counts its looks instead of asking a clock, so a
-process that was stopped, or a machine that slept, raises no alarm.
+It must not influence the run. So it touches nothing but numbers as long as all is well, and keeps
+no object of the run alive between looks: addresses decide the order of some sets. It counts its
+looks instead of reading a clock, so a suspended process or machine causes no alarm.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", 
 
 
 class Watchdog:
-    """Looks after one run, from a thread of its own between ``start`` and ``stop``."""
+    """Watches one run, from a thread of its own."""
 
     def __init__(self, domain: Domain, thread: int) -> None:
         self._domain = domain
@@ -54,7 +53,6 @@ class Watchdog:
 
     @contextmanager
     def on_duty(self) -> Iterator[None]:
-        """Have the thread within the ``with`` block."""
         ready = allocate_lock()
         for lock in (self._stopping, self._ended, ready):
             lock.acquire()
@@ -69,7 +67,7 @@ class Watchdog:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Expect something to happen within the ``with`` block: the run is going on."""
+        """Expect events within the ``with`` block."""
         self._running = True
         try:
             yield
@@ -97,7 +95,7 @@ class Watchdog:
         self._ended.release()
 
     def _tell(self, for_s: int) -> bool:
-        """Say where the run is; return whether there was anything to say."""
+        """Report where the run is; return whether there was anything to report."""
         domain = self._domain
         frames = list(_frames(sys._current_frames().get(self._thread)))
         if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
@@ -120,12 +118,10 @@ class Watchdog:
 
 
 def _say(text: str) -> None:
-    """Print a note as the command does."""
     tell(f"rsltrace: note: {text}")
 
 
 def _frames(frame: FrameType | None) -> Iterator[FrameType]:
-    """Yield the frames of a stack, innermost first."""
     while frame is not None:
         yield frame
         frame = frame.f_back
@@ -136,7 +132,7 @@ def _is_execute(frame: FrameType) -> bool:
 
 
 def _process_asked(frames: Iterable[FrameType]) -> str:
-    """Name the process that the run waits for; "" if it waits for none."""
+    """Name the process that the run waits for, or ""."""
     door = sys.modules.get("rsltrace.adapters.processes.process")  # not loaded: there is none
     if door is None:
         return ""

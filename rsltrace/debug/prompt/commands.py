@@ -57,13 +57,10 @@ class PromptCommand:
 
     @property
     def name(self) -> str:
-        """Its own name."""
         return self.names[0]
 
 
 class PromptCommands:
-    """The commands there are."""
-
     def __init__(self) -> None:
         self.all: list[PromptCommand] = []
         self._by_name: dict[str, PromptCommand] = {}
@@ -71,7 +68,7 @@ class PromptCommands:
     def add(
         self, *names: str, topic: str, usage: str = "", repeats: bool = False
     ) -> Callable[[Run], Run]:
-        """Make a function a command, whose help is the function's docstring."""
+        """Make a function a command; its docstring is the help."""
 
         def added(run: Run) -> Run:
             command = PromptCommand(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
@@ -83,9 +80,9 @@ class PromptCommands:
         return added
 
     def find(self, word: str) -> PromptCommand:
-        """Return the command that is meant: by a name, or by the beginning of one.
+        """Return the command of a name, or of the unique beginning of one.
 
-        :raises DebugError: it could be several, or none.
+        :raises DebugError: none or several match.
         """
         found = self._by_name.get(word)
         if found is not None:

@@ -31,7 +31,7 @@ Completer = Callable[[str], Sequence[str]]
 
 
 class LineReader:
-    """Gives ``first`` lines, then those of stdin. ``is_script``: nobody sits at a terminal."""
+    """Reads ``first``, then stdin. ``is_script``: stdin is not a terminal."""
 
     def __init__(self, first: Sequence[str], complete: Completer) -> None:
         self._first = list(first)
@@ -41,7 +41,6 @@ class LineReader:
 
     @property
     def from_terminal(self) -> bool:
-        """Whether the last line was typed."""
         return self._from_terminal
 
     def read(self, prompt: str) -> str | None:
@@ -70,7 +69,7 @@ class LineReader:
 
 @contextmanager
 def _readline(complete: Completer) -> Iterator[None]:
-    """Let lines be edited, found again and completed, where Python has readline."""
+    """Enable editing, history and completion, where Python has readline."""
     try:
         import readline
     except ImportError:
@@ -101,7 +100,7 @@ _HEADS = "node topic entity output exception log finding watch when t=".split()
 
 
 def completions(text: str, shell: PromptContext) -> list[str]:
-    """Return what the last word of ``text`` could become."""
+    """Return the completions of the last word of ``text``."""
     words = text.lstrip().split(" ")
     last = words[-1]
     if len(words) == 1:
@@ -158,15 +157,12 @@ EXIT_DIVERGED = 1
 
 
 class Shell:
-    """A conversation about one session.
-
-    ``diverged`` says whether the run has once done something else than its trace says.
-    """
+    """The prompt of one session. ``diverged``: the run once differed from its trace."""
 
     def __init__(
         self, session: DebugSession, first: Sequence[str] = (), names: Names | None = None
     ) -> None:
-        """``first`` are commands before those of stdin, ``names`` those of the trace, if any."""
+        """``first`` are commands to run before those of stdin; ``names`` are the trace's."""
         self.session = session
         self.diverged = False
         self.is_over = False
@@ -175,10 +171,8 @@ class Shell:
         self._last = ""
 
     def run(self) -> int:
-        """Carry out commands until there are no more; return the exit status.
-
-        In a script, a command that cannot be carried out ends it: the next ones count on it.
-        """
+        """Run commands until the end of input; return the exit status. A script ends at the first
+        command that fails."""
         self.show([show.position_line(self.session.position)])
         while not self.is_over:
             try:
@@ -197,9 +191,9 @@ class Shell:
         return EXIT_DIVERGED if self.diverged else 0
 
     def carry_out(self, line: str) -> None:
-        """Do what a line says.
+        """Run one command line.
 
-        :raises RsltraceError: it cannot be done.
+        :raises RsltraceError: it failed.
         """
         text = line.strip()
         if not text and self._lines.from_terminal:
@@ -219,28 +213,23 @@ class Shell:
     # -- for commands ------------------------------------------------------------------------------
 
     def show(self, lines: Iterable[str]) -> None:
-        """Print lines."""
         for line in lines:
             say(line)
 
     def stopped(self, stopped: Stopped) -> None:
-        """Print where and why the run has stopped."""
         self.diverged = self.diverged or stopped.reason == "diverged"
         self.show(show.stopped_lines(stopped))
 
     def read(self, prompt: str) -> str | None:
-        """Return the next line, for somebody else; None if there are no more."""
         return self._lines.read(prompt)
 
     def node_here(self) -> str | None:
-        """Return the node whose event is about to run, or has just ended."""
         position = self.session.position
         event = position.next if position.is_next else position.event
         name = (event or {}).get("node")
         return str(name) if name else None
 
     def names(self) -> Names:
-        """Return the names there are, as far as they are known."""
         if self._names is not None:
             return self._names
         graph: dict[str, Any] = self.session.inspect("graph")
@@ -253,7 +242,7 @@ class Shell:
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C stop the run under way, after its present event, and not the session."""
+        """Let Ctrl-C pause the run, after its current event, instead of ending the session."""
 
         def interrupt(number: int, frame: object) -> None:
             self.session.pause()

@@ -1,9 +1,8 @@
-"""One node fed from a recording of the real robot: the topics that it subscribes to play to it.
+"""Run one node with the inputs from a recording of the real robot.
 
-The run is one of a job with one entry and the bag, so its trace is an ordinary one. What the node
-puts out is compared with what the robot recorded on the same topics. A robot takes time for what
-takes none here, so messages are matched by the stamp in their header; those without one by their
-order.
+The run is that of a job with one entry and the bag, so its trace is an ordinary one. Its outputs
+are compared with what the robot recorded on the same topics. A robot takes time where a simulation
+takes none, so messages are matched by their header stamps, or else by their order.
 """
 
 from __future__ import annotations
@@ -41,8 +40,7 @@ from rsltrace.trace.recordings.playback import header_stamp_ns
 
 @dataclass(frozen=True, slots=True)
 class NodeTopics:
-    """The entry of a job (its place in ``nodes:``) that makes a node, and the node's topics with
-    their types."""
+    """The topics of a node with their types, and its entry in ``nodes:``."""
 
     node: str
     entry: int
@@ -51,12 +49,12 @@ class NodeTopics:
 
 
 class _NodeProbe(Session):
-    """Constructs the entries of a job one by one, until one has made the node."""
+    """Constructs the entries of a job one by one until one has made the node."""
 
     def find(self, node: str) -> NodeTopics:
-        """Return what there is to know of the node.
+        """Return the node's topics.
 
-        :raises RunError: what went wrong in a constructor.
+        :raises RunError: a constructor failed.
         """
         world, graph = self.world, self.world.domain.graph
         hooks = int(self.job.hooks.before is not None)
@@ -82,7 +80,7 @@ class _NodeProbe(Session):
 
 
 def node_topics(job: Job, node: str) -> NodeTopics:
-    """Construct the nodes of a job until ``node`` is there; return its topics.
+    """Construct the nodes of a job until ``node`` exists; return its topics.
 
     :raises ReplayError: no entry of the job makes it.
     :raises JobError, SetupError, RunError: its code cannot be loaded, or fails.
@@ -107,7 +105,7 @@ _NOT_OF_ROBOTS: dict[str, object] = {
 
 
 class BagOutputs(NodeOutputs):
-    """What a bag has on the topics of a node, decoded by what a trace says of their types."""
+    """The messages of a bag on a node's topics, decoded with the types of a trace."""
 
     def __init__(self, trace: Trace) -> None:
         super().__init__(trace, [])
@@ -132,11 +130,11 @@ def replay_from_bag(
     echo: bool = False,
     observer: Observer | None = None,
 ) -> NodeReplayResult:
-    """Run one node of a job with what bags have of its topics; compare what it puts out.
+    """Run one node of a job with inputs from bags; compare its outputs.
 
-    :raises ReplayError: the job makes no such node, or the bags have nothing for it.
+    :raises ReplayError: the job makes no such node, or the bags have no input for it.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
-    :raises RunError: what went wrong in the node.
+    :raises RunError: the node failed.
     """
     alone = job.model_copy(update=_NOT_OF_ROBOTS)
     ends = node_topics(alone, node)
@@ -175,9 +173,9 @@ def replay_from_bag(
 
 
 def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
-    """Yield the bags with the topics of which the node hears.
+    """Yield the bags with the topics that the node subscribes to.
 
-    :raises ReplayError: there are none, or of another type.
+    :raises ReplayError: there are none, or they have another type.
     """
     names: list[str] = []
     met = False
@@ -204,12 +202,12 @@ def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
 
 
 def _compared(ends: NodeTopics) -> list[str]:
-    """Return the topics that only the node itself can have filled, as far as one can tell."""
+    """Return the topics that probably only the node itself publishes."""
     return [t for t in ends.published if t not in (*_OF_ALL_NODES, *ends.subscribed)]
 
 
 def _sides(trace: Trace, ends: NodeTopics, bags: Sequence[Path]) -> tuple[NodeOutputs, BagOutputs]:
-    """Return what the node has put out, and what was recorded on these topics."""
+    """Return the node's outputs, and the recorded ones on these topics."""
     recorded = BagOutputs(trace)
     headers: dict[str, bool] = {}
     for path in bags:
@@ -248,7 +246,7 @@ def _read(path: Path, topics: list[str], side: BagOutputs, headers: dict[str, bo
 
 
 def _at(key: Key, data: bytes, headers: dict[str, bool], counts: dict[Key, int]) -> int:
-    """Return the stamp of a message's header, or its number where it has none."""
+    """Return the stamp of a message's header, or else its number."""
     if headers[key[1]]:
         return header_stamp_ns(data)
     counts[key] = counts.get(key, -1) + 1

@@ -1,7 +1,7 @@
-"""What a node has put out in two recordings, side by side.
+"""Compare the outputs of a node in two recordings.
 
-Outputs are compared topic by topic (or service, or the log): those of one simulated time in their
-order. Where one has more than the other, something is missing or new.
+Outputs are compared topic by topic (or service, or the log), those of one simulated time in order.
+Where one recording has more than the other, an output is missing or new.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ Key = tuple[OutputKind, str]
 
 @dataclass(frozen=True, slots=True)
 class NodeOutput:
-    """An output of a node: when, where to, its place among all outputs of the node.
+    """An output of a node: time, topic, and its place among all outputs of the node.
 
-    Outputs of two sides that are ``at`` the same stand for each other, those of one side in order.
+    Outputs of two recordings with the same ``at`` are compared, in order.
     """
 
     stamp_ns: int
@@ -60,7 +60,7 @@ class NodeOutputs:
         self.trace, self.puts = trace, puts
 
     def decoded(self, put: NodeOutput) -> object | None:
-        """Return what was put out, None if it was not kept or cannot be decoded."""
+        """Return the decoded output, None if it was not kept or cannot be decoded."""
         trace, output = self.trace, put.output
         if output.kind is OutputKind.EXCEPTION:
             return trace.detail(output)
@@ -74,7 +74,7 @@ class NodeOutputs:
 
 
 def outputs_of_node(trace: Trace, node: str) -> list[NodeOutput]:
-    """Return what a node has published, called, answered, logged and raised, in its order."""
+    """Return all that a node published, called, answered, logged and raised, in order."""
     entities = trace.entities
     named = [one for one in entities.values() if one.name == node]
     nodes = {one.id for one in named if one.kind is EntityKind.NODE}
@@ -103,7 +103,7 @@ def outputs_of_node(trace: Trace, node: str) -> list[NodeOutput]:
 def output_changes(
     recorded: NodeOutputs, present: NodeOutputs, options: DiffOptions
 ) -> Iterator[OutputChange]:
-    """Yield what has changed, in the order of its time."""
+    """Yield the outputs that differ, by time."""
     for before, after in _pairs(recorded.puts, present.puts):
         if before is not None and after is not None:
             if before.output.hash == after.output.hash:
@@ -146,7 +146,7 @@ def _event(put: NodeOutput | None) -> int | None:
 def _pairs(
     recorded: Sequence[NodeOutput], present: Sequence[NodeOutput]
 ) -> list[tuple[NodeOutput | None, NodeOutput | None]]:
-    """Return outputs that stand for each other, in order."""
+    """Pair the outputs of two recordings, in order."""
     waiting: dict[tuple[Key, int], list[NodeOutput]] = {}
     for put in present:
         waiting.setdefault((put.key, put.at), []).append(put)
@@ -193,7 +193,7 @@ _SENT = frozenset(
 
 
 class OutputWatch(EventObserver):
-    """Compares the outputs of ``node`` with ``recorded`` ones, and ends the run with ``stop``."""
+    """Ends the run with ``stop`` at the first output of ``node`` that differs from ``recorded``."""
 
     order = ObserverOrder.OUTPUTS
 
@@ -211,29 +211,25 @@ class OutputWatch(EventObserver):
         self._loop: EventLoop
 
     def attach(self, session: Session) -> None:
-        """Compare what comes from now on."""
         self._loop = session.loop
         session.world.domain.dispatcher.add_observer(self)
 
     def entity_created(self, entity: Entity) -> None:
-        """Remember the node and what belongs to it."""
         if entity.node == entity.id and entity.name == self._node:
             self._nodes.add(entity.id)
         if entity.node in self._nodes:
             self._own[entity.id] = entity.name
 
     def output(self, kind: int, entity: int, content_hash: int) -> None:
-        """Keep what is sent until the event is over."""
         if kind in _SENT:
             self._sent.append((kind, entity, content_hash))
 
     def after_event(self) -> None:
-        """End the run if the outputs of the event were not as recorded."""
         if not self._as_recorded(self._loop.now_ns):
             self._loop.stop(self._stop)
 
     def _as_recorded(self, now_ns: int) -> bool:
-        """Return whether what an event has sent was recorded, and nothing is missing until now."""
+        """Whether the event's outputs were recorded, and none is missing until now."""
         sent, self._sent = self._sent, []
         for kind, entity, content_hash in sent:
             name = TOPIC_ROSOUT if kind == OutputKind.LOG else self._own.get(entity)

@@ -53,7 +53,7 @@ _BEGIN = (EventKind.SERVICE, EventKind.ACTION)
 
 
 class ServiceAnswers:
-    """The requests of the unit's clients that others have taken, until they are answered."""
+    """The requests of the node's clients until they are answered."""
 
     def __init__(self, columns: RecordingColumns, is_own: Callable[[Column], Column]) -> None:
         events, outputs = columns.events, columns.outputs
@@ -91,8 +91,8 @@ class ServiceAnswers:
                 self._untaken.setdefault(client, []).append(number)
 
     def of(self, event: int, position: int, service: int) -> tuple[int, int] | None:
-        """Return the client (of the recording) that a response goes to, and which of its requests
-        it answers; None if it goes to somebody else. Responses are asked for in their order."""
+        """Return (recorded client, number of its request) that a response answers; None if it is
+        for another node. Responses must be asked for in order."""
         waiting = self._open.get(service, [])
         for place, (begun, client, number) in enumerate(waiting):
             if begun == event:
@@ -110,15 +110,15 @@ class ServiceAnswers:
         return (asked_by, numbers.pop(0)) if numbers else None
 
     def _drawn_for(self, event: int, position: int) -> int:
-        """Return for whom chance decided when a response arrives, or that it does not."""
+        """Return the client of the draw that follows a response, or -1."""
         rows = self._columns.outputs_of(event)[position + 1 : position + 2]
         drawn = len(rows) and rows["kind"][0] == OutputKind.DRAW
         return int(rows["entity"][0]) if drawn else -1
 
 
 class NodeReplaySession(Session):
-    """Runs ``unit`` alone. The stages are those of ``Session``; bags, stop conditions, policy and
-    executors of the job are none of its business: the recording has what came of them."""
+    """A session that runs one entry. The recording replaces the job's bags, stop conditions, policy
+    and executors."""
 
     loop: RecordedInputLoop
 
@@ -204,15 +204,14 @@ class NodeReplaySession(Session):
 
     @property
     def fed(self) -> int:
-        """How many messages, requests and responses of others there have been."""
+        """How many recorded messages, requests and responses the node has received."""
         return self._stand_ins.fed
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
-        """Return nothing: rules for other nodes have nothing to do here."""
         return ()
 
     def begin(self) -> None:
-        """Construct the unit among the others, and jump to the start."""
+        """Construct the entry at its recorded place, and jump to the start."""
         world, unit = self.world, self._unit
         entries = dict(zip(unit.entries, self._entries, strict=True))
         last = 0
@@ -238,7 +237,7 @@ class NodeReplaySession(Session):
                 self._has_begun = not self.ended
 
     def _starts_later(self, place: int) -> bool:
-        """Whether an entry (its place among hooks and nodes) has started after the run had."""
+        """Whether an entry (its place among hooks and nodes) starts after the run does."""
         index = place - int(self.job.hooks.before is not None)
         nodes = self.job.nodes
         return 0 <= index < len(nodes) and nodes[index].start_after is not None
@@ -282,7 +281,7 @@ class NodeReplaySession(Session):
         return read
 
     def _client(self, recorded: int) -> Client | None:
-        """Return the client of the unit that stands for a recorded one, if it is there."""
+        """Return the client that corresponds to a recorded one, if it exists."""
         present = self.script.present(recorded)
         clients = self.world.domain.graph.clients(self._trace.entity(recorded).name)
         return next((one for one in clients if one.entity_id == present), None)
@@ -295,7 +294,7 @@ class NodeReplaySession(Session):
 
 
 class _Progress(EventObserver):
-    """Tells a script of the unit's entities and events."""
+    """Reports the node's entities and events to the script."""
 
     order = ObserverOrder.SCRIPT
 
@@ -305,20 +304,17 @@ class _Progress(EventObserver):
         self._names: dict[int, str] = {0: ""}
 
     def entity_created(self, entity: Entity) -> None:
-        """Tell of an entity and the name of its node."""
         if entity.node == entity.id:
             self._names[entity.id] = entity.name
         self._script.met(entity, self._names.get(entity.node, ""))
 
     def after_event(self) -> None:
-        """Tell of an event that is not done for others."""
         event = self._dispatcher.event
         if event.kind != EventKind.BAG:
             self._script.happened(event.kind, event.entity, self._dispatcher.loop.now_ns)
 
 
 def run_node(session: NodeReplaySession, watch: OutputWatch | None = None) -> RunResult:
-    """Run a session to its end."""
     with session:
         if watch is not None:
             watch.attach(session)
@@ -342,9 +338,9 @@ def replay_node(
     echo: bool = False,
     observer: Observer | None = None,
 ) -> NodeReplayResult:
-    """Run one node of a trace alone, fed with what it got; compare what it puts out.
+    """Run one node of a trace alone with its recorded inputs; compare its outputs.
 
-    :raises ReplayError: there is no such node, or the trace does not hold what it got.
+    :raises ReplayError: there is no such node, or the trace lacks its inputs.
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
     trace = plan.trace
@@ -403,7 +399,7 @@ def replay_node(
 
 
 def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
-    """Return, for each construction in a trace, which entry of the job it was that of."""
+    """Return the job entry of each construction in a trace."""
     told = trace.metadata(METADATA_FED).get("entries") or trace.result.get("entries", "")
     some = [int(one) for one in told.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))

@@ -46,23 +46,22 @@ class RecordingColumns:
 
     @cached_property
     def created_in(self) -> dict[int, int]:
-        """By entity, the event that created it."""
+        """The event that created each entity."""
         rows = self.outputs[self.outputs["kind"] == OutputKind.ENTITY]
         return dict(zip(rows["entity"].tolist(), rows["event"].tolist(), strict=True))
 
     @cached_property
     def constructions(self) -> list[int]:
-        """The events that constructed the entries of the job, and the player of its bags."""
+        """The construction events of the job's entries and of its bag player."""
         found: list[int] = np.flatnonzero(self.events["kind"] == EventKind.CONSTRUCT).tolist()
         return found
 
     def outputs_of(self, event: int) -> Column:
-        """Return the outputs of an event."""
         rows: Column = self.outputs[self.first_output[event] : self.first_output[event + 1]]
         return rows
 
     def payload(self, event: int, position: int) -> bytes | None:
-        """Return what an output has sent, None if it was not kept."""
+        """Return the message of an output, None if it was not kept."""
         found = self.trace.payload(self.trace.outputs_of(event)[position])
         return None if found is None else found[2]
 
@@ -96,14 +95,13 @@ class OutputChange:
 
 @dataclass(frozen=True, slots=True)
 class NodeReplayResult:
-    """How a node did, alone, with the inputs of a recording.
+    """The outputs of a node that was replayed alone.
 
-    ``trace`` (a path) is the recording, ``node`` the node's full name; ``inputs`` is how many
-    messages, requests and responses of others were fed. ``compared`` is how many outputs the
-    recording has of it (until ``end_ns``, if the replay ended before); ``changes`` are those that
-    are not the same now, in the order of time, the first one first. ``ended`` says why the replay
-    ended. ``path`` is the replay's own trace, None if none was asked for. ``error`` is what went
-    wrong in the node. ``notes`` are texts for people.
+    ``trace`` (a path) is the recording, ``node`` the full name; ``inputs`` is how many recorded
+    messages, requests and responses it received. ``compared`` is how many recorded outputs were
+    compared (until ``end_ns``); ``changes`` are those that differ, by time. ``ended`` says why the
+    replay ended. ``path`` is the replay's own trace or None. ``error`` is the node's failure,
+    ``notes`` are texts for people.
     """
 
     trace: str

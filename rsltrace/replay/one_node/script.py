@@ -1,4 +1,4 @@
-"""The script of a fed run: what of a recording the nodes that run notice, in its order."""
+"""The recorded events that matter to the node that is replayed, in order."""
 
 from __future__ import annotations
 
@@ -77,12 +77,11 @@ class ReplayedEntry:
 
     @property
     def others(self) -> tuple[str, ...]:
-        """The nodes that run with it, because the same entry makes them."""
         return tuple(name for name in self.nodes if name != self.node.name)
 
     @cached_property
     def own_events(self) -> Column:
-        """For each event, whether it happens by itself when the unit runs."""
+        """For each event, whether the replayed entry causes it itself."""
         events = self.columns.events
         own = np.isin(events["entity"], self._ids)
         for index in np.flatnonzero(events["entity"] == 0).tolist():
@@ -93,25 +92,23 @@ class ReplayedEntry:
         return found
 
     def is_own(self, entities: Column) -> Column:
-        """Return which of some entities are the unit's."""
         found: Column = np.isin(entities, self._ids)
         return found
 
     def done_by_others(self) -> int:
-        """Return how many outputs of the node came about in events that are not the unit's."""
+        """Return how many outputs of the node were made in events of others."""
         outputs, entities = self.columns.outputs, self.columns.trace.entities
         ids = [one for one in self.entities if entities[one].node == self.node.id]
         sent = np.isin(outputs["entity"], ids) & np.isin(outputs["kind"], SENT)
         return int((~self.own_events[outputs["event"][sent]]).sum())
 
     def entry_of(self, place: int) -> int:
-        """Return which entry the construction at ``place`` among those of the trace was that of."""
+        """Return the job entry of the construction at ``place`` in the trace."""
         return self._ordinals[place] if place < len(self._ordinals) else place
 
     # -- who made what ---------------------------------------------------------------------------
 
     def _entry_of_entity(self, entity_id: int) -> int:
-        """Return the entry that made an entity, -1 if none did."""
         entity = self.columns.trace.entities[entity_id]
         if entity.node not in (0, entity_id):
             entity_id = entity.node
@@ -149,8 +146,7 @@ class ReplayedEntry:
         return found
 
     def _only_suspended(self, index: int) -> int:
-        """Return the entry whose constructor has waited until event ``index``, if it is the only
-        one that could have."""
+        """Return the only entry whose constructor waited until event ``index``, else -1."""
         waiting = [
             place
             for place, event in enumerate(self.columns.constructions)
@@ -164,9 +160,9 @@ class ReplayedEntry:
 
 
 def find_node(columns: RecordingColumns, name: str) -> Entity:
-    """Return the node of a name, with or without the slash before it.
+    """Return a node by name, with or without its leading slash.
 
-    :raises ReplayError: if the recording has none; it names those that there are.
+    :raises ReplayError: the recording has none; the message names the nodes.
     """
     trace = columns.trace
     nodes = [one for one in trace.entities.values() if one.kind is EntityKind.NODE]
@@ -224,7 +220,6 @@ class RecordedScript:
 
     @cached_property
     def _events_of(self) -> dict[int, deque[int]]:
-        """The events of each entity of the unit."""
         found: dict[int, deque[int]] = {}
         own = np.flatnonzero(self._own)
         for index, entity in zip(
@@ -237,7 +232,6 @@ class RecordedScript:
 
     @property
     def next(self) -> RecordedStep | None:
-        """The first step that is not done, None after the last."""
         waiting = self._waiting
         while waiting and waiting[0].done:
             waiting.popleft()
@@ -249,11 +243,9 @@ class RecordedScript:
         return step_or_none
 
     def entity(self, entity: int) -> int:
-        """Return the recorded entity that one of the run stands for, -1 if none."""
         return self._entities.get(entity, -1)
 
     def following(self, entity: int) -> int:
-        """Return the index of the next event of a recorded entity, NEVER if none is to come."""
         first = self.next
         events = self._events_of.get(entity)
         if first is None or not events:
@@ -265,11 +257,11 @@ class RecordedScript:
     # -- for the run -----------------------------------------------------------------------------
 
     def present(self, entity: int) -> int:
-        """Return the entity of the run that stands for a recorded one, -1 if there is none."""
+        """Return the entity of this run for a recorded one, or -1."""
         return self._present.get(entity, -1)
 
     def met(self, entity: Entity, node: str) -> None:
-        """Take note of an entity that the run has made."""
+        """Match a new entity with a recorded one."""
         key = (node, entity.kind, entity.name)
         recorded = self._recorded.get((key, self._counts[key]))
         self._counts[key] += 1
@@ -278,7 +270,7 @@ class RecordedScript:
             self._present[recorded] = entity.id
 
     def happened(self, kind: int, entity: int, now_ns: int) -> None:
-        """Take note of an event of the unit: it is the next one, or a later one of this time."""
+        """Mark the step of an event as done: the next one, or a later one of this time."""
         recorded = self.entity(entity)
         first = self.next
         if first is None:
@@ -300,7 +292,7 @@ class RecordedScript:
                 return
 
     def perform_until(self, event: int) -> None:
-        """Do what others did before an event."""
+        """Do what other nodes did before an event."""
         while (step := self.next) is not None and step.index < event:
             step.done = True
             if step.perform is not None:
@@ -356,9 +348,9 @@ def _key(entity: Entity, entities: dict[int, Entity]) -> Key:
 
 
 def check_payloads(columns: RecordingColumns, unit: ReplayedEntry) -> None:
-    """See that the trace has what the unit's nodes have got.
+    """Check that the trace has the node's input messages.
 
-    :raises ReplayError: saying what it does not have, and how to record it.
+    :raises ReplayError: saying which are missing, and how to record them.
     """
     entities = columns.trace.entities
     outputs = columns.outputs

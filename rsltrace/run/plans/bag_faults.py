@@ -1,6 +1,6 @@
-"""Single messages that bags play otherwise than they were recorded: changed, swapped, stale.
+"""Faults of single messages that bags play: changed, swapped or repeated.
 
-It happens before a message is published, so all that follows, the trace included, has that one.
+They apply before a message is published, so the trace has the faulty message.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ _FLOAT_MAX = {"f": 3.4028234663852886e38, "d": 1.7976931348623157e308}
 
 
 class UnfitError(ValueError):
-    """A field that is not there, or cannot have such a value; says why."""
+    """A field that does not exist or cannot have the value."""
 
 
 def changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
-    """Return what changes a message (canonical CDR) as a fault says. It raises UnfitError for one
-    whose array has no such item.
+    """Return the function that changes a message (canonical CDR) as a fault says. It raises
+    UnfitError for a message whose array lacks the item.
 
-    :raises UnfitError: the class has no such field, or that cannot have such a value.
+    :raises UnfitError: the class has no such field, or the value does not fit.
     """
     assert spec.field is not None
     steps = field_steps(spec.field)
@@ -60,7 +60,7 @@ def changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
 
 
 def _type_at(spec: Message, steps: tuple[Step, ...]) -> FieldType:
-    """Return of what type the field is that steps lead to."""
+    """Return the type of the field at a path."""
     kind: FieldType = spec
     before = ""
     for name, place in steps:
@@ -82,7 +82,7 @@ def _type_at(spec: Message, steps: tuple[Step, ...]) -> FieldType:
 
 
 def _change_of(spec: FaultSpec, kind: FieldType) -> Callable[[Any], Any]:
-    """Return what gives the new value of a field from the old one."""
+    """Return the function from a field's old value to its new one."""
     name = str(spec.field)
     if isinstance(kind, (Array, Sequence)):
         return _change_of_array(spec, kind, name)
@@ -140,7 +140,7 @@ def _is_character(item: Item) -> bool:
 
 
 def _limits(item: Primitive) -> tuple[float, float]:
-    """Return the least and the greatest number of a type; finite ones."""
+    """Return the least and the greatest finite number of a type."""
     if item.code in "fd":
         return -_FLOAT_MAX[item.code], _FLOAT_MAX[item.code]
     bits = 8 * item.size
@@ -149,9 +149,9 @@ def _limits(item: Primitive) -> tuple[float, float]:
 
 
 def _fitting(item: Primitive | Text, value: Any, name: str) -> Any:
-    """Return a value as the field has it.
+    """Return a value converted to the field's type.
 
-    :raises UnfitError: it cannot.
+    :raises UnfitError: it does not fit.
     """
     if isinstance(item, Text):
         if not isinstance(value, str):
@@ -175,8 +175,8 @@ def _fitting(item: Primitive | Text, value: Any, name: str) -> Any:
 
 
 def _moved(item: Primitive, old: Any, scale: float, offset: float) -> Any:
-    """Return a number, scaled and shifted; what is beyond a type's limits is infinite, or of
-    integers the limit."""
+    """Return a scaled and shifted number. Beyond the limits, floats become infinite and integers
+    are clamped."""
     least, most = _limits(item)
     if item.code in "fd":
         moved = old * scale + offset
@@ -189,7 +189,6 @@ def _moved(item: Primitive, old: Any, scale: float, offset: float) -> Any:
 
 
 def _change(owner: Any, steps: tuple[Step, ...], new: Callable[[Any], Any]) -> None:
-    """Change the field that steps lead to."""
     (name, place), *rest = steps
     held = getattr(owner, name)
     if place is None:
@@ -212,7 +211,7 @@ def _change(owner: Any, steps: tuple[Step, ...], new: Callable[[Any], Any]) -> N
 
 
 def check_changes(job: Job, topic: str, message_class: type) -> None:
-    """Raise BagError if what a fault says cannot become of messages of a class on a topic."""
+    """Raise BagError if a fault's change does not fit a topic's message class."""
     for index, spec in enumerate(job.faults):
         if spec.change == topic:
             try:
@@ -222,7 +221,7 @@ def check_changes(job: Job, topic: str, message_class: type) -> None:
 
 
 class BagFaults:
-    """The faults of one run that are about what bags play. ``is_open``: there may be some later."""
+    """The faults of what bags play in one run. ``is_open``: more may be added later."""
 
     def __init__(self, job: Job, *, is_open: bool = False) -> None:
         self._by_number: dict[tuple[str, int], list[_BagFault]] = {}
@@ -234,7 +233,7 @@ class BagFaults:
         self.add(job, 0)
 
     def add(self, job: Job, first: int) -> None:
-        """Have those of a job from its ``first`` fault on."""
+        """Add the faults of a job from number ``first`` on."""
         for index, spec in enumerate(job.faults[first:], start=first):
             if spec.of_bag:
                 assert spec.message is not None
@@ -243,7 +242,7 @@ class BagFaults:
                 self._by_number.setdefault((spec.name, spec.message), []).append(fault)
 
     def missed(self) -> Iterator[tuple[str, str]]:
-        """Yield the place in the job of each fault that has not come to pass, and why."""
+        """Yield (place in the job, reason) of each fault that did not happen."""
         for fault in self._all:
             reached, spec = self.reached[fault.spec.name], fault.spec
             if fault.missed:
@@ -253,7 +252,7 @@ class BagFaults:
                 yield fault.where, f"bags played {reached} {times} on {spec.name}"
 
     def played(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
-        """Yield messages as they are to be published."""
+        """Yield messages with the faults applied."""
         return self._played(messages) if self._all or self._is_open else messages
 
     def _played(self, messages: Iterator[BagMessage]) -> Iterator[BagMessage]:
@@ -282,7 +281,7 @@ class BagFaults:
         ahead: deque[BagMessage],
         rest: Iterator[BagMessage],
     ) -> bytes:
-        """Put the content of a message where its publisher's next one is, return that one's."""
+        """Swap a message's content with that of its publisher's next one; return the latter."""
         _, publisher, data = message
         place = 0
         while True:
@@ -308,7 +307,7 @@ class _BagFault:
         self.missed = ""
 
     def changed(self, publisher: BagPublisher, data: bytes) -> bytes:
-        """Return a message with another value, or as it is if it has no such item."""
+        """Return the changed message, or the same one if it lacks the item."""
         try:
             return changer(class_of(publisher), self.spec)(publisher.canonical(data))
         except UnfitError as error:

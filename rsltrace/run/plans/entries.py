@@ -31,7 +31,7 @@ from rsltrace.trace.model.texts import format_duration
 
 
 def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None) -> Iterator[str]:
-    """Yield the entries that will never start, as far as the graph of all entries tells.
+    """Yield the entries that can never start, judging by the complete graph.
 
     ``end_ns`` is when the run ends, if time ends it.
     """
@@ -66,7 +66,7 @@ def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None)
 
 
 def missed_starts(job: Job, missed: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
-    """Yield the entries (keys) that have not started in a run, and what they waited for."""
+    """Yield the entries (keys) that have not started, and what they waited for."""
     keys = entry_keys(job.nodes)
     for key, unmet in missed:
         index = keys.index(key)
@@ -82,7 +82,7 @@ def missed_starts(job: Job, missed: Iterable[tuple[str, list[str]]]) -> Iterator
 
 
 def _of_container(spec: NodeSpec, name: str) -> str:
-    """Return what a component waits for without saying so."""
+    """Return what a component implicitly waits for."""
     assert spec.container is not None
     return load_service(spec.container) if name == "service" else "the component before it"
 
@@ -104,9 +104,9 @@ _LINE_MAX = 4000
 
 
 def terminal_input(job: Job, index: int) -> list[Typed] | None:
-    """Return what is typed at the terminal of an entry, None if it has none.
+    """Return the input for the terminal of an entry, None if it has none.
 
-    :raises JobError: if a file cannot be read or has lines that no terminal takes.
+    :raises JobError: a file cannot be read, or a line is too long.
     """
     stdin = job.nodes[index].stdin
     if stdin is None:
@@ -154,10 +154,10 @@ def node_entries(
     only: Container[int] | None = None,
     told: Callable[[str], None] = lambda text: None,
 ) -> list[Entry]:
-    """Import what the job names and let rcl parse the arguments, before anything is constructed.
+    """Import what the job names and let rcl parse the arguments; nothing is constructed.
 
-    ``only`` are the places in ``nodes:`` of those that are wanted (None: all); ``told`` is given
-    a line if something takes long.
+    ``only`` are the wanted places in ``nodes:`` (None: all); ``told`` is called with a line when
+    something takes long.
     """
     entries = []
     mains = MainFinder(job)
@@ -214,9 +214,9 @@ def _never() -> object:
 
 
 def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) -> Component:
-    """Return what a container is asked to load.
+    """Return the component that a container loads.
 
-    :raises JobError: if the service by which that is done is not known here.
+    :raises JobError: the service that loads components is not installed.
     """
     check_loadable(where)
     assert spec.component is not None
@@ -235,7 +235,7 @@ def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) ->
 
 
 def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
-    """Return when an entry starts, None if it does so with the run."""
+    """Return when an entry starts, None if it starts with the run."""
     spec = job.nodes[index]
     after = spec.start_after
 
@@ -259,8 +259,7 @@ def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
 
 
 def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
-    """Return the place of the component that the same container loads before, None if there is
-    none that is to start when this one is."""
+    """Return the place of the component that the same container loads before this one, or None."""
     spec = nodes[index]
     for place in range(index - 1, -1, -1):
         other = nodes[place]
@@ -272,7 +271,7 @@ def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
 def arguments_of(job: Job, index: int, for_all: list[str], *, where: str) -> list[RosArguments]:
     """Return the ROS arguments of an entry; ``for_all`` are those of all nodes.
 
-    :raises JobError: if rcl refuses them, or cannot read a parameter file.
+    :raises JobError: rcl refuses them, or cannot read a parameter file.
     """
     _check_parameter_files(job, index)
     spec = job.nodes[index]
@@ -288,7 +287,7 @@ def arguments_of(job: Job, index: int, for_all: list[str], *, where: str) -> lis
 
 
 def _check_parameter_files(job: Job, index: int) -> None:
-    """Raise ``JobError`` at the line of a parameter file that rcl cannot read."""
+    """Raise ``JobError`` at a parameter file that rcl cannot read."""
     spec = job.nodes[index]
     for number, path in enumerate(spec.parameter_files):
         try:
@@ -302,7 +301,7 @@ def _check_parameter_files(job: Job, index: int) -> None:
 
 
 def _check_arguments(job: Job, index: int, target: Any) -> None:
-    """Raise ``JobError`` if a class or function does not take the ``arguments`` of its entry."""
+    """Raise ``JobError`` if a class or function does not accept its ``arguments``."""
     spec = job.nodes[index]
     assert isinstance(spec.arguments, dict)
     try:
@@ -333,7 +332,7 @@ def _error_with_line(job: Job, loc: Loc, message: str) -> JobError:
 
 
 def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Return a name for each entry that other entries (of other classes) do not change."""
+    """Return a key for each entry, stable when other entries are added."""
     met: Counter[tuple[str, str | None, str | None]] = Counter()
     keys = []
     for spec in nodes:
@@ -345,8 +344,8 @@ def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
 
 
 def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
-    """Add to the error of a constructor the line of the job at which the parameter stands that it
-    refused, or the node, if there are several that are made in the same way."""
+    """Add to a constructor's error the line of the job: that of the refused parameter, or of the
+    entry if several are made the same way."""
     if error is None:
         return
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
@@ -364,7 +363,7 @@ def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
 def hook_entries(
     job: Job, name: str, target: Target | None, argument: Callable[[], object]
 ) -> list[Entry]:
-    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
+    """Return a hook of the job, if it has it, as an entry. A hook may return more nodes."""
     if target is None:
         return []
     where = locate(job, ("hooks", name))
@@ -374,9 +373,9 @@ def hook_entries(
 
 
 def arguments_for_all(job: Job) -> list[str]:
-    """Return the ROS arguments of all nodes, the paths in them absolute.
+    """Return the ROS arguments of all nodes, with absolute paths.
 
-    :raises JobError: if rcl refuses them.
+    :raises JobError: rcl refuses them.
     """
     words = list(job.ros_arguments)
     for index, word in enumerate(words[:-1]):

@@ -1,8 +1,8 @@
-"""Finding what ``main:``, ``executable:``, ``script:`` and ``module:`` name: what runs it.
+"""Find what ``main:``, ``executable:``, ``script:`` and ``module:`` run.
 
-An executable is a console script of a Python distribution, or a Python script that a ROS package
-has installed (``lib/<package>/<executable>`` below a prefix of the ament index); or what a package
-that nobody has built would install as such. All run as they are, in this process.
+An executable is a console script of a Python distribution, a Python script that a ROS package
+installs (``lib/<package>/<executable>`` below a prefix of the ament index), or what an unbuilt
+package would install as such. All run unchanged in this process.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ from rsltrace.trace.model.regular_file import read_regular
 
 @dataclass(frozen=True)
 class MainProgram:
-    """Code to run as ``__main__``. ``folder`` is where Python looks for its modules first; ``spec``
-    is None for a script."""
+    """Code to run as ``__main__``. Python looks for its modules in ``folder`` first; ``spec`` is
+    None for a script."""
 
     path: Path
     code: CodeType
@@ -55,7 +55,7 @@ class MainProgram:
     spec: ModuleSpec | None = None
 
     def __call__(self) -> None:
-        """Run the program in the ``__main__`` of the main that runs."""
+        """Run the program as ``__main__``."""
         names = vars(sys.modules["__main__"])
         spec = self.spec
         names.update(
@@ -87,9 +87,9 @@ def script_program(path: Path, *, what: str = "", where: str) -> MainProgram:
 
 
 def module_program(name: str, folder: Path, *, where: str) -> MainProgram:
-    """Return a module to run as ``python -m name`` does in ``folder``; its packages are imported.
+    """Return a module to run as ``python -m name`` does in ``folder``; imports its packages.
 
-    :raises JobError: if there is no such module, or it is no Python source.
+    :raises JobError: there is no such module, or it is not Python source.
     """
     try:
         spec = run_as_main(name)
@@ -119,16 +119,16 @@ def module_program(name: str, folder: Path, *, where: str) -> MainProgram:
 
 
 class MainFinder:
-    """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
+    """Finds the mains of a job. Each has its package's globals to itself, as a process has."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._packages: set[str] = set()
 
     def find(self, spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
-        """Return what ``sys.argv[0]`` shall be, and the function to call.
+        """Return ``sys.argv[0]`` and the function to call.
 
-        :raises JobError: if there is no such thing, or it is not Python.
+        :raises JobError: it does not exist, or is not Python.
         """
         if spec.executable is not None:
             found = find_executable(spec.executable, where=where)
@@ -152,7 +152,7 @@ class MainFinder:
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
-        """Import a main's module, or leave that to its program if it uses rclpy's contexts."""
+        """Import a main's module now, or when its program starts if it uses rclpy's contexts."""
         package = re.split("[.:]", target)[0]
         again = package in self._packages
         before = set(sys.modules)
@@ -167,12 +167,11 @@ class MainFinder:
         return function
 
     def _without_process(self) -> AbstractContextManager[None]:
-        """Let rclpy be that of no process while a module is imported. In a native run it is the
-        process of the main already."""
+        """Import without a process of rclpy; in a native run it is the main's process."""
         return nullcontext() if boundary().is_free else before_its_process()
 
     def _copied(self, package: str) -> AbstractContextManager[None]:
-        """Let a package be imported once more if somebody else has it already."""
+        """Import a package again if another main has imported it."""
         again = package in self._packages
         self._packages.add(package)
         return _imported_again(package) if again else nullcontext()
@@ -182,12 +181,11 @@ class DeferredMain:
     """A main whose module is imported when it starts, in its own program."""
 
     def __init__(self, target: str, *, again: bool) -> None:
-        """``again``: another one has the module, too."""
+        """``again``: another main has imported the module, too."""
         self._target = target
         self._again = again
 
     def __call__(self) -> object:
-        """Import the module and call the function, as a console script does."""
         module, _, name = self._target.partition(":")
         package = module.partition(".")[0]
         again, self._again = self._again, True  # a program that is restarted imports it once more
@@ -198,7 +196,7 @@ class DeferredMain:
 
 @contextmanager
 def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
-    """Let a module see its own arguments when it is imported: ``def main(args=sys.argv):``."""
+    """Set ``sys.argv`` during an import: ``def main(args=sys.argv):``."""
     before = sys.argv
     sys.argv = [name, *spec.arguments]
     try:
@@ -209,7 +207,7 @@ def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
 
 @contextmanager
 def _imported_again(package: str) -> Iterator[None]:
-    """Import a package once more than it is: who has it already keeps what it has."""
+    """Import a package a second time; those that have it keep their copy."""
 
     def modules() -> dict[str, ModuleType]:
         return {
@@ -230,7 +228,7 @@ def _imported_again(package: str) -> Iterator[None]:
 
 
 def why_not(package: str, name: str) -> str | None:
-    """Return why an executable cannot run here, or None if it can; nothing is imported."""
+    """Return why an executable cannot run here, or None. Nothing is imported."""
     compiled = compiled_file(f"{package}/{name}")
     if compiled is not None:
         reason = why_not_run(compiled)
@@ -243,7 +241,7 @@ def why_not(package: str, name: str) -> str | None:
 
 
 def source_of(target: str, *, where: str) -> str | Path:
-    """Return where an executable's code is: ``module:function``, or a script.
+    """Return the code of an executable: ``module:function``, or a script.
 
     :raises JobError: as ``find_executable``.
     """
@@ -298,17 +296,17 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
 
 
 def compiled_file(target: str) -> Path | None:
-    """Return the file of ``package/name`` if that is a compiled program, else None."""
+    """Return the file of ``package/name`` if it is a compiled program, else None."""
     package, _, name = target.partition("/")
     path = None if name in _console_scripts(package) else _installed_files(package).get(name)
     return path if path is not None and is_compiled(path) else None
 
 
 def process_command(target: str, *, where: str) -> list[str]:
-    """Return what starts ``package/name`` as a process: a ROS package's file, or that of a console
-    script; where none is installed, the code that it would run.
+    """Return the command that starts ``package/name`` as a process: the installed file, or else the
+    code that it would run.
 
-    :raises JobError: if there is no such executable.
+    :raises JobError: there is no such executable.
     """
     package, _, name = target.partition("/")
     found: str | Path | None = _installed_files(package).get(name)
@@ -327,12 +325,12 @@ def process_command(target: str, *, where: str) -> list[str]:
 
 
 def _normalized(name: str) -> str:
-    """Return a distribution's name as package indexes compare it."""
+    """Return a distribution's name in the normalized form of package indexes."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _console_scripts(package: str) -> dict[str, str]:
-    """Return ``module:function`` by name of a distribution's console scripts."""
+    """Return ``module:function`` of a distribution's console scripts, by name."""
     found: dict[str, str] = {}
     from importlib import metadata
 
@@ -343,13 +341,13 @@ def _console_scripts(package: str) -> dict[str, str]:
 
 
 def _prefixes() -> list[Path]:
-    """Return where ROS packages are installed, as the ament index has it."""
+    """Return the prefixes in which ROS packages are installed."""
     listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [Path(folder) for folder in [*listed, sys.prefix] if folder]
 
 
 def _installed_files(package: str) -> dict[str, Path]:
-    """Return what a ROS package has in its ``lib`` folder to be run."""
+    """Return the executable files of a ROS package, by name."""
     found: dict[str, Path] = {}
     for prefix in _prefixes():
         folder = prefix / "lib" / package
@@ -362,7 +360,7 @@ def _installed_files(package: str) -> dict[str, Path]:
 
 
 def _packages() -> set[str]:
-    """Return the names of the packages there are."""
+    """Return the names of all installed packages."""
     from importlib import metadata
 
     names = {dist.name for dist in metadata.distributions() if dist.name}
@@ -374,7 +372,7 @@ def _packages() -> set[str]:
 
 
 def _did_you_mean_or(name: str, names: Iterable[str], word: str) -> str:
-    """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near, to go on from."""
+    """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near."""
     near = nearest(name, sorted(names))
     if near in (None, name):
         return f": {word}"

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 
 def arm_topic_faults(faults: Sequence[FaultSpec], world: World) -> None:
-    """Let single messages go wrong. Before the first node is made, or later where
-    ``FaultsOfAll`` have been there from the beginning."""
+    """Add faults of single messages: before the first node is made, or later where
+    ``AllTopicFaults`` were there from the start."""
     by_topic: dict[str, list[MessageFault]] = {}
     for spec in faults:
         if spec.of_message:
@@ -27,8 +27,8 @@ def arm_topic_faults(faults: Sequence[FaultSpec], world: World) -> None:
 
 
 def arm_node_faults(job: Job, world: World, start_ns: int) -> NodeFaults | None:
-    """Let nodes crash, hang or start again; None if the job has nothing of the kind. Before the
-    first one is made."""
+    """Let nodes crash, hang or restart; None if the job has no such faults. Must be called before
+    the first node is made."""
     if not any(spec.of_node for spec in job.faults):
         return None
     from rsltrace.adapters.rclpy.faults import NodeFault, NodeFaults
@@ -53,7 +53,7 @@ def arm_node_faults(job: Job, world: World, start_ns: int) -> NodeFaults | None:
 def missed_faults(
     job: Job, world: World, nodes: NodeFaults | None, bags: BagFaults | None
 ) -> Iterator[str]:
-    """Yield the faults that have not come to pass in a run that is over."""
+    """Yield the faults that did not happen in a finished run."""
     for index, spec in enumerate(job.faults):
         if spec.of_bag and bags is None:
             where = locate(job, ("faults", index))

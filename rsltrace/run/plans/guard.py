@@ -51,7 +51,7 @@ _ONE_PROCESSOR = "'taskset --cpu-list 0' before 'rsltrace record' gives it one p
 
 
 class _TorchGenerators(EventObserver):
-    """Gives each node's code the state of torch's generator that is the node's own."""
+    """Gives each node its own state of torch's random generator."""
 
     order = ObserverOrder.GENERATORS
 
@@ -61,13 +61,12 @@ class _TorchGenerators(EventObserver):
         self._name_of = name_of
 
     def before_event(self, call: EventCall) -> bool:
-        """Enter the node whose code is going to run."""
         self._event.handle, self._event.node = call.handle, call.node
         self._streams.enter(self._name_of())
         return True
 
     def node_entered(self, node: object, *, is_made: bool) -> None:
-        """Enter a node, or give the state of who makes one its name."""
+        """Enter a node, or rename its maker's state to it."""
         (self._streams.rename if is_made else self._streams.enter)(self._name_of())
 
 
@@ -84,7 +83,7 @@ class RunGuard:
         self._has_torch = False
 
     def begin(self, world: World, replay: Path | None = None) -> None:
-        """Make the guard of a world: from here on ``engaged`` puts it in charge."""
+        """Make the guard of a world; ``engaged`` activates it."""
         from rsltrace.adapters.rclpy.guard_context import GuardContext
 
         loop, dispatcher = world.domain.loop, world.domain.dispatcher
@@ -123,14 +122,14 @@ class RunGuard:
             self.torch_loaded()
 
     def _begin_log_time(self, now_ns: int) -> None:
-        """Let ``logging`` count the time of a record from the begin of the run."""
+        """Let ``logging`` count time from the start of the run."""
         module: Any = logging
         self._stack.callback(setattr, module, "_startTime", module._startTime)
         whole = isinstance(module._startTime, int)  # nanoseconds, from Python 3.13 on
         module._startTime = now_ns if whole else now_ns / 1e9
 
     def torch_loaded(self) -> None:
-        """Give each node a state of torch's generator from now on."""
+        """Give each node its own state of torch's generator from now on."""
         world, guard = self._world, self.guard
         if world is None or guard is None or self._has_torch:
             return
@@ -142,7 +141,7 @@ class RunGuard:
         streams.enter(guard.context.node())
 
     def stays_threaded(self, library: str, why: str) -> None:
-        """Report a library that computes in threads of its own, which cannot be pinned."""
+        """Report a library whose threads cannot be pinned."""
         if self.guard is None:
             self._unpinned.append((library, why))  # met before the run
             return
@@ -158,19 +157,18 @@ class RunGuard:
             guard.found(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
-        """Write down what was found before there was a trace: when modules were imported."""
+        """Record the findings of imports, from before the trace was open."""
         for finding in self._early:
             recorder.finding(finding, now_ns)
         self._early.clear()
 
     @property
     def counts(self) -> tuple[GuardCount, ...]:
-        """How often each call was met so far."""
         counts = self.guard.counts if self.guard is not None else {}
         return tuple(GuardCount(*key, count) for key, count in sorted(counts.items()))
 
     def write(self, writer: TraceWriter) -> None:
-        """Put the summary into the trace, if there is anything to say."""
+        """Write the summary into the trace."""
         summary = {}
         if self.counts:
             summary["calls"] = counts_text(self.counts)
@@ -182,12 +180,12 @@ class RunGuard:
             writer.add_metadata(METADATA_GUARD, summary)
 
     def engaged(self) -> AbstractContextManager[None]:
-        """Put the guard in charge of what this thread does now."""
+        """Let the guard apply to this thread."""
         return nullcontext() if self.guard is None else engage(self.guard)
 
 
 def install_guard(stack: ExitStack, job: Job) -> RunGuard:
-    """Put the replacements in place until ``stack`` ends."""
+    """Install the replacements until ``stack`` ends."""
     made = RunGuard(job, stack)
     if job.guard.enabled:
         if job.guard.pins:
@@ -213,7 +211,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
 
 
 def _orders_sets(job: Job) -> bool:
-    """Return whether sets are to be looked at anywhere: else all code is compiled as it is."""
+    """Whether the guard rewrites uses of sets; otherwise code is compiled unchanged."""
     policies = [policy_of(job.guard)]
     policies += [policy_of(job.guard, spec.guard) for spec in job.nodes if spec.guard is not None]
     modes = (policy.modes.get(Source.ORDER, Mode.VIRTUAL) for policy in policies)
@@ -221,5 +219,5 @@ def _orders_sets(job: Job) -> bool:
 
 
 def node_packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
-    """Return the packages that nodes are in: the user's, wherever they are."""
+    """Return the packages of the nodes: user code, wherever it is installed."""
     return frozenset(spec.package for spec in nodes) - {"", "rsltrace", "rclpy"}

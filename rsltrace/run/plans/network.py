@@ -37,7 +37,7 @@ from rsltrace.trace.model.texts import format_duration
 
 
 def clocks_of(job: Job) -> tuple[ClockRule, ...]:
-    """Return what is different about clocks, the first that fits first."""
+    """Return the rules for the nodes' clocks; the first match counts."""
     found = []
     for spec in job.clocks:
         random = spec.random_jumps
@@ -53,7 +53,7 @@ def clocks_of(job: Job) -> tuple[ClockRule, ...]:
 
 
 def clock_notes(job: Job, start_ns: int) -> Iterator[str]:
-    """Yield the clocks that would show times before 0 when they are set."""
+    """Yield the clocks that would show times before 0."""
     for index, spec in enumerate(job.clocks):
         wrong_ns = spec.offset_ns
         settings: list[tuple[Loc, int]] = [(("clocks", index, "offset"), start_ns + wrong_ns)]
@@ -72,9 +72,9 @@ def clock_notes(job: Job, start_ns: int) -> Iterator[str]:
 
 
 def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
-    """Return the plan of a job's delays, or None if it has none.
+    """Return the plan of a job's delays, or None.
 
-    :raises JobError: if a file of delays is wrong.
+    :raises JobError: a file of delays is wrong.
     """
     delay = job.delay
     if delay is None:
@@ -109,7 +109,6 @@ def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
 
 
 def link_model(job: Job, spec: DelaySpec) -> Model:
-    """Return the model that a job describes."""
     burst = spec.burst
     return Model(
         delay=distribution_of(job, spec) if spec.kinds() else None,
@@ -124,7 +123,7 @@ def link_model(job: Job, spec: DelaySpec) -> Model:
 
 
 def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
-    """Return the distribution that a job describes; files are read."""
+    """Return the distribution of a job's spec; reads files."""
     if spec.constant_ns is not None:
         return Constant(spec.constant_ns)
     if spec.uniform is not None:

@@ -1,4 +1,4 @@
-"""From ``policy: {recorded: …}`` to the order that a run follows, and what a run writes for it."""
+"""Follow the order of a recording (``policy: {recorded: …}``), and record what that needs."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ ATTACHMENT_POLLS = "rsltrace/polls"
 def follow_recording(
     job: Job, domain: Domain, stack: ExitStack
 ) -> RecordedOrderObserver | NativeOrderObserver | None:
-    """Have a run follow the order of a recording, if the job says so; it stays open as long as
-    ``stack``. That of a native run is followed where it can be.
+    """Let a run follow the order of a recording, if the job says so; the recording stays open as
+    long as ``stack``. The order of a native run is followed where possible.
 
-    :raises JobError: if the recording cannot be read, or has nothing to follow.
+    :raises JobError: the recording cannot be read, or has no events.
     """
     from rsltrace.simulation.middleware.events.recorded_order_observer import (
         NativeOrderObserver,
@@ -105,13 +105,13 @@ def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
 
 
 def remember_choices(loop: EventLoop) -> None:
-    """Have a loop remember what its policy chooses; what comes first needs no remembering."""
+    """Let a loop remember its policy's choices; FIFO needs none."""
     if isinstance(loop, OrderedLoop) and not isinstance(loop.policy, Fifo):
         loop.choices = PolicyChoices()
 
 
 def write_choices(writer: TraceWriter, loop: EventLoop) -> None:
-    """Write down what a policy has chosen, if it had a choice."""
+    """Write a policy's choices into the trace."""
     if isinstance(loop, OrderedLoop) and loop.choices:
         data = loop.choices.encoded()
         writer.add_attachment(ATTACHMENT_CHOICES, "application/octet-stream", data)
@@ -122,7 +122,7 @@ def write_choices(writer: TraceWriter, loop: EventLoop) -> None:
 
 
 def _polls_from_ns(trace: Trace) -> int | None:
-    """Return from when on the recording's executors polled, None if they did not."""
+    """Return from when on the recorded executors polled, or None."""
     data = trace.attachment(ATTACHMENT_POLLS)
     if data is not None:
         return int(data)
@@ -132,9 +132,9 @@ def _polls_from_ns(trace: Trace) -> int | None:
 
 
 def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:
-    """Return what chooses as the recording's policy did, None if nobody knows.
+    """Return the function that repeats the choices of the recording's policy, or None.
 
-    A recording that was cut off has no choices; its policy, made again, makes the same ones.
+    An incomplete recording has no choices; its policy, made again, makes the same ones.
     """
     data = trace.attachment(ATTACHMENT_CHOICES)
     if data is not None:
@@ -165,7 +165,7 @@ def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
 
 
 class _EventCursor:
-    """The events of a recording up to its end, read once, from the first to the last."""
+    """Reads the events of a recording once, in order."""
 
     def __init__(self, trace: Trace) -> None:
         self._following = _events(trace)
@@ -173,7 +173,7 @@ class _EventCursor:
         self._present: RecordedEvent | None = None
 
     def event(self, index: int) -> RecordedEvent | None:
-        """Return the event of an index, which is no less than that of the call before."""
+        """Return the event of an index, which must not decrease from call to call."""
         while self._next <= index:
             self._present = next(self._following, None)
             self._next += 1

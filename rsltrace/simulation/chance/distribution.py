@@ -1,8 +1,7 @@
-"""What a delay or an execution time may be: frozen values that describe, and samplers that draw.
+"""Distributions of delays and execution times: frozen descriptions, and samplers that draw.
 
-All parameters are nanoseconds unless said otherwise. ``sampler`` binds a description to a stream
-and to the start of the run; what it returns is called with the present time and gives nanoseconds,
-never negative.
+Parameters are nanoseconds unless stated. ``sampler`` binds a description to a random stream and the
+start of the run; it is called with the current time and returns nanoseconds, never negative.
 """
 
 from __future__ import annotations
@@ -176,7 +175,6 @@ class Lognormal:
 
     @classmethod
     def of_moments(cls, mean_ns: float, sd_ns: float) -> Lognormal:
-        """Return the one with this mean and standard deviation."""
         square = (sd_ns / mean_ns) * (sd_ns / mean_ns)
         spread = 1.0 + square
         if square < 1e-12:  # of which the sum keeps too little: log(1 + x) is x there
@@ -203,7 +201,6 @@ class Gamma:
 
     @classmethod
     def of_moments(cls, mean_ns: float, sd_ns: float) -> Gamma:
-        """Return the one with this mean and standard deviation."""
         ratio = mean_ns / sd_ns
         return cls(ratio * ratio, sd_ns / ratio)
 

@@ -32,7 +32,7 @@ _EXP_TERMS = tuple(1.0 / k for k in range(16, 0, -1))
 
 
 def log(x: float) -> float:
-    """Return the natural logarithm of ``x > 0``, by the series of the inverse tanh."""
+    """Return the natural logarithm of ``x > 0``, by the series of atanh."""
     fraction, exponent = frexp(x)
     if fraction < _SQRT_HALF:
         fraction *= 2.0
@@ -46,7 +46,7 @@ def log(x: float) -> float:
 
 
 def exp(x: float) -> float:
-    """Return e to the power of ``x`` (|x| up to 700), by Taylor's series of what is left of it."""
+    """Return e to the power of ``x`` (|x| up to 700), by range reduction and Taylor's series."""
     exponent = int(x * _LOG2_E + (0.5 if x >= 0.0 else -0.5))
     rest = (x - exponent * _LN2_HIGH) - exponent * _LN2_LOW
     total = 1.0
@@ -82,7 +82,7 @@ class Stream:
         return int(self.uniform() * count)
 
     def whole_numbers(self, low: int, count: int) -> Iterator[int]:
-        """Return ``low + below(count)`` forever, from the stream's beginning, in half the time."""
+        """Yield ``low + below(count)`` forever, from the stream's beginning, twice as fast."""
         return chain.from_iterable(self._whole_numbers(low, float(count)))
 
     def _uniforms(self) -> Iterator[list[float]]:
@@ -130,7 +130,7 @@ class ClockModel:
 
 
 class WrongClock:
-    """What one node's clock shows. Exact: no floats take part after the draws."""
+    """The time that one node's clock shows. Exact: no floats after the draws."""
 
     def __init__(self, model: ClockModel, stream: Stream, start_ns: int) -> None:
         self._model = model
@@ -144,7 +144,6 @@ class WrongClock:
         self._told = 0
 
     def shows(self, now_ns: int) -> int:
-        """Return what the clock shows at simulated time ``now_ns``."""
         model = self._model
         since_ns = now_ns - self._start_ns
         drift_ns = since_ns * model.drift.numerator // model.drift.denominator
@@ -156,7 +155,7 @@ class WrongClock:
         return max(now_ns + wrong_ns, 0)
 
     def set_since(self, now_ns: int) -> int:
-        """Return by how much random jumps have set the clock since this was last asked."""
+        """Return the sum of random jumps since the last call."""
         if not self._model.random_every_ns:
             return 0
         since_ns = now_ns - self._start_ns

@@ -1,8 +1,7 @@
-"""Which of the callbacks that are ready runs next: one small class per rule.
+"""Which of the ready callbacks runs next: one class per rule.
 
-A policy is asked whenever something may run. It sees everything that may run now, in the order in
-which it became ready, timers that are due last, and names one. ``docs/policies.md`` shows how to
-write one.
+A policy sees everything that may run now, in the order in which it became ready, due timers last,
+and chooses one. ``docs/policies.md`` shows how to write one.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _LARGE = 255
 
 
 class PolicyChoices:
-    """The choices of a run so far, in order. Where only one could run there was none."""
+    """The choices of a run so far. Where only one callback could run there was none."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -35,7 +34,7 @@ class PolicyChoices:
         return bool(self._data)
 
     def add(self, index: int) -> None:
-        """Remember that the policy chose ``index`` of those that were ready."""
+        """Remember that the policy chose ``index``."""
         if index < _LARGE:
             self._data.append(index)
         else:
@@ -43,12 +42,10 @@ class PolicyChoices:
             self._data += index.to_bytes(4, "little")
 
     def encoded(self) -> bytes:
-        """Return the choices as a trace holds them."""
         return bytes(self._data)
 
 
 def decoded(data: bytes) -> Iterator[int]:
-    """Yield the choices that ``PolicyChoices.encoded`` wrote."""
     at = 0
     while at < len(data):
         index, at = data[at], at + 1
@@ -112,7 +109,6 @@ class PriorityRule:
     group_of: str | None = None
 
     def fits(self, candidate: Candidate) -> bool:
-        """Whether the rule is about ``candidate``."""
         if not fnmatchcase(candidate.node, self.node):
             return False
         if self.entity is not None:
@@ -133,7 +129,6 @@ class Priority:
         return max(range(len(ready)), key=lambda i: (self.priority(ready[i]), -i))
 
     def priority(self, candidate: Candidate) -> int:
-        """Return the priority of something that may run."""
         for rule in self._rules:
             if rule.fits(candidate):
                 return rule.priority
@@ -143,8 +138,7 @@ class Priority:
 class RateMonotonic:
     """The shortest period first; what has none comes last, in order of arrival.
 
-    A message has the period of the timer that it came of (``follows_chains``: the middleware sees
-    to that).
+    A message has the period of the timer that caused it (``follows_chains``).
     """
 
     follows_chains = True
@@ -187,14 +181,14 @@ class Departure:
 
 
 def candidate_name(candidate: Candidate) -> str:
-    """Name a candidate: node and entity, ``/planner /scan``; what has neither by its kind."""
+    """Name a candidate by node and entity (``/planner /scan``), or else by its kind."""
     return " ".join(filter(None, (candidate.node, candidate.entity))) or candidate.kind
 
 
 class Departures:
-    """First come, first served, timers last, but for the departures that are given.
+    """First come, first served, timers last, except for the given departures.
 
-    :raises RunError: from ``choose``, if a departure names what cannot run then.
+    :raises RunError: from ``choose``, if a departure's candidate cannot run then.
     """
 
     def __init__(self, departures: Iterable[Departure]) -> None:
@@ -215,7 +209,7 @@ class Departures:
         return departure.run
 
     def unmet(self) -> list[int]:
-        """Return the choices of departures that the run has not come to."""
+        """Return the choice numbers that the run has not reached."""
         return sorted(choice for choice in self._departures if choice >= self.choices)
 
 
@@ -231,8 +225,7 @@ def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Mom
 
 
 class FifoUntil:
-    """First come, first served up to ``time_ns``; what comes later is for another policy, which is
-    not asked before."""
+    """First come, first served up to ``time_ns``, then another policy."""
 
     def __init__(self, time_ns: int, policy: Policy) -> None:
         self._time_ns = time_ns
@@ -285,5 +278,5 @@ class Pct:
 
 
 def pct_bound(entities: int, choices: int, depth: int) -> float:
-    """Return the least probability with which one run of ``Pct`` meets an order of that depth."""
+    """Return the minimum probability that one run of ``Pct`` finds an order of that depth."""
     return 1.0 / (max(entities, 1) * float(max(choices, 1)) ** (depth - 1))

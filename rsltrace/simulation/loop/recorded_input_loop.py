@@ -1,9 +1,9 @@
-"""Loops that run a part of a recorded graph: what others did is done at its recorded place.
+"""Loops that run one entry of a recorded graph with its recorded inputs.
 
-The recorded events are a script. Those of others are steps to perform; those of the nodes that run
-here keep what follows them waiting until they have happened. So the nodes meet each input in the
-state in which they met it in the recording, by the rules of ``loop.py``. An event of theirs that
-does not come (their code has changed) is passed over once nothing else is left to do at its time.
+The recorded events are a script. Those of other nodes are steps to perform; those of the nodes that
+run here delay what follows them until they have happened. So the nodes meet each input in the state
+in which they met it in the recording. An event of theirs that does not come (their code has
+changed) is skipped once nothing else is left to do at its time.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ _WAITING_KINDS = (
 
 @dataclass(slots=True)
 class RecordedStep:
-    """A recorded event. ``perform`` does what it did, and is None for one that happens by itself:
-    then ``kind`` and ``entity`` (of the recording) say which it is."""
+    """A recorded event. ``perform`` repeats it; it is None for an event that happens by itself,
+    which recorded ``kind`` and ``entity`` identify."""
 
     index: int
     stamp_ns: int
@@ -62,7 +62,7 @@ class StepScript(Protocol):
 
 
 def stop_at_recorded_end(script: StepScript, loop: EventLoop) -> Callable[[Progress], Stop | None]:
-    """Return the stop condition of a run that ends when its recording did."""
+    """Return the stop condition that ends the run when the recording ends."""
 
     def condition(progress: Progress) -> Stop | None:
         ahead = progress.next_ns is not None and progress.next_ns < script.end_ns
@@ -75,21 +75,19 @@ def stop_at_recorded_end(script: StepScript, loop: EventLoop) -> Callable[[Progr
 
 
 class RecordedInputLoop(EventLoop):
-    """The plain loop, fed from ``script``, which is set before it runs."""
+    """The plain loop with inputs from ``script``, which is set before it runs."""
 
     script: StepScript
     by_steps = False
     """Whether time moves on from step to step (``min_time_step``); what is due between is late."""
 
     def next_ns(self) -> int | None:
-        """Return when the next timer, release or step is due."""
         step = self.script.next
         if step is not None and self.by_steps:
             return step.stamp_ns
         return _earlier_ns(super().next_ns(), step)
 
     def run_step(self) -> None:
-        """Run everything that is due at the present time."""
         now_ns = self.now_ns
         self._release()
         limit = self.events + self._livelock_limit
@@ -111,7 +109,7 @@ class RecordedInputLoop(EventLoop):
         return released
 
     def _one(self) -> bool:
-        """Do the next thing that is due; False if nothing is."""
+        """Do the next thing that is due; return False if there is none."""
         step = self.script.next
         if step is None and self.now_ns >= self.script.end_ns:
             return False
@@ -131,12 +129,11 @@ class RecordedInputLoop(EventLoop):
         return True
 
     def _run_task(self, step: RecordedStep | None) -> bool:
-        """Run what the last event has left to do at once."""
         self.tasks.popleft().dispatch()
         return True
 
     def _dispatch_one(self, step: RecordedStep | None) -> bool:
-        """Dispatch what is ready or due; ``step`` is the event that the recording has next."""
+        """Dispatch what is ready or due; ``step`` is the next recorded event."""
         if self.ready:
             self.ready.popleft().dispatch()
             return True
@@ -149,19 +146,19 @@ class RecordedInputLoop(EventLoop):
 
 
 class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
-    """The loop of jobs that say who runs next, fed: policies, executors, execution times, ties.
+    """The loop with recorded inputs for jobs with policies, executors, execution times or ties.
 
-    The recording says what ran when, so neither policy nor executors are asked. Where callbacks
-    have to wait for workers (``has_workers``), what the recording knows runs when it ran there;
-    anything else is first come, first served. A look whether something has come (``spin_once``) has
-    no event, so where nobody but the order of arrival decides, it is first come, too.
+    The recording decides the order, so neither policy nor executors are asked. Where callbacks wait
+    for workers (``has_workers``), those in the recording run at their recorded time; others are
+    first come, first served. Polling calls (``spin_once``) have no event, so without a policy they
+    are first come, first served, too.
     """
 
     has_workers = False
     by_policy = False
 
     def next_timer(self) -> Any:
-        """Return the timer that is due next; those that wait for their recorded time are not."""
+        """Return the next timer that does not wait for its recorded time."""
         due, after = self.timers.due(self.now_ns)
         free = (timer for timer in due if not self._is_held(self.place(timer.owner)))  # type: ignore[arg-type]
         return next(free, after)
@@ -206,7 +203,7 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
 
     def _looked_for(self, free: list[Place], step: RecordedStep | None) -> Place:
-        """Return what the recording has next, if that is here: its policy let the look wait."""
+        """Return the next recorded item if it is ready: the policy let the poll wait."""
         if step is None:
             return free[0]
         return next((place for place in free if self._is_that_of(place, step)), free[0])
@@ -219,7 +216,7 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
         return recorded == step.entity
 
     def _is_held(self, place: Place) -> bool:
-        """Whether it waits until the recording has it."""
+        """Whether it waits for its recorded time."""
         candidate = place.candidate
         if (
             not self.has_workers
@@ -231,17 +228,17 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
 
 
 def _is_handed_over(item: Any) -> bool:
-    """Whether an executor of the user's own runs it."""
+    """Whether one of the user's own executors runs it."""
     return getattr(getattr(item, "node", None), "mailbox", None) is not None
 
 
 def _is_poll(place: Place) -> bool:
-    """Whether it is a call that only looks whether something has come, and has no event then."""
+    """Whether it is a call that only polls, and then has no event."""
     return bool(getattr(place.candidate.item, "quiet", False))
 
 
 def _has_no_event(item: Any) -> bool:
-    """Whether it is no event itself: it is handed over, or a blocked call goes on."""
+    """Whether it makes no event itself: it is handed over, or resumes a blocked call."""
     return _is_handed_over(item) or hasattr(item, "quiet")
 
 

@@ -36,7 +36,7 @@ class RecordedEvent(NamedTuple):
 
 
 def entity_text(entity: Entity, node: str) -> str:
-    """Name an entity, of the node of that name, as ``RecordedEvent.name`` does."""
+    """Name an entity of a node, as in ``RecordedEvent.name``."""
     if entity.kind is EntityKind.SYSTEM:
         return THE_RUN
     what = f"{entity.kind.label} {entity.name}"
@@ -44,7 +44,7 @@ def entity_text(entity: Entity, node: str) -> str:
 
 
 def event_text(kind: int, name: str, stamp_ns: int) -> str:
-    """Describe an event for people; ``name`` is that of the entity."""
+    """Describe an event for people; ``name`` is its entity's."""
     if name == THE_RUN:
         name = _OF_THE_RUN.get(kind, name)
     if kind == EventKind.FAULT:
@@ -56,15 +56,13 @@ def event_text(kind: int, name: str, stamp_ns: int) -> str:
 class RecordedOrder:
     """The order of a recording.
 
-    ``event`` returns the recording's event of an index, or None after its end; from there on it is
-    first come, first served. Entities are the same if their names are: ``name_of`` returns the name
-    of one of this run, by its id. ``chosen`` chooses as the recording's own policy did: then the
-    run is the recording's as long as it does the same, which whoever ends the events has to
-    look at (``recorded_run`` in ``simulation/middleware/events``). Where nobody knows what it
-    chose (None) the events are all there is, and what has none of its own, see ``Choices`` in
-    ``policy.py``, runs as it comes.
+    ``event`` returns the recorded event of an index, or None after the end; from there on it is
+    first come, first served. ``name_of`` returns the name of an entity of this run; entities with
+    equal names are the same. ``chosen`` repeats the choices of the recording's policy;
+    ``RecordedOrderObserver`` then checks the events. Without it (None) only events are known, and
+    what has no event runs as it comes.
 
-    :raises RunError: from ``choose``, if what the recording has next cannot run now.
+    :raises RunError: from ``choose``, if the next recorded event cannot run now.
     """
 
     follows_chains = True
@@ -85,8 +83,7 @@ class RecordedOrder:
         self.forget: Callable[[str], None] | None = None
 
     def poll_as(self, policy: RclpyWaitSet | FifoUntil) -> None:
-        """Have executors poll as in the recording: of that policy's choices, all follow from what
-        has happened."""
+        """Let executors poll as in the recording: this policy's choices follow from the events."""
         self._chosen = policy.choose
         self.polls_from_ns, self.forget = policy.polls_from_ns, policy.forget
 
@@ -117,7 +114,7 @@ class RecordedOrder:
         return self.cannot_follow(moment.events, expected, here)
 
     def cannot_follow(self, index: int, expected: RecordedEvent, here: str) -> RunError:
-        """Return the error that this run does not do what the recording did."""
+        """Return the error that this run differs from the recording."""
         why = "Nodes, job or input differ from those of the recording"
         if self._chosen is None:
             why += ", or its events are not enough: what its policy chose is not in it (cut off?)"
@@ -134,10 +131,10 @@ class RecordedOrder:
 
 
 def has_event(item: Any) -> bool:
-    """Say whether there is an event if something runs.
+    """Whether running an item makes an event.
 
-    There is none if a full queue has dropped the message it stood for, if an executor of the user's
-    own is only told of it, or if somebody wakes who may just go on waiting.
+    It makes none if a full queue has dropped its message, if it is only handed to one of the user's
+    own executors, or if it wakes a call that may continue to wait.
     """
     node = getattr(item, "node", None)
     is_told = getattr(node, "mailbox", None) is not None
@@ -158,18 +155,18 @@ CALLBACKS = frozenset(
 
 
 class NativeCallback(NamedTuple):
-    """A callback of the native run: which of its events, and what ran."""
+    """A callback of the native run and the number of its event."""
 
     number: int
     event: RecordedEvent
 
 
 class NativeOrder:
-    """The order of a native run, as far as it can be followed.
+    """The order of a native run, followed as far as possible.
 
-    Who is ready before its turn is held back until those are ready that came before, but no longer
-    than until the time at which it ran itself, counted from the first callback of both runs.
-    ``name_of`` returns the name of an entity of this run, by its id.
+    A callback that is ready early waits for those before it, but no longer than until its own time
+    in the native run, counted from the first callback of both runs. ``name_of`` returns the name of
+    an entity of this run.
     """
 
     def __init__(
@@ -189,7 +186,7 @@ class NativeOrder:
         self._first: tuple[NativeCallback, str] | None = None
 
     def hold_until(self, ready: Sequence[Candidate], moment: Moment) -> int | None:
-        """Return until when all that is ready is to wait for who comes before; None: one runs."""
+        """Return until when all that is ready waits for earlier callbacks; None: run one now."""
         places = [self._place(one) for one in ready]
         first = (
             min(place for place in places if place is not None) if all_have_places(places) else None
@@ -208,7 +205,7 @@ class NativeOrder:
         return min(range(len(ready)), key=lambda index: places[index] or 0)
 
     def happened(self, kind: int, entity: int, now_ns: int) -> None:
-        """Take note of an event of this run that is over."""
+        """Note an event of this run."""
         name = self.name_of(entity)
         if kind not in CALLBACKS or name is None:
             return
@@ -230,7 +227,7 @@ class NativeOrder:
         self._next = place + 1
 
     def _why(self, missed: NativeCallback, name: str, now_ns: int) -> str:
-        """Say why what was missed did not run before an event of that name."""
+        """Say why the missed callback did not run before an event of that name."""
         there = sum(place < self._next for place in self._places[missed.event.name])
         return (
             f"its run number {there + 1} was not ready here, and {name}, which came after it, did "
@@ -248,7 +245,7 @@ class NativeOrder:
         return places[count] if count < len(places) else None
 
     def notes(self) -> Iterator[str]:
-        """Yield how far the order was followed, and where first it was not."""
+        """Yield how far the order was followed, and where it first was not."""
         count, end = self._next, len(self._observed)
         missing = count - sum(self._ran)
         if self._in_turn == count and not self._others:
@@ -270,5 +267,4 @@ class NativeOrder:
 
 
 def all_have_places(places: Sequence[int | None]) -> bool:
-    """Whether all have a place."""
     return None not in places

@@ -39,7 +39,7 @@ class TimerState:
         self.ticket: object = None
 
     def call(self, now_ns: int) -> None:
-        """Account for a call at ``now_ns``: move the deadline to its next grid point."""
+        """Move the deadline to its next grid point after a call at ``now_ns``."""
         self.last_call_ns = now_ns
         deadline_ns = self.deadline_ns + self.period_ns
         if deadline_ns <= now_ns:
@@ -91,7 +91,7 @@ class TimerQueue(Protocol):
 class CreationOrderQueue:
     """Smallest (deadline, creation order) first. O(log n) for every change.
 
-    The loop looks at the first timer far more often than timers change, so that is kept up to date.
+    The loop reads the first timer far more often than timers change, so it is kept up to date.
     """
 
     def __init__(self) -> None:
@@ -115,7 +115,7 @@ class CreationOrderQueue:
         self._find_head()
 
     def _tidy(self) -> None:
-        """Drop what changes have left behind: a watchdog is reset more often than it is due."""
+        """Remove outdated entries: a watchdog timer is reset more often than it is due."""
         self._heap = [entry for entry in self._heap if entry[2].ticket is entry]
         heapify(self._heap)
         self._room = _ROOM + 2 * len(self._heap)

@@ -55,7 +55,7 @@ class FastLink(Protocol):
 
 
 def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
-    """Return how ``link`` sends, if it does nothing but delay and keeps the order."""
+    """Return how ``link`` sends if it only delays and keeps the order."""
     loop = dispatcher.loop
     under_way = dispatcher.event
     subscription = link.subscription
@@ -106,9 +106,10 @@ def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
 
 
 def direct_send(dispatcher: Dispatcher, link: FastLink) -> Send:
-    """Return how ``link`` sends, if there is nothing the matter with it.
+    """Return how ``link`` sends if it is perfect.
 
-    Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
+    Only messages that an execution time delays wait in the loop's queue, and what must not overtake
+    them.
     """
     loop = dispatcher.loop
     under_way = dispatcher.event
@@ -162,7 +163,7 @@ class ServiceLink:
         self._last_ns = 0
 
     def send(self, exchange: Any) -> None:
-        """Send a request or response on its way."""
+        """Send a request or response."""
         dispatcher = self._dispatcher
         loop = dispatcher.loop
         now_ns = loop.now_ns
@@ -197,11 +198,11 @@ class ServiceLink:
 
 
 class PublisherLink:
-    """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
+    """The link from a publisher to a subscription; ``channel`` is None if messages arrive at once.
 
-    What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
-    messages as its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last
-    message in order arrives.
+    What a reliable publisher cannot send during an outage waits in ``_held``, as many messages as
+    its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last message in
+    order arrives.
     """
 
     def __init__(
@@ -279,9 +280,9 @@ class PublisherLink:
         self._bring(message, max(arrival_ns, self._behind_ns))
 
     def _suffer(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
-        """Send a message to which something happens that the job says.
+        """Send a message with a fault.
 
-        The model of the link draws for it as for any other, so that those after it fare the same.
+        The link's model draws for it as for any other, so later messages are not affected.
         """
         draw, channel = self._dispatcher.draw, self._channel
         sent_ns += fault.late_ns
@@ -319,7 +320,7 @@ class PublisherLink:
             loop.schedule_release(arrival_ns, self._arrive, *message)
 
     def expects(self, arrive: Callable[[Release], Any]) -> bool:
-        """Whether a message is due now that has not arrived yet: none must overtake it."""
+        """Whether a due message has not arrived yet: none must overtake it."""
         scheduled, now_ns = self._loop.scheduled, self._loop.now_ns
         return bool(scheduled and scheduled[0][0] <= now_ns) and any(
             release[3] == arrive and release[0] <= now_ns for release in scheduled
@@ -347,7 +348,7 @@ class PublisherLink:
         subscription.deliver(arrived)
 
     def _expire(self, release: Release) -> None:
-        """Drop a message that nobody has taken within its lifespan."""
+        """Drop a message that was not taken within its lifespan."""
         queue = self.subscription.queue
         for place, waiting in enumerate(queue):
             if waiting is release[4]:
@@ -355,20 +356,20 @@ class PublisherLink:
                 return
 
     def sign_of_life(self) -> None:
-        """Tell the subscription that its publisher is alive; takes no time, outages hide it."""
+        """Tell the subscription that its publisher is alive; outages hide it."""
         channel, now_ns = self._channel, self._loop.now_ns
         hidden = channel is not None and channel.cut_off_until(now_ns) is not None
         if self._lease is not None and not hidden:
             self._lease.seen()
 
     def acked_ns(self) -> int:
-        """Return when all that was sent so far has arrived, where that is acknowledged."""
+        """Return when all acknowledged messages so far have arrived."""
         if self.subscription.qos.reliability is not Reliability.RELIABLE:
             return 0
         return self.last_ns
 
     def close(self) -> None:
-        """Forget the publisher, or the subscription: one of them goes."""
+        """Forget the publisher or subscription."""
         if self._lease is not None:
             self._lease.gone()
 
@@ -381,7 +382,7 @@ class PublisherLink:
         self._held.append((message, arrivals_ns))
 
     def _release(self) -> None:
-        """Let go of what has waited through an outage."""
+        """Send what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
         loop = self._loop
@@ -409,7 +410,7 @@ class Network:
         subscription: Subscription,
         faults: TopicFaults | None,
     ) -> PublisherLink:
-        """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
+        """Return the link of a publisher to a subscription."""
         channel = self._plan.topic_channel(
             topic,
             self._end("publisher", topic, publisher),
@@ -419,7 +420,6 @@ class Network:
         return PublisherLink(self._dispatcher, qos, subscription, channel, faults)
 
     def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
-        """Bring a request to the server."""
         key = (client.entity_id, server.entity_id)
         way = self._requests.get(key)
         if way is None:
@@ -428,7 +428,6 @@ class Network:
         way.send(exchange)
 
     def response(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
-        """Bring a response to the client."""
         key = (client.entity_id, server.entity_id)
         way = self._responses.get(key)
         if way is None:
@@ -447,7 +446,7 @@ class Network:
         )
 
     def _end(self, kind: str, name: str, endpoint: DomainEntity) -> tuple[str, int]:
-        """Return (node, how many such endpoints it has made before this one)."""
+        """Return (node, number of its earlier endpoints of this kind)."""
         end = self._ends.get(endpoint.entity_id)
         if end is None:
             node = endpoint.node.fully_qualified_name

@@ -1,4 +1,4 @@
-"""The graph of a world as plain values: who is there, who talks to whom, and who never will."""
+"""The graph of a run as plain values: nodes, connections, and problems."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _STATIC_TRANSFORMS = "/tf_static"
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """One end of a topic, service or action: the node, and (of a topic) its QoS in words."""
+    """One end of a topic, service or action: the node, and (of a topic) its QoS as text."""
 
     node: str
     qos: str = ""
@@ -32,9 +32,9 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A topic, service or action with its ends. ``senders`` publish or call, ``receivers``
-    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policies) of the
-    pairs that do not connect."""
+    """A topic, service or action with its ends in creation order. ``senders`` publish or call,
+    ``receivers`` subscribe or serve. ``apart`` has (sender, receiver, policies) of incompatible
+    pairs."""
 
     kind: str
     name: str
@@ -55,8 +55,7 @@ class GraphNode:
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
-    program that waits for work has)."""
+    """The graph after construction. ``waiting`` says what has not finished."""
 
     nodes: tuple[GraphNode, ...]
     links: tuple[Link, ...]
@@ -64,7 +63,7 @@ class Overview:
     problems: tuple[str, ...] = field(default=())
 
     def of_kind(self, kind: str) -> list[Link]:
-        """Return the links of one kind (``topic``, ``service``, ``action``), by name."""
+        """Return the links of one kind (``topic``, ``service``, ``action``)."""
         return [link for link in self.links if link.kind == kind]
 
 
@@ -75,9 +74,9 @@ def graph_overview(
     everything: bool = False,
     follows: Callable[[str], bool] = lambda node: False,
 ) -> Overview:
-    """Return the present graph; ``everything`` with what every node has.
+    """Return the current graph; ``everything`` includes what every node has.
 
-    ``follows`` says whether ``/clock`` drives the time of a node; others listen to it in vain.
+    ``follows`` says whether ``/clock`` drives a node's time; other nodes subscribe to it in vain.
     """
     nodes = tuple(_node(node) for node in graph.nodes)
     links = [*_topics(graph), *_services(graph), *_actions(graph)]
@@ -98,7 +97,7 @@ def graph_overview(
 
 
 def _namesakes(nodes: Iterable[GraphNode]) -> Iterator[str]:
-    """Yield the names that several nodes have: a mistake, most often."""
+    """Yield the names that several nodes share."""
     for name, count in Counter(node.name for node in nodes).items():
         if count > 1:
             yield (
@@ -173,7 +172,7 @@ def _name_of(endpoint: DomainEntity) -> str:
 
 
 def _is_everywhere(link: Link) -> bool:
-    """Say whether a link is one that rclpy makes for every node, or a part of an action."""
+    """Whether a link is one that rclpy makes for every node, or part of an action."""
     if _ACTION in link.name:
         return True
     if link.kind == "topic":
@@ -184,7 +183,7 @@ def _is_everywhere(link: Link) -> bool:
 
 
 def _is_unheard_static(link: Link) -> bool:
-    """Say whether a link is what every listener of tf2 subscribes to besides ``/tf``, in vain."""
+    """Whether a link is the ``/tf_static`` subscription of tf2 listeners, without publishers."""
     return link.name == _STATIC_TRANSFORMS and not link.senders
 
 

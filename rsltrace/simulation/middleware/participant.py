@@ -24,15 +24,14 @@ class QosEndpoint(Protocol):
 
 
 class QosEvent(DomainEntity):
-    """Becomes ready when one status of an endpoint has news. ``cause`` is the event that made them.
+    """Becomes ready when a status of an endpoint changes. ``cause`` is the event that changed it.
 
-    Client libraries make one or two for every endpoint; the trace is told of those that fire.
+    Client libraries make one or two for every endpoint; the trace has those that fire.
     """
 
     kind = EntityKind.QOS_EVENT
 
     def listen(self, endpoint: QosEndpoint, status: str) -> None:
-        """Hear of a status from now on, by its name."""
         self.announced = False
         self.endpoint = endpoint
         self.status = status
@@ -41,7 +40,6 @@ class QosEvent(DomainEntity):
         endpoint.events.listeners[status] = self
 
     def trigger(self) -> None:
-        """Make it ready, if there is news."""
         if self.is_queued or not self.active or not self.has_news():
             return
         self.is_queued = True
@@ -52,15 +50,13 @@ class QosEvent(DomainEntity):
         self.dispatcher.loop.ready.append(self)
 
     def dispatch(self) -> None:
-        """Hand the status over."""
         raise AssertionError("every QoS event says how")
 
     def has_news(self) -> bool:
-        """Return whether there is a status to take."""
         return self.endpoint.events.news(self.status)
 
     def take_event(self) -> Any:
-        """Return the status; its changes are those since the last time."""
+        """Return the status with the changes since the last call."""
         return self.endpoint.events.take(self.status)
 
     def trace_name(self) -> str:
@@ -82,10 +78,10 @@ _ENTITIES_PER_NODE_MAX = 1 << 20
 
 
 class Participant(DomainEntity):
-    """Somebody in the domain, with a name; in the trace, a node.
+    """A node.
 
-    ``door`` speaks for it. ``process`` is where it lives, if that may end before the run does.
-    ``number`` tells those of one name apart, in the order of creation.
+    ``door`` handles its exceptions. ``process`` is set if its process may end before the run.
+    ``number`` distinguishes nodes of the same name, in order of creation.
     """
 
     kind = EntityKind.NODE
@@ -107,20 +103,18 @@ class Participant(DomainEntity):
 
     @property
     def key(self) -> str:
-        """The full name, with the number of a second one of that name: ``/n #2``."""
+        """The full name, with the number of a namesake: ``/n #2``."""
         name = self.fully_qualified_name
         return name if self.number == 1 else f"{name} #{self.number}"
 
     def ordinal(self, count: int) -> int:
-        """Return a number for one of its things that no other node of its name gives."""
+        """Return a number that no namesake of this node uses for the same kind of entity."""
         return count + (self.number - 1) * _ENTITIES_PER_NODE_MAX
 
     def timer_periods(self) -> Iterable[tuple[str, int]]:
-        """Yield (callback, period in ns) of its timers."""
         return ((callback_name(timer.callback), timer.state.period_ns) for timer in self.timers)
 
     def shortest_period_ns(self) -> int | None:
-        """Return the period of its fastest timer, None if it has none."""
         return min((period_ns for _, period_ns in self.timer_periods()), default=None)
 
     def trace_name(self) -> str:
@@ -131,5 +125,4 @@ class Participant(DomainEntity):
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return a node's fully qualified name."""
     return (namespace if namespace.endswith("/") else namespace + "/") + name

@@ -1,5 +1,5 @@
-"""What an ordered loop has to know of what may run: names, periods, groups, simulated executors;
-and execution times, which keep workers busy and hold back what a callback sends."""
+"""What an ordered loop needs to know of callbacks: names, periods, groups, simulated executors; and
+execution times, which keep workers busy and delay what a callback sends."""
 
 from __future__ import annotations
 
@@ -29,12 +29,11 @@ _UNKNOWN = -1
 
 
 def follows_chains(policy: object) -> bool:
-    """Whether a policy wants the periods of chains (``ChainPeriods``)."""
     return bool(getattr(policy, "follows_chains", False))
 
 
 class ChainPeriods(EventObserver):
-    """Follows which period each event goes back to."""
+    """Tracks the timer period that each event goes back to."""
 
     order = ObserverOrder.RATES
 
@@ -45,7 +44,7 @@ class ChainPeriods(EventObserver):
         dispatcher.add_observer(self)
 
     def period(self, item: Any, what: Runnable) -> int | None:
-        """Return the period (ns) of something that may run; its latest arrival counts, too."""
+        """Return the period (ns) of an item, including its latest arrival."""
         if what.kind == "timer" and what.period_ns is not None:
             self._of_entities[what.entity] = what.period_ns
         elif isinstance(item, Receiver) and item.queue:
@@ -60,7 +59,6 @@ class ChainPeriods(EventObserver):
         return self._of_events[event] if known else None
 
     def before_event(self, call: EventCall) -> bool:
-        """Take note of the event's period."""
         period_ns = self._of_entities.get(call.entity)
         if period_ns is None:
             period_ns = self._of_event(call.cause_event)
@@ -106,10 +104,10 @@ class ExecutionRule:
 
 @dataclass(frozen=True, slots=True)
 class SchedulingPlan:
-    """What a job says of order, executors and execution times. The first rule that fits counts.
+    """What a job says of order, executors and execution times. The first matching rule counts.
 
-    Nodes without an executor have one of their own with one worker; ``occupies`` says whether
-    callbacks occupy workers at all.
+    Nodes without an executor have one of their own with one worker; ``occupies``: callbacks occupy
+    workers at all.
     """
 
     policy: Policy
@@ -144,7 +142,6 @@ class Scheduling:
     # -- what may run --------------------------------------------------------------------------
 
     def place(self, item: Schedulable | Any) -> Place:
-        """Describe something that may run."""
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
         workers = self._workers_of(what)
@@ -162,7 +159,7 @@ class Scheduling:
         return Place(candidate, workers, what.group, what.told)
 
     def _workers_of(self, what: Runnable) -> Workers | None:
-        """Return the simulated executor that something runs on, if it does on any."""
+        """Return the simulated executor of an item, or None."""
         if not self._plan.occupies or what.node is None or not what.executor:
             return None
         name = what.node.fully_qualified_name
@@ -179,8 +176,6 @@ class Scheduling:
 
 
 class ExecutionTimes(EventObserver):
-    """Gives callbacks their durations."""
-
     order = ObserverOrder.EXECUTION_TIMES
 
     def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
@@ -191,7 +186,7 @@ class ExecutionTimes(EventObserver):
         self._counts: dict[tuple[str, str, str], int] = {}
 
     def before_event(self, call: EventCall) -> bool:
-        """Draw how long the callback takes, and charge it with that when it is over."""
+        """Draw the execution time, and charge it when the callback is over."""
         event, charge = self._dispatcher.event, self._loop.charge
         duration = None
         if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):

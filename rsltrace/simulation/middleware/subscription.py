@@ -26,8 +26,8 @@ Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
 class Subscription(Receiver):
     """Receives a topic; ``callback`` is called with each message's bytes.
 
-    A full queue drops its oldest message. ``qos`` is resolved, ``publishers`` are the connected
-    ones; ``timed`` says whether its QoS looks at the clock.
+    A full queue drops its oldest message. ``qos`` is resolved, ``publishers`` are connected;
+    ``timed``: its QoS depends on time.
     """
 
     kind = EntityKind.SUBSCRIPTION
@@ -58,7 +58,6 @@ class Subscription(Receiver):
 
     @property
     def type_name(self) -> str:
-        """The name of its type."""
         return self.type.name
 
     def dispatch(self) -> None:

@@ -1,4 +1,4 @@
-"""The event under way: whose code runs, what caused it, and how it will be recorded."""
+"""The current event: whose code runs, what caused it, and how it will be recorded."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ _SERVICES = (EntityKind.CLIENT, EntityKind.SERVICE)
 
 
 class Asker(NamedTuple):
-    """A node that has asked what a name becomes; ``entry_key`` is that of the job's entry that made
-    it, empty if none did."""
+    """A node that resolved a name; ``entry_key`` is the key of its job entry, or ""."""
 
     entry_key: str
     name: str
@@ -36,7 +35,7 @@ class Asker(NamedTuple):
 
 
 class NameRegistry(EventObserver):
-    """The names there have been, each once, in the order of their coming."""
+    """The names of all nodes, topics, services and timers of a run, in order of creation."""
 
     order = ObserverOrder.CENSUS
 
@@ -56,7 +55,6 @@ class NameRegistry(EventObserver):
         a thread in each of a million callbacks."""
 
     def entity_created(self, entity: Entity) -> None:
-        """Remember an entity; its node comes before it."""
         if entity.kind is EntityKind.NODE:
             self._names[entity.id] = entity.name
             self._describe(entity, entity.name)
@@ -76,7 +74,7 @@ class NameRegistry(EventObserver):
                 topics[node, entity.name] = None
 
     def describe_all(self) -> Callable[[int], str | None]:
-        """Keep the names of all entities from now on; return the function that knows them."""
+        """Keep the names of all entities from now on; return the lookup function."""
         self.described = {0: THE_RUN}
         return self.described.get
 
@@ -86,7 +84,6 @@ class NameRegistry(EventObserver):
 
     @property
     def topics(self) -> dict[str, None]:
-        """Every topic that somebody publishes or subscribes."""
         return {topic: None for _, topic in (*self.publishers, *self.subscriptions)}
 
 
@@ -95,10 +92,9 @@ class NameRegistry(EventObserver):
 
 @dataclass(slots=True)
 class Outcome:
-    """``ended_after`` is how many events there were when the run ended: what follows is the
-    ending. ``waits`` are the calls that still waited then. ``drops`` count what full queues
-    dropped, by receiver, and by how many messages a publisher holds if its queue was the full one
-    (in an outage), else 0."""
+    """How a run has gone. ``ended_after`` is the number of events when it ended; later ones are its
+    shutdown. ``waits`` are the calls that still waited then. ``drops`` counts the drops of full
+    queues by receiver, and by queue size of a publisher in an outage (else 0)."""
 
     error: RunError | None = None
     notes: list[str] = field(default_factory=list)
@@ -107,27 +103,27 @@ class Outcome:
     drops: dict[tuple[Any, int], int] = field(default_factory=dict)
 
     def note_end(self, events: int) -> None:
-        """Remember how many events there were when the run ended; the first call counts."""
+        """Remember the number of events at the end of the run; the first call counts."""
         if self.ended_after is None:
             self.ended_after = events
 
 
 class Door(Protocol):
-    """Speaks for participants: it is asked for what only it can know of their code."""
+    """Handles the exceptions of participants."""
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Decide what becomes of the run now that the event under way has raised ``error``."""
+        """Decide what becomes of the run after the current event raised ``error``."""
 
 
 class ParticipantState(Protocol):
-    """The state of a participant, where it is hashed after each of its events."""
+    """The hashed state of a participant."""
 
     def after_event(self) -> int:
-        """Return its hash now, 0 if there is none."""
+        """Return the hash now, 0 if there is none."""
 
 
 class EventOwner(Protocol):
-    """A participant as those see it who record what its code does."""
+    """A participant, as the recording code sees it."""
 
     entity_id: int
     fully_qualified_name: str
@@ -136,11 +132,11 @@ class EventOwner(Protocol):
 
 
 class Event:
-    """The event under way. There is one object of it, which each event fills anew.
+    """The current event: one object that each event fills in anew.
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
     ``took_ns``. A ``quiet`` event is recorded only if something comes of it. ``on_end`` is called
-    once it is over. ``node`` is a participant (an ``EventOwner``), whose door may know more of it.
+    after it. ``node`` is an ``Owner`` or None.
     """
 
     __slots__ = (
@@ -174,12 +170,11 @@ class Event:
 
 
 class OutsideEvent:
-    """Stands for a handle in an event that is no entity's callback: construction, shutdown, a clock
+    """The handle of an event that is not an entity's callback: construction, shutdown, a clock
     jump, a main, a thread."""
 
     def __init__(self, describe: Callable[[], str]) -> None:
         self.describe = describe
 
     def dispatch(self) -> None:
-        """Fail: the loop never has it in a queue."""
         raise AssertionError("never in a queue")

@@ -1,8 +1,8 @@
 """QoS that depends on time: deadlines, and the liveliness of publishers.
 
-A watch looks at the clock only when its time may be up, not at every message; and only where there
-is a callback that wants to know, so that a run without one can still end because nothing is left.
-What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` compares the two.
+A timer looks at the clock only when its period may be over, and only where a callback listens, so
+that a run without one can still end because nothing is left. The behaviour follows Fast DDS;
+``tests/middleware/test_qos_native.py`` compares the two.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class _QosTimer(ABC):
         self.over = False
 
     def seen(self) -> None:
-        """Start anew: there was a message, or a sign of life."""
+        """Start a new period."""
         self._due_ns = self._loop.now_ns + self._period_ns
         if not self._scheduled:
             self._schedule()
@@ -89,10 +89,10 @@ class OfferedLease(_QosTimer):
 
 
 class RequestedLease(_QosTimer):
-    """Whether a subscription holds one publisher for alive.
+    """Whether a subscription considers one publisher alive.
 
     With automatic liveliness the publisher is alive as long as it exists and can be heard; with
-    manual liveliness from its first sign of life until the lease has passed without another.
+    manual liveliness from its first sign of life until a lease passes without another.
     """
 
     def __init__(
@@ -111,14 +111,13 @@ class RequestedLease(_QosTimer):
             super().seen()
 
     def cut_off(self, from_ns: int, to_ns: int) -> None:
-        """Nothing is heard for some time, not even what automatic liveliness rests on."""
+        """Lose liveliness during an outage longer than the lease."""
         if not self._manual and to_ns - from_ns > self._period_ns:
             at_ns = from_ns + self._period_ns
             self._loop.schedule(at_ns, lambda: self._becomes(False))
             self._loop.schedule(to_ns, lambda: self._becomes(True))
 
     def gone(self) -> None:
-        """Forget the publisher."""
         if self._alive is not None:
             self._events.add(LIVELINESS_CHANGED, **{_NAME[self._alive]: -1})
         self._alive = None
@@ -144,12 +143,11 @@ _NAME = {True: "alive", False: "not_alive"}
 
 
 def finite(duration_ns: int) -> bool:
-    """Whether a QoS duration is a limit."""
     return 0 < duration_ns < INFINITE_NS
 
 
 class OfferedQosTimers:
-    """What a publisher promises: its deadline, and its liveliness if that is manual."""
+    """The deadline of a publisher, and its manual liveliness."""
 
     def __init__(self, loop: EventLoop, qos: Qos, events: EndpointEvents) -> None:
         self._watches: list[_QosTimer] = []
@@ -162,21 +160,18 @@ class OfferedQosTimers:
 
     @classmethod
     def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> OfferedQosTimers | None:
-        """Return the promises of a profile, or None if it makes none."""
+        """Return the timers of a profile, or None if it needs none."""
         offers = cls(loop, qos, events)
         return offers if offers._watches else None
 
     def sent(self) -> None:
-        """A message was published."""
         for watch in self._watches:
             watch.seen()
 
     def asserted(self) -> None:
-        """The publisher has said that it is alive."""
         if self._lease is not None:
             self._lease.seen()
 
     def end(self) -> None:
-        """The publisher is gone."""
         for watch in self._watches:
             watch.over = True
