@@ -1,6 +1,6 @@
-"""What if, in a debugging session: branches of its run, made by replaying it with edits.
+"""Branches of a debugging session: its run, repeated with edits.
 
-A branch is a trace, so a session goes on in it as in any other: ahead, back, and verified.
+A branch is a trace, so a session continues in it as in any other.
 """
 
 from __future__ import annotations

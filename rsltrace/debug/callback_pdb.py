@@ -1,7 +1,7 @@
-"""``pdb`` in the first line of a callback, spoken through a socket: a simulation has no terminal.
+"""``pdb`` in the first line of a callback, over a socket: a simulation has no terminal.
 
-The lines of the conversation are JSON: ``{"write": text}`` and ``{"read": true}`` from here,
-``{"line": text}`` (null: there are no more) from the client, in answer to the second.
+The lines are JSON: ``{"write": text}`` and ``{"read": true}`` from here, ``{"line": text}`` (null
+at the end) as the client's answer to the second.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class PdbConnection:
             self._end.connect(address)
         except OSError as error:
             self._end.close()
-            raise DebugError(f"nobody listens at {address}: {error}") from error
+            raise DebugError(f"no client listens at {address}: {error}") from error
         self._lines = self._end.makefile("rw", encoding="utf-8")
 
     def write(self, text: str) -> int:

@@ -1,4 +1,4 @@
-"""Which checkpoints there are, and which of too many is to go."""
+"""Positions, breakpoints and stops of a session; and which checkpoints to keep."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from typing import Any
 
 from rsltrace.debug.processes import SimProcess
 from rsltrace.trace.model.texts import format_seconds
-
-# Where a debugged run stands, as clients see it.
 
 
 @dataclass(frozen=True, slots=True)

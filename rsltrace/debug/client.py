@@ -1,4 +1,4 @@
-"""A debugging session, from Python: what runs user code is a process of its own.
+"""The Python API of a debugging session. User code runs in a process of its own.
 
 >>> import rsltrace
 >>> with rsltrace.DebugSession("run.mcap") as session:    # doctest: +SKIP

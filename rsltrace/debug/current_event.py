@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from rsltrace.debug.event_history import EventLedger, Payload
     from rsltrace.run.session import Session
 
-# The user's code of an event: what it calls, and the line at which that waits or goes on.
-
 _LINES_MAX = 400
 _FLAGS = 10
 _SUSPENDED = int(EventFlag.SUSPENDED)

@@ -1,4 +1,4 @@
-"""Debuggers of Python in copies of a simulation: what calls the callbacks there."""
+"""Python debuggers that call the callbacks in copies of a simulation."""
 
 from __future__ import annotations
 
@@ -15,10 +15,8 @@ from rsltrace.debug.current_event import CurrentEventView, code_of
 from rsltrace.errors import DebugError
 from rsltrace.line_protocol import Lines, Message
 
-# ``debugpy`` in a copy of a simulation: an editor stops in callbacks, and simulated time waits.
-#
-# Debugpy's threads, locks and sleeps have to be real ones, also on the stack of a callback that
-# stands still: for them there is no run. ``Outside`` is how a run looks away.
+# Debugpy's threads, locks and sleeps have to be real ones, even on the stack of a stopped callback.
+# ``Outside`` is the context in which they are not part of the run.
 
 HOST = "127.0.0.1"
 _BREAKPOINT = 1_000_000_000
@@ -44,7 +42,7 @@ class DebugpyServer:
         try:
             import debugpy
         except ImportError:
-            raise DebugError("debugpy is not here: pip install 'rsltrace[debugpy]'") from None
+            raise DebugError("debugpy is not installed: pip install 'rsltrace[debugpy]'") from None
 
         self._outside = outside
         self._debugpy: Any = debugpy
@@ -52,7 +50,7 @@ class DebugpyServer:
         try:
             _, self.port = debugpy.listen((HOST, port))
         except (RuntimeError, OSError) as error:
-            raise DebugError(f"nobody can listen at {HOST}:{port}: {error}") from error
+            raise DebugError(f"cannot listen at {HOST}:{port}: {error}") from error
         import pydevd  # debugpy brings its own, once it listens
         import pydevd_tracing
 

@@ -1,8 +1,7 @@
 """The simulation's side of a debugging session: runs between events, stops, answers, forks.
 
-It is an observer of events, and stands where one has ended, or where a callback is about to be
-called. To stop is to read requests there instead of going back to the loop; whatever stack that is
-on stays as it is.
+It is an observer of events. To stop is to read requests after an event, or before a callback,
+instead of returning to the loop; the stack stays as it is.
 """
 
 from __future__ import annotations
@@ -156,7 +155,7 @@ class Engine(EventObserver):
         index, goal = self.ledger.events, self._goal
         with engage(None):
             if self.diverged:
-                self.over = "the run did not do in this event what it did the first time"
+                self.over = "this event differs from the first run"
                 self._stop("diverged", text=self.over)
                 return
             if goal.after and self._ask(goal.after, index):

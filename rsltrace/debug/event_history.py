@@ -1,8 +1,7 @@
-"""What a debugged run has done: the event that has ended last, and whether it was as before.
+"""The events of a debugged run: the last one, and whether each is as in the first run.
 
-A run is recorded as always, but to here instead of a file: what it sends is kept for one event, so
-that conditions can look at it, and its chain hash is compared with the one of that event when it
-ran the first time.
+The recorder writes to an ``EventLedger`` instead of a file. It keeps what an event sends for one
+event, so that conditions can look at it, and compares each chain hash with that of the first run.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.reader import RUN, Trace
 from rsltrace.trace.words.events import counted, output_text
 from rsltrace.trace.writer import TraceWriter
-
-# What is known of a run's events: all of them from its trace, or those that have run so far.
 
 _ROW_BYTES = 8 + EVENT_REST.size
 _ROWS_AT_ONCE = 4096

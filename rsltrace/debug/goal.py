@@ -1,4 +1,4 @@
-"""How far to run: what a request to run says, understood."""
+"""How far to run: the goal that a request to run describes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a run that stands still is asked: its nodes, queues, timers, stacks, graph and messages."""
+"""Inspect a stopped run: nodes, queues, timers, stacks, graph, messages, Python expressions."""
 
 from __future__ import annotations
 
@@ -38,11 +38,9 @@ if TYPE_CHECKING:
     from rsltrace.debug.event_history import EventLedger
     from rsltrace.run.session import Session
 
-# Python at the prompt of a session: ``print EXPRESSION``, and ``DebugSession.evaluate``.
-#
-# That is meant to be Python, of whoever sits there, in a copy of a run whose code they have agreed
-# to run: methods of nodes may be called. Nothing that a file says is evaluated so: conditions,
-# checks and metrics have a language of their own (``rsltrace.conditions``).
+# ``print EXPRESSION`` and ``DebugSession.evaluate`` take Python from the user at the prompt, in a
+# copy of a run whose code they trust: it may call methods of nodes. Text from files is never
+# evaluated so: conditions, checks and metrics have their own language (``rsltrace.conditions``).
 
 _HARMLESS = (
     "abs all any bool bytes chr dict divmod enumerate float format frozenset getattr hasattr hash "

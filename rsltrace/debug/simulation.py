@@ -1,7 +1,7 @@
-"""The process of a simulation that is debugged: opens a trace or a job, and does as it is told.
+"""The process of a debugged simulation: opens a trace or a job, and serves the supervisor.
 
-Run as ``python -m rsltrace.debug.simulation DESCRIPTOR SPEC`` by the supervisor, which it serves on
-that descriptor. SPEC is a JSON object.
+Run as ``python -m rsltrace.debug.simulation DESCRIPTOR SPEC`` by the supervisor; DESCRIPTOR is the
+socket, SPEC a JSON object.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Between the client and the processes of the simulation: who stands where, and who is woken.
+"""The process between the client and the simulation processes.
 
-Run as ``python -m rsltrace.debug.supervisor DESCRIPTOR SPEC`` by the client, which it serves on
-that descriptor until the client is gone. It runs no user code, so it can always answer.
+Run as ``python -m rsltrace.debug.supervisor DESCRIPTOR SPEC`` by the client, until the client
+disconnects. It runs no user code, so it can always answer.
 """
 
 from __future__ import annotations
@@ -138,7 +138,7 @@ class Supervisor:
         goal = self._place(request["to"])
         here = self._index if "until" in goal else int(self.tree.position["stamp_ns"])
         if next(iter(goal.values())) < here:
-            raise DebugError(f"{request['to']} is behind: go_to goes back")
+            raise DebugError(f"{request['to']} is in the past: go_to goes back")
         return self._forward(**goal)
 
     def _go_on(self, request: Message) -> Message:

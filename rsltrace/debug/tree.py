@@ -1,4 +1,4 @@
-"""The processes of a session by what they are for: the cursor, and checkpoints asleep behind it."""
+"""The processes of a session: the cursor, and the checkpoints behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whose code a job would run, and from which files: found without importing any of it."""
+"""Find the code files that a job would run, without importing any."""
 
 from __future__ import annotations
 

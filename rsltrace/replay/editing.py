@@ -1,7 +1,7 @@
-"""Making edits in a run: at the boundary between two events, or in the way of the next one.
+"""Make edits in a run: between two events, or to the next event.
 
-Where an edit takes place depends on nothing but how many events there have been and what time it
-is, so the same edits of the same run give the same branch.
+The place of an edit depends only on the number of events and the time, so the same edits of the
+same run give the same branch.
 """
 
 from __future__ import annotations
@@ -36,8 +36,6 @@ from rsltrace.trace.model.texts import format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
-
-# Other messages than those that were sent: on their way, or as one receiver gets them.
 
 
 def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
@@ -171,7 +169,7 @@ class EditObserver(EventObserver):
         self._on_new: Callable[[], None] | None = on_new
         self.error: EditError | None = None
         self._setting: OutsideEvent | None = None
-        """The event that an edit is itself, while it is under way."""
+        """The current event, if it is an edit itself."""
         self._session: Session
 
     @property
@@ -212,7 +210,7 @@ class EditObserver(EventObserver):
             if edit.of_event and happens and self.error is None:
                 happens = bool(self._try(edit, self._event, call))
         if self.error is not None and hasattr(call.handle, "task"):
-            call.handle.task._handler.close()  # a coroutine that nobody is going to begin
+            call.handle.task._handler.close()  # a coroutine that will not begin
         return happens and self.error is None
 
     def after_event(self) -> None:
@@ -230,7 +228,7 @@ class EditObserver(EventObserver):
         if edit.index is None or edit.index >= self._loop.events:
             return
         if self._dispatcher.event.handle is not self._setting:
-            self._fail(edit, "this is no callback, but what a main or thread did")
+            self._fail(edit, "the event is not a callback: a main or a thread made it")
 
     def _is_due(self, edit: Edit) -> bool:
         if edit.index is not None:
@@ -293,13 +291,13 @@ class EditObserver(EventObserver):
             wrapper = getattr(handle, "wrapper", None)
             if wrapper is not None:
                 return wrapper
-        raise EditError(f"there is no node {name} by then")
+        raise EditError(f"at that time there is no node {name}")
 
     def _arm(self, edit: Edit, topic: str) -> None:
         """Wait for the next message on a topic, from any publisher."""
         domain = self._session.world.domain
         if not domain.graph.publishers(topic):
-            return  # nobody yet
+            return  # no publisher yet
         self._pending.remove(edit)
         self._armed.setdefault(topic, []).append(edit)
 

@@ -1,4 +1,4 @@
-"""Edits: what is to be other than in the trace, each at one place in the run.
+"""Edits: changes to a recorded run, each at one event or time.
 
     812: message.pose.position.x = 3.0         what event 812 receives
     2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on
@@ -151,9 +151,10 @@ def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
         for name, kind in ((node, EntityKind.NODE), (edit.topic, EntityKind.PUBLISHER)):
             known = names.get(kind, set())
             if name is not None and name not in known:
-                what = "is no node" if kind is EntityKind.NODE else "is published by nobody"
+                is_node = kind is EntityKind.NODE
+                what = "is not a node" if is_node else "has no publisher"
                 near = did_you_mean(name, known)
-                raise EditError(f"{edit.text!r}: {name} {what} of {trace.name}{near}")
+                raise EditError(f"{edit.text!r}: {name} {what} in {trace.name}{near}")
 
 
 class _EditParser:

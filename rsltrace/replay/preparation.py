@@ -116,7 +116,7 @@ def job_folder_of(trace: Trace, given: Path | None) -> Path:
 
 
 def _shown(place: Path) -> str:
-    return "the present folder" if place == Path() else str(place)
+    return "the working directory" if place == Path() else str(place)
 
 
 def _folder_markers(trace: Trace) -> list[str]:
@@ -147,13 +147,10 @@ def _text(file: Path) -> str:
         return ""
 
 
-# Whether to run what a trace names. A trace may come from anybody, and its job may name any code.
-#
-# ``record`` runs what a job file says that somebody chose to run. A replay runs what a *trace*
-# says, and a trace looks like data. So it runs without being asked only where it does no more than
-# ``record`` of the job file in the present folder would do: the same nodes (or some of them) with
-# the same parameters, arguments, launch files, hooks and bags. What only says when, in which order
-# and for how long they run may differ.
+# A trace looks like data and may come from anyone, but its job may name any code. So it is replayed
+# without ``trust`` only if ``record`` of the job file in the working directory would run the same:
+# the same nodes (or some of them) with the same parameters, arguments, launch files, hooks and
+# bags. Settings of time and order may differ.
 
 _LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
 _MAY_DIFFER = frozenset(
@@ -181,7 +178,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     """
     name = job_name(trace)
     if not named and folder.resolve() != Path.cwd():
-        return f"its job lies in {folder}, which is not the present folder"
+        return f"its job is in {folder}, which is not the working directory"
     if not name:
         return "its job was made in Python, so there is no job file here that says the same"
     try:
@@ -196,7 +193,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     if edits_of(trace):
         return "it holds edits, which the nodes would run with"
     if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
-        return "it holds answers from outside (of files, sockets, …) that the nodes would be given"
+        return "it holds recorded answers (of files, sockets, …) that the nodes would get"
     return ""
 
 
@@ -261,7 +258,7 @@ class Preparation:
     distrust: str
     notes: tuple[str, ...]
     edits: tuple[Edit, ...] = ()
-    """What the run was told to do otherwise, of a trace that is a branch."""
+    """The edits of the run, if the trace is a branch."""
 
 
 @contextmanager

@@ -52,11 +52,11 @@ def replay_prepared(
     :raises EditError: an edit cannot be made.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     """
-    fed = plan.trace.metadata(METADATA_FED).get("node")
-    if fed is not None:
+    node = plan.trace.metadata(METADATA_FED).get("node")
+    if node is not None:
         raise ReplayError(
-            f"{plan.trace.name} was made by replaying {fed} alone, without the nodes it hears: "
-            f"replay it with --node {fed}"
+            f"{plan.trace.name} is a replay of {node} alone, without the nodes that it subscribes "
+            f"to: replay it with --node {node}"
         )
 
     def on_first(session: Session) -> None:
@@ -196,7 +196,7 @@ def _result(
     recorded = trace.result.get("stop_reason", "")
     if verification.is_last and not whole:
         notes.append(
-            "what the nodes did when their run was ended from outside is not the same "
+            "the nodes' shutdown differs after the run was ended from outside "
             f"(event {verification.verified})"
         )
     elif whole and run.stop_reason != recorded:

@@ -1,4 +1,4 @@
-"""What a replay found: how far the run did what its trace says, and what it did then."""
+"""The result of a replay."""
 
 from __future__ import annotations
 

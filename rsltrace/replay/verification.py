@@ -1,7 +1,7 @@
-"""Comparing a run with a trace, event by event, as the events end.
+"""Compare a run with a trace, event by event.
 
-A chain hash stands for an event and all before it, so one number per event is compared. The first
-that differs ends the run there: what the event has sent waits in queues that nobody reads any more.
+A chain hash covers an event and all before it, so one number per event is compared. The first
+difference ends the run.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From a Job to a trace and a result: where the layers below are put together."""
+"""Run a job: from a Job to a trace and a result."""
 
 from __future__ import annotations
 

@@ -109,6 +109,6 @@ def _played_and_published(found: Overview) -> Iterator[str]:
         others = [node for node in nodes if node != f"/{PLAYER}"]
         if len(others) < len(nodes) and others and link.name.rpartition("/")[2] not in _OF_MANY:
             yield (
-                f"topic {link.name}: a bag plays it, and {', '.join(others)} publishes it, too; "
-                f"unless both are meant: bags: [{{path: ..., exclude: [{link.name}]}}]"
+                f"topic {link.name}: both a bag and {', '.join(others)} publish it; if that is "
+                f"not intended: bags: [{{path: ..., exclude: [{link.name}]}}]"
             )

@@ -11,8 +11,6 @@ from rsltrace.job import Job
 from rsltrace.run.plans.executables import compiled_file, why_not
 from rsltrace.run.process import search_path
 
-# The launch files of a job as nodes: what a job's search path has can be launched, too.
-
 
 def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
     """Return a job whose launch files are replaced by nodes; executables are also looked for in its

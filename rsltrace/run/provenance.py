@@ -32,11 +32,8 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.writer import TraceWriter
 
-# Which numerical libraries a job may depend on, and the kernel each chose for the processor.
-#
-# OpenBLAS and its like round differently on different processors. A trace says which kernels they
-# used, but only of a job whose modules use such libraries: any other has the same bytes
-# everywhere.
+# OpenBLAS and similar libraries round differently on different processors. A trace names their
+# kernels, but only if the job's modules use such libraries: others have the same bytes everywhere.
 
 _LIBRARIES = frozenset(
     "numpy scipy pandas cv2 torch tensorflow jax numba sklearn casadi cvxpy filterpy pinocchio "
@@ -117,9 +114,6 @@ def _module_of_value(value: object) -> str:
         return ""
     name = getattr(value, "__module__", "")
     return name if isinstance(name, str) else ""
-
-
-# What a module's code is, comments and layout apart, and which other modules it uses.
 
 
 def module_code(modules: Mapping[str, Path]) -> dict[str, str]:

@@ -330,7 +330,7 @@ class Session:
         )
         if writer.place != path and self._observer.note is not None:
             self._observer.note(
-                f"{path} stays as it is until this run is over; until then it goes to "
+                f"{path} is replaced when this run is over; until then the trace is in "
                 f"{writer.place}"
             )
         self._record_to(writer)

@@ -1,4 +1,4 @@
-"""A run that somebody outside drives step by step, like a Gym environment."""
+"""A run that its caller drives step by step, like a Gym environment."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ from rsltrace.run.session import RunResult, Session
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import format_seconds
-
-# Listening to a topic from outside of a simulation, without being part of the graph.
 
 
 class TopicTap:

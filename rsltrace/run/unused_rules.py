@@ -23,8 +23,6 @@ from rsltrace.trace.model.drop import Drop
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
 
-# What full queues dropped in a run: as a trace keeps it, and as a run tells it.
-
 _TOLD = 5
 
 Counts = Mapping[tuple[Receiver, int], int]
@@ -56,10 +54,8 @@ def drop_notes(counts: Counts) -> list[str]:
     return [f"full queues dropped their oldest messages: {'; '.join(parts)}"]
 
 
-# Remappings of a job that remap nothing: no node has asked for the name that they replace.
-#
-# rcl itself is asked what a rule does to a name, so its forms (`~/x`, `node:x`, `rosservice://x`)
-# mean here what they mean in a run.
+# rcl itself applies the rules, so their forms (`~/x`, `node:x`, `rosservice://x`) mean what they do
+# in a run.
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""

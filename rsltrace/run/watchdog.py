@@ -46,7 +46,7 @@ class Watchdog:
         self._thread = thread
         self._process = os.getpid()
         self.has_told = False
-        """Whether what is under way now has been told of."""
+        """Whether a note on the current callback was printed."""
         self._running = False
         self._stopping = allocate_lock()
         self._ended = allocate_lock()
@@ -111,7 +111,7 @@ class Watchdog:
         if process := _process_asked(frames):
             who, where = f"{process}, in {who},", ""
         _say(
-            f"{who} has not come back for {for_s} s of real time; simulated time stands still at "
+            f"{who} has not returned for {for_s} s of real time; simulated time stands still at "
             f"{format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
         )
         return True

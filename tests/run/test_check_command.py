@@ -205,8 +205,8 @@ def test_a_topic_that_is_played_and_published(command: Any, job_file: Callable[.
     assert done.returncode == 1
     assert done.stdout.endswith(
         "to look at:\n"
-        "  topic /numbers: a bag plays it, and /talker publishes it, too; "
-        "unless both are meant: bags: [{path: ..., exclude: [/numbers]}]\n"
+        "  topic /numbers: both a bag and /talker publish it; "
+        "if that is not intended: bags: [{path: ..., exclude: [/numbers]}]\n"
     )
     job_file(FINE + "bags: [{path: numbers, exclude: [/numbers]}]\n")
     assert command("check", "job.yaml").returncode == 0

@@ -106,7 +106,7 @@ def test_a_busy_loop_is_named_with_its_line(
     said = capsys.readouterr().err
     assert said.count("rsltrace: note:") == 1, said
     assert "/busy: timer" in said
-    assert "Busy.tick has not come back for 10 s of real time" in said
+    assert "Busy.tick has not returned for 10 s of real time" in said
     assert "stands still at 2.000000000 s" in said
     lines = Path(__file__).read_text().splitlines()
     first = next(n for n, line in enumerate(lines, 1) if "def __call__" in line)

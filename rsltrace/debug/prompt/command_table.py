@@ -19,8 +19,6 @@ from rsltrace.debug.prompt.commands import PromptCommands, PromptContext
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.terminal import say
 
-# The terminal's side of ``pdb`` in a callback: what it writes is shown, lines are read for it.
-
 _LOOK_S = 0.1
 
 
@@ -98,9 +96,9 @@ _add = COMMANDS.add
 _CHANGED = re.compile(r"(?P<node>[\w/~]+)(?:\.|\s+)(?P<attribute>\S.*)")
 
 
-def _count(text: str, otherwise: int = 1) -> int:
+def _count(text: str, default: int = 1) -> int:
     if not text:
-        return otherwise
+        return default
     if not (text.isascii() and text.isdecimal()):
         raise DebugError(f"{text!r} is no whole number")
     return int(text)

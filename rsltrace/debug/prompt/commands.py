@@ -1,4 +1,4 @@
-"""What can be said at the prompt: names, abbreviations, help."""
+"""The command registry of the prompt: names, abbreviations, help."""
 
 from __future__ import annotations
 

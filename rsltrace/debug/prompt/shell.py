@@ -1,6 +1,6 @@
-"""The prompt: reads commands, has the session carry them out, prints what came of it.
+"""The prompt: reads commands, sends them to the session, and prints the answers.
 
-It knows nothing of the run but what the session says, as any client of it.
+It uses nothing but the session's public API.
 """
 
 from __future__ import annotations
@@ -23,8 +23,6 @@ from rsltrace.trace.words.entities import LOG_LEVELS
 if TYPE_CHECKING:
     from rsltrace.debug.checkpoints import Stopped
     from rsltrace.debug.client import DebugSession
-
-# Lines of a debugging session: typed at a terminal, or out of a pipe or file.
 
 Completer = Callable[[str], Sequence[str]]
 """By a line up to where the cursor is: what its last word could become."""
@@ -93,8 +91,6 @@ def _readline(complete: Completer) -> Iterator[None]:
         readline.set_completer(before[0])
         readline.set_completer_delims(before[1])
 
-
-# What a line at the prompt could become.
 
 _HEADS = "node topic entity output exception log finding watch when t=".split()
 

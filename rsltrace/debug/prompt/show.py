@@ -1,4 +1,4 @@
-"""What the prompt prints: where the run stands, what is in it, and source lines."""
+"""Format what the prompt prints: positions, values and source lines."""
 
 from __future__ import annotations
 

@@ -35,8 +35,6 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings import open_bag
 from rsltrace.trace.recordings.playback import header_stamp_ns
 
-# What a node subscribes to and publishes: seen by constructing it, in a run that ends at once.
-
 
 @dataclass(frozen=True, slots=True)
 class NodeTopics:
@@ -101,7 +99,7 @@ _NOT_OF_ROBOTS: dict[str, object] = {
     "bags": (),
     "stop": StopSpec(),
 }
-"""What a job says of a simulated robot; a recording of a real one has the effects of all that."""
+"""Settings of a simulated robot; a recording of a real one already has their effects."""
 
 
 class BagOutputs(NodeOutputs):

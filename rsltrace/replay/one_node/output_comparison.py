@@ -185,8 +185,6 @@ def _preview(side: NodeOutputs, put: NodeOutput) -> str:
     return _NOT_KEPT if message is None else preview(message, 60)
 
 
-# Seeing the first output that is not as recorded when it comes about, and ending the run there.
-
 _SENT = frozenset(
     map(int, (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG))
 )

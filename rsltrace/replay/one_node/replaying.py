@@ -1,4 +1,4 @@
-"""Replaying one node of a trace."""
+"""Replay one node of a trace."""
 
 from __future__ import annotations
 
@@ -45,10 +45,6 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
-# A run of one entry of a recorded job, fed with what its nodes got then.
-
-# Which request a recorded response answers. A trace says who got it, and who asked what.
-
 _BEGIN = (EventKind.SERVICE, EventKind.ACTION)
 
 
@@ -59,7 +55,7 @@ class ServiceAnswers:
         events, outputs = columns.events, columns.outputs
         self._columns = columns
         self._asked: dict[tuple[int, int], tuple[int, int]] = {}
-        """By event and output that asked: the client, and which of its requests it was."""
+        """By requesting event and output: (client, number of the request)."""
         counts: dict[int, int] = {}
         places = np.flatnonzero((outputs["kind"] == OutputKind.REQUEST) & is_own(outputs["entity"]))
         for place in places.tolist():
@@ -68,11 +64,11 @@ class ServiceAnswers:
             position = place - int(columns.first_output[event])
             self._asked[event, position] = client, counts[client]
         self._got: dict[tuple[int, int], int] = {}
-        """By event and output that answered: the client."""
+        """By answering event and output: the client."""
         self._open: dict[int, list[tuple[int, int, int]]] = {}
-        """By service: (event that took it, client, number) of requests, oldest first."""
+        """By service: (event that took it, client, number) of open requests, oldest first."""
         self._untaken: dict[int, list[int]] = {}
-        """By client, the numbers of the requests that nobody seems to have taken."""
+        """By client, the numbers of requests that no recorded event took."""
         if not self._asked:
             return
         own = is_own(events["entity"])
@@ -105,7 +101,7 @@ class ServiceAnswers:
             if begun < event and client == asked_by:
                 del waiting[place]
                 return client, number
-        # In the trace of one node alone nobody has taken the requests: they are answered in order.
+        # In the trace of one node alone no event takes the requests: they are answered in order.
         numbers = self._untaken.get(asked_by)
         return (asked_by, numbers.pop(0)) if numbers else None
 
@@ -412,13 +408,13 @@ def _notes(
         yield f"{', '.join(unit.others)} ran with it: the same entry of the job makes them"
     if differs:
         yield (
-            "its inputs are those of the recording, also where others would have answered its "
-            "changed outputs in another way"
+            "its inputs are the recorded ones, even where other nodes would have reacted to its "
+            "changed outputs"
         )
     elsewhere = unit.done_by_others()
     if elsewhere:
         yield (
-            f"{elsewhere} of its outputs came about in events of other nodes or of whoever drove "
-            "the run, which are not replayed"
+            f"{elsewhere} of its outputs were made in events of other nodes or of the driver, "
+            "which are not replayed"
         )
     yield from run.notes

@@ -1,4 +1,4 @@
-"""What ``replay --node`` says: the outputs that are not as recorded, as a table or as JSON."""
+"""Format the result of ``replay --node``, as a table or as JSON."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What replaying one node found: the outputs that are not as recorded."""
+"""The result of replaying one node, and the columns of a recording that it needs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,6 @@ from rsltrace.trace.reader import Trace
 if TYPE_CHECKING:
     from rsltrace.diff.facts.evidence import FieldDifference
     from rsltrace.errors import RunError
-
-# What replaying a node has to know of a whole recording, in columns: who did what, and why.
 
 Column = npt.NDArray[Any]
 SENT = (OutputKind.MESSAGE, OutputKind.LOG, OutputKind.REQUEST, OutputKind.RESPONSE)
@@ -142,14 +140,14 @@ class NodeReplayResult:
     def sentence(self) -> str:
         """The result in one sentence."""
         inputs = "1 input" if self.inputs == 1 else f"{self.inputs} inputs"
-        fed = f"fed with {inputs} over {format_seconds(self.end_ns - self.start_ns)} s"
+        run = f"{inputs} over {format_seconds(self.end_ns - self.start_ns)} s"
         first = self.first
         if first is None and not self.compared:
-            return f"{self.node} ran, and there is nothing to compare it with ({fed})"
+            return f"{self.node} ran, but there is nothing to compare its outputs with ({run})"
         if first is None:
-            return f"{self.node} does the same: {self.compared} outputs ({fed})"
+            return f"{self.node} is unchanged: {self.compared} outputs as recorded ({run})"
         when = format_seconds(first.time_ns)
         at = f"{first.kind} {first.name} at {when} s is {first.change.value}"
         more = len(self.changes) - 1
         later = f", and {more} later" if more else ""
-        return f"{self.node} does something else: {at}{later}, of {self.compared} outputs ({fed})"
+        return f"{self.node} diverges: {at}{later}, of {self.compared} outputs ({run})"

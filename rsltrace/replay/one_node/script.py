@@ -24,11 +24,9 @@ from rsltrace.trace.model.event import (
     duration_of,
 )
 
-# What runs when one node of a recording runs: the entry of the job that made it, and nothing else.
-#
-# An entry may make several nodes (a ``main``, a function that returns a list), and its code has
-# threads and timers; all that came from the same construction belongs together. A trace says which
-# event created each entity, and which event caused which.
+# The entry of the job that made the node runs, with all that came from the same construction: an
+# entry may make several nodes, threads and timers. A trace says which event created each entity,
+# and which event caused which.
 
 _OF_ALL = (EventKind.CLOCK_JUMP,)
 
@@ -51,8 +49,8 @@ class ReplayedEntry:
         self.node = find_node(columns, node)
         if (columns.events["kind"] == EventKind.FAULT).any():
             raise ReplayError(
-                "in this run the job lets nodes crash, hang or start again (faults:), which is not "
-                "to be had for one node alone: replay the whole run (without --node)"
+                "the job lets nodes crash, hang or restart (faults:), which one node alone cannot "
+                "repeat: replay the whole run (without --node)"
             )
         made_by = self._entry_of_entity(self.node.id)
         hooks = int(job.hooks.before is not None)
@@ -60,7 +58,7 @@ class ReplayedEntry:
         if made_by < 0 or made_by >= count:
             raise ReplayError(
                 f"{self.node.name} was made by {_maker(made_by)}, not by an entry of the job: "
-                "there is no code of it to run"
+                "it has no code to run"
             )
         entries = {one: self._entry_of_entity(one) for one in columns.trace.entities if one}
         self.entities = frozenset(one for one, entry in entries.items() if entry == made_by)
@@ -176,7 +174,7 @@ def find_node(columns: RecordingColumns, name: str) -> Entity:
 
 
 def _maker(entry: int) -> str:
-    return "whoever drove the simulation, or another node's code" if entry < 0 else "a bag"
+    return "the driver of the simulation or another node" if entry < 0 else "a bag"
 
 
 _ENDPOINTS = (

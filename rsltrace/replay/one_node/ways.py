@@ -1,4 +1,4 @@
-"""The ways to replay one node: from a trace, from a trace with a bag, from a job with a bag."""
+"""The sources of a one-node replay: a trace, a trace with a bag, a job with a bag."""
 
 from __future__ import annotations
 

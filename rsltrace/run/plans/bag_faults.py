@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from rsltrace.adapters.player import BagPublisher
     from rsltrace.adapters.player import Message as BagMessage
 
-# Another value in one field of a message, as ``change:`` among a job's ``faults:`` says.
-
 _FLOAT_MAX = {"f": 3.4028234663852886e38, "d": 1.7976931348623157e308}
 
 

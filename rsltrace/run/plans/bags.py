@@ -1,4 +1,4 @@
-"""The bags of a job: opened, checked and merged into the graph."""
+"""Open, check and merge the bags of a job."""
 
 from __future__ import annotations
 

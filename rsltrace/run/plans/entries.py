@@ -1,4 +1,4 @@
-"""From the nodes and hooks of a job to the entries of a world: imported, arguments parsed."""
+"""Import the nodes and hooks of a job, and parse their arguments."""
 
 from __future__ import annotations
 
@@ -26,8 +26,6 @@ from rsltrace.run.plans.scheduling import load_target
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.model.texts import format_duration
-
-# ``start_after:`` of a job's entries that never comes true, or did not.
 
 
 def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None) -> Iterator[str]:
@@ -94,8 +92,6 @@ def _where(job: Job, index: int, key: str) -> str:
         place = ("nodes", index, "container")
     return spec.origin or locate(job, place)
 
-
-# From an entry's ``stdin:`` to what is typed at its terminal.
 
 _ENTER = b"\r"
 _KEY = re.compile(r"\x1b(?:\[[0-9;]*[ -/]*[@-~]|O[A-Za-z]|[^\x1b])?|.", re.DOTALL)
@@ -248,7 +244,7 @@ def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
         rule = StartRule(after.delay_ns, after.topic, after.service, after.node, started, ended)
     if spec.container is None:
         return rule
-    # A component waits for its container, which loads one after the other.
+    # A component waits for its container, which loads components one by one.
     rule = rule or StartRule()
     before = previous_component(job.nodes, index)
     return replace(
@@ -307,7 +303,7 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
     try:
         signature = inspect.signature(target, follow_wrapped=False)
     except (TypeError, ValueError):
-        return  # nobody knows
+        return  # unknown
     names = [name for name, one in signature.parameters.items() if one.kind in _BY_NAME]
     takes_any = any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
     for name in spec.arguments:

@@ -37,11 +37,8 @@ from rsltrace.run.process import run_as_main, user_modules
 from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.model.regular_file import read_regular
 
-# Programs that are run, not imported: what ``python script.py`` and ``python -m module`` start.
-#
-# Their code runs as ``__main__``: in the module of that name which every main has to itself, as a
-# process has. So ``unittest.main()``, ``pickle`` and ``dataclasses`` find what the program
-# defines.
+# Scripts and modules run as ``__main__``, in a module of that name of their own. So
+# ``unittest.main()``, ``pickle`` and ``dataclasses`` find what the program defines.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""From a job's ``faults:`` to what goes wrong in a world: messages by topic, and nodes."""
+"""Arm the faults of a job: of messages, by topic, and of nodes."""
 
 from __future__ import annotations
 

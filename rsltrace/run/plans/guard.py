@@ -1,4 +1,4 @@
-"""The guard of a run, as its job wants it."""
+"""The guard of a run."""
 
 from __future__ import annotations
 

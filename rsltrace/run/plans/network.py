@@ -1,4 +1,4 @@
-"""From a job's ``delay:`` to the plan of a network: models, files read, times made absolute."""
+"""Make the delay and clock models of a job: files are read, times made absolute."""
 
 from __future__ import annotations
 
@@ -32,8 +32,6 @@ from rsltrace.simulation.chance.distribution import (
 )
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.trace.model.texts import format_duration
-
-# From a job's ``clocks:`` to the clocks of its nodes.
 
 
 def clocks_of(job: Job) -> tuple[ClockRule, ...]:

@@ -187,10 +187,8 @@ def _merge_outages(outages: Sequence[Outage]) -> tuple[Outage, ...]:
     return tuple(found)
 
 
-# Which model each link of a graph has: the rules of a job, by the names of topics and nodes.
-
 QUIET_TOPICS = frozenset(("/rosout", "/parameter_events"))
-"""Topics that the default delay leaves alone: nobody's behaviour is meant when it is set."""
+"""Topics without the default delay."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
-"""Named streams of random numbers: one per link, so that no link disturbs another.
+"""Named streams of random numbers: one per link, so that links do not disturb each other.
 
-A stream is a function of (seed, name, counter) and of nothing else. Adding, removing or renaming
-one leaves all others as they were, which a generator shared by all cannot promise.
+A stream is a function of (seed, name, counter) only. Adding, removing or renaming one leaves all
+others unchanged, which a shared generator cannot promise.
 """
 
 from __future__ import annotations
@@ -17,11 +17,8 @@ from math import frexp, ldexp
 import numpy as np
 import numpy.typing as npt
 
-# Logarithm and exponential with the same last bit on every machine.
-#
-# C libraries differ in the last bit of ``log`` and ``exp``. These use only operations that IEEE
-# 754 rounds correctly, in one fixed order; they are good to about 1e-15, which is all that is
-# needed.
+# C libraries differ in the last bit of ``log`` and ``exp``. These use only operations that IEEE 754
+# rounds correctly, in a fixed order, and are good to about 1e-15.
 
 _SQRT_HALF = 0.7071067811865476
 _LN2_HIGH = 0.693147180369123816490
@@ -109,9 +106,6 @@ class Stream:
             blocks = min(2 * blocks, _BLOCKS_MAX)
             bits = np.frombuffer(b"".join(digests), dtype="<u8").astype(np.uint64)
             yield (bits >> np.uint64(12) | _ONE).view(np.float64) - _LESS
-
-
-# A clock that is wrong: offset, drift, and jumps that are given or drawn.
 
 
 @dataclass(frozen=True, slots=True)

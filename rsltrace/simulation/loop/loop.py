@@ -36,10 +36,6 @@ class Dispatchable(Protocol):
         """Name it for an error message: ``/listener: subscription /chatter``."""
 
 
-class TimerOwner(Dispatchable, Protocol):
-    """What a due timer dispatches."""
-
-
 NOTHING_LEFT = "nothing left to do"
 END_OF_TIME = "what is due next is beyond 2**63 ns, where ROS's time ends"
 TIME_NS_MAX = 2**63 - 1
@@ -47,10 +43,9 @@ ORDER_BAG = 0
 ORDER_RELEASE = 1
 
 Release = tuple[Any, ...]
-"""What is scheduled: when (ns), its order (``ORDER_…``), its place in the order of scheduling, what
-is called with this very tuple, and whatever that needs. The call returns who is ready now, or None
-if it has seen to that itself. A message's is also what waits in the queue of its subscription:
-nearly every event of a run with delays is one, and makes one tuple."""
+"""Time (ns), order (``ORDER_…``), place in the order of scheduling, the function called with this
+tuple, and its arguments. The function returns what is ready now, or None. A message's release also
+waits in the queue of its subscription: nearly every event of a run with delays makes one tuple."""
 
 
 def _act(release: Release) -> None:
@@ -63,7 +58,7 @@ class EventLoop:
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
     (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases. As long as there are
     fewer events than ``looks_at``, the loop would do nothing now but dispatch the next task or the
-    first of ``ready``: whoever it has given the stack to may do so in its place.
+    first of ``ready``: the code that now has the stack may do so instead.
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -214,7 +209,7 @@ class EventLoop:
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
         timer_ns = horizon_ns = self.looks_at = -1
         while True:
-            # Time steps in which one thing arrives and nothing else is due. To compare two times
+            # Time steps with one arrival and nothing else due. To compare two times
             # takes Python longer than to see that they are the same object, and here it shows.
             while scheduled and not (ready or tasks or idle):
                 next_ns = scheduled[0][0]
@@ -253,7 +248,7 @@ class EventLoop:
                 else:
                     now_ns = self.now_ns  # a callback may have blocked, and time have passed
                     if timers.next_ns <= now_ns:
-                        owner: TimerOwner = timers.head.owner  # type: ignore[union-attr, assignment]
+                        owner: Dispatchable = timers.head.owner  # type: ignore[union-attr, assignment]
                         owner.dispatch()
                     elif not idle or not self._run_idle():
                         break

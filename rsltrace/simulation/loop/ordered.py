@@ -107,16 +107,14 @@ class OrderedLoop(EventLoop):
         self.place: Callable[[Dispatchable], Place]
         self.charge = ExecutionCharge()
         self.choices: PolicyChoices | None = None
-        """What the policy has chosen so far, where somebody wants to know."""
+        """The policy's choices so far, if they are recorded."""
         self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
-        """Told of every choice, of one alone, too, if somebody has to know."""
+        """Called at every choice, even of one candidate."""
         self.hold_until: Callable[[Sequence[Candidate], Moment], int | None] | None = None
-        """Says until when all that is ready has to wait, if somebody wants that; None: it need
-        not."""
+        """Returns until when all that is ready has to wait, or None."""
         self.on_lull: Callable[[], None] | None = None
-        """Told each time that nothing is left that could run, if somebody has to know."""
+        """Called each time that nothing is left to run."""
         self.has_begun = False
-        """Whether it has run anything yet."""
         self._forced: Place | None = None
         self._held_until_ns = -1
         self._held: dict[object, None] = {}

@@ -15,10 +15,8 @@ from rsltrace.errors import RunError
 from rsltrace.simulation.chance.stream import Stream
 from rsltrace.trace.model.texts import format_seconds
 
-# What a policy has chosen, one byte for each choice it had: enough to choose the same again.
-#
-# The events of a trace do not say it all. What is told to an executor of the user's own, or wakes
-# somebody who looks and waits again, has no event, and yet it matters when it was its turn.
+# A policy's choices are recorded, one byte each. A trace's events are not enough to repeat them:
+# what is handed to one of the user's own executors, or wakes a polling call, has no event.
 
 _LARGE = 255
 """Stands for a choice that needs more than one byte, which follows in four."""
@@ -160,10 +158,7 @@ class Permutation:
         return self._below(len(ready)) if len(ready) > 1 else 0
 
 
-# Policies of a search for the order that fails: departures from the plain order, and PCT.
-#
-# Both count choices: the times at which more than one could run. Where only one can, there is
-# nothing to choose, and nothing is counted.
+# Search policies. Both count choices: the times at which more than one callback could run.
 
 _SHOWN = 5
 

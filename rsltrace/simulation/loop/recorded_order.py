@@ -1,4 +1,4 @@
-"""The policy ``recorded``: what a recording ran next runs next, event by event."""
+"""The policy ``recorded``: repeats the order of a recording, event by event."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THE_RUN = "the run"
 _OF_THE_RUN = {
     int(EventKind.CONSTRUCT): "the construction of a node",
     int(EventKind.CLOCK_JUMP): "the jump to the start",
-    int(EventKind.OUTSIDE): "something that the run was told from outside",
+    int(EventKind.OUTSIDE): "an event from outside of the run",
 }
 _SHOWN = 5
 
@@ -142,16 +142,13 @@ def has_event(item: Any) -> bool:
     return is_there and not is_told and not getattr(item, "quiet", False)
 
 
-# The policy ``recorded`` of a native run: what ran next there runs next, where it can.
-#
-# A native run does not do the same again: its timers drift, its messages take their time. So its
-# order is a wish. Callbacks are the same if their names are, and if each is the one of that
-# number: the third of a timer is the third of it there.
+# The order of a native run can only be followed approximately: its timers drift, its messages take
+# time. Callbacks correspond by name and number: a timer's third call there is its third call here.
 
 CALLBACKS = frozenset(
     map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))
 )
-"""What has a place in the order; everything else runs as soon as it can."""
+"""Events with a place in the order; all others run as soon as they can."""
 
 
 class NativeCallback(NamedTuple):

@@ -1,4 +1,4 @@
-"""What participants and all that they make have in common (DDS: a domain entity)."""
+"""The base classes of participants and their endpoints (DDS: domain entities)."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class DomainEntity:
 
     kind: EntityKind
     announced = True
-    """Whether the trace is told of the entity when it is created."""
+    """Whether the entity is recorded when it is created."""
     begins_active = True
     graph: GraphMembership | None = None
     """The graph it has joined."""
@@ -155,9 +155,6 @@ def callback_name(callback: Callable[..., Any] | Any) -> str:
     except Exception:
         pass
     return type(callback).__qualname__
-
-
-# Entities for which something arrives: the queue between the loop and their callback.
 
 
 class Receiver(DomainEntity):

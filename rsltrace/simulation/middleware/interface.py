@@ -1,4 +1,4 @@
-"""Types by name: all that the middleware knows of what it carries."""
+"""Message and service types by name, faults of single messages, and the source of callbacks."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import PurePath
 from types import CodeType, CoroutineType, FunctionType, MethodType
-
-# Single messages that go wrong, by their number on a topic: lost, late, or twice.
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,8 +65,6 @@ class AllTopicFaults(dict[str, TopicFaults]):
     def get(self, topic: str, default: object = None) -> TopicFaults:
         return self.setdefault(topic, TopicFaults(()))
 
-
-# Where the code of a callback is: file and line, in words that hold on any machine.
 
 _WRAPPED_MAX = 50
 

@@ -1,6 +1,6 @@
-"""Links with a model: messages, requests and responses that take time, get lost or come twice.
+"""Links with a model: messages, requests and responses are delayed, lost or duplicated.
 
-A graph without models has no links, and its publications go straight into the queues.
+A graph without models has no links; its publications go straight into the queues.
 """
 
 from __future__ import annotations
@@ -30,11 +30,9 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT
 from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
 
-# The usual links in a hurry: every message arrives, in the order of sending, at once or later.
-#
-# With a delay on every link, most events of a run are messages that come this way. What a link has
-# to look up is therefore bound once, in a closure, its arrivals go straight into the loop's queue,
-# and its draws to the recorder without a call.
+# Fast links: every message arrives, in order, at once or later. With a delay on every link, most
+# events of a run come this way, so lookups are bound once in a closure, arrivals go straight into
+# the loop's queue, and draws to the recorder without a call.
 
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""

@@ -1,4 +1,4 @@
-"""Participants: those who publish, subscribe, call and serve; in ROS, nodes."""
+"""Participants, which are nodes in ROS, and their QoS events."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from rsltrace.simulation.middleware.qos.status import EndpointEvents
 from rsltrace.simulation.middleware.timer import Timer
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT
-
-# QoS events: news of an endpoint's status, for whoever wants to hear of it.
 
 
 class QosEndpoint(Protocol):
@@ -87,7 +85,7 @@ class Participant(DomainEntity):
     kind = EntityKind.NODE
     process: object = None
     held: list[Any] | None = None
-    """What would run of it, besides its callbacks, if it did not hang."""
+    """What waits to run, besides its callbacks, while it hangs."""
     number = 1
 
     def __init__(self, dispatcher: Dispatcher, name: str, namespace: str, door: Door) -> None:

@@ -20,8 +20,6 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import OutputKind
 
-# What endpoints send through: the trace's channels, links with a model, and who listens in.
-
 Watcher = Callable[[Any, bytes], None]
 """Is called with the publisher and the canonical bytes of each message on a topic."""
 

@@ -19,11 +19,8 @@ from rsltrace.simulation.middleware.events.observer import EventCall, EventObser
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import Draw, EventKind, encode_draw
 
-# At what rate chains run: a message has the period of the timer that it came of.
-#
-# The rate of a subscription (service, client) is the fastest of the chains that have reached it so
-# far, that of a timer its own; of what no timer has caused (bags, drivers), its node's fastest
-# timer.
+# The period of a subscription (service, client) is that of the fastest chain that has reached it;
+# without a timer as cause (bags, drivers), that of its node's fastest timer.
 
 _UNKNOWN = -1
 

@@ -1,4 +1,4 @@
-"""Subscriptions: what has been published waits in their queue until their callback runs."""
+"""Subscriptions: published messages wait in their queue until their callback runs."""
 
 from __future__ import annotations
 

@@ -27,8 +27,6 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import pack_operation
 from rsltrace.trace.recorder import Recorder
 
-# The book of entities: their ids, and when the trace is told of each.
-
 
 class Recordable(Protocol):
     """Something with an id in the trace. ``announced``: it is recorded when it is created."""

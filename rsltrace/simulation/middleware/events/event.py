@@ -14,10 +14,6 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
 from rsltrace.trace.model.finding import EndlessWait
 
-# Who and what there has been in a run: every node, topic, service and timer.
-#
-# A rule of a job that fits none of them does nothing, and nobody would notice.
-
 _ACTIONS = (EntityKind.ACTION_CLIENT, EntityKind.ACTION_SERVER)
 _ACTION_TOPICS = ("feedback", "status")
 _ACTION_SERVICES = ("send_goal", "cancel_goal", "get_result")
@@ -85,9 +81,6 @@ class NameRegistry(EventObserver):
     @property
     def topics(self) -> dict[str, None]:
         return {topic: None for _, topic in (*self.publishers, *self.subscriptions)}
-
-
-# How a run has gone so far: the error that ends it, and what is worth saying of it.
 
 
 @dataclass(slots=True)

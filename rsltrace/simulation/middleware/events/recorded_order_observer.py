@@ -21,8 +21,6 @@ from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.texts import format_seconds
 
-# A run that follows the order of a native one as far as it can.
-
 
 class NativeOrderObserver(EventObserver):
     """Tells the order of a native run what has run, and lets the loop wait."""
