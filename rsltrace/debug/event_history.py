@@ -11,7 +11,7 @@ import tempfile
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.guard.redirect import copy_of
 from rsltrace.replay.verification import limit_of
@@ -32,37 +32,8 @@ _pwrite = copy_of(os.pwrite)  # type: ignore[arg-type]
 _fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 
 
-class EventHistory(Protocol):
-    """The events of a run, by index."""
-
-    trace: Trace | None
-    ended: Stop | None
-    """Why the run goes no further than ``limit``, where that is known beforehand."""
-
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        """What is open for it, and meant to be shared by all processes of a session."""
-
-    @property
-    def limit(self) -> int | None:
-        """How many events there are at most, None if nobody knows."""
-
-    @property
-    def known(self) -> int:
-        """How many events are known so far."""
-
-    def hashes(self, first: int) -> Iterator[int]:
-        """Yield the chain hashes of the events from ``first`` on, as far as they are known."""
-
-    def learn(self, index: int, rest: bytes, chain_hash: int) -> bool:
-        """Take note of an event that has not been there before; False if there can be none."""
-
-    def row(self, index: int) -> tuple[bytes, int]:
-        """Return an event, packed, and its chain hash. Raises IndexError."""
-
-
 class TraceHistory:
-    """The events of a trace: a run that has been recorded."""
+    """The events of a trace. ``ended`` says why the run goes no further than ``limit`` events."""
 
     def __init__(self, trace: Trace) -> None:
         self.trace: Trace | None = trace
@@ -70,9 +41,7 @@ class TraceHistory:
         count, self.ended = limit_of(trace, None)
         self._limit = count if count >= 0 else trace.event_count
 
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        return ()
+    descriptors: tuple[int, ...] = ()
 
     @property
     def limit(self) -> int | None:
@@ -80,16 +49,20 @@ class TraceHistory:
 
     @property
     def known(self) -> int:
+        """How many events are known so far."""
         return self._limit
 
     def hashes(self, first: int) -> Iterator[int]:
+        """Yield the chain hashes of the known events from ``first`` on."""
         for rows in self._trace.events(first):
             yield from rows["chain_hash"].tolist()
 
     def learn(self, index: int, rest: bytes, chain_hash: int) -> bool:
+        """Add an event; return False if the history is complete."""
         return False
 
     def row(self, index: int) -> tuple[bytes, int]:
+        """Return an event, packed, and its chain hash. Raises IndexError."""
         event = self._trace.event(index)
         rest = EVENT_REST.pack(
             event.index,
@@ -149,6 +122,8 @@ class RunHistory:
             raise IndexError(f"event {index} has not run yet")
         return data[8:], int.from_bytes(data[:8], "little")
 
+
+EventHistory = TraceHistory | RunHistory
 
 Payload = tuple[int, bytes]
 """The channel of a message, and its canonical CDR."""

@@ -40,7 +40,7 @@ class Supervisor:
             "go_to": self._go_to,
             "break": self._break,
             "clear": self._clear,
-            "breakpoints": lambda request: self._listed(),
+            "breakpoints": lambda request: self._conditions(),
             "inspect": self._pass_on,
             "evaluate": self._pass_on_apart,
             "node": self._pass_on_apart,
@@ -201,9 +201,6 @@ class Supervisor:
     def _clear(self, request: Message) -> None:
         if self._breakpoints.pop(request["number"], None) is None:
             raise DebugError(f"there is no breakpoint {request['number']}")
-
-    def _listed(self) -> list[Message]:
-        return self._conditions()
 
     # -- what the simulation answers itself --------------------------------------------------------
 

@@ -94,14 +94,11 @@ class CheckpointTree:
 
     # -- the cursor --------------------------------------------------------------------------------
 
-    def ask_cursor(self, request: Message) -> Any:
+    def ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
         """Send a request to the process at the session's position.
 
         :raises Lost: that process ended; another one stands there now.
         """
-        return self._ask_cursor(request)
-
-    def _ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
         try:
             return self._ask(self._cursor, request, whole=whole)
         except Lost as error:
@@ -109,7 +106,7 @@ class CheckpointTree:
 
     def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
         """Have a copy run user code; the copy may be killed."""
-        answer = self._ask_cursor(request, whole=True)
+        answer = self.ask_cursor(request, whole=True)
         if "with" not in answer:
             return answer["ok"]
         copy = SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
@@ -127,7 +124,7 @@ class CheckpointTree:
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
             request["ladder"] = self._checkpoints.ladder(int(before["index"]), goal["until"])
-        answer: Message = self._ask_cursor(request)
+        answer: Message = self.ask_cursor(request)
         self.position = answer["position"]
         return answer
 
@@ -178,9 +175,10 @@ class CheckpointTree:
     def _leave_cursor(self) -> None:
         """Keep the cursor's process as a checkpoint, or end it."""
         position = self.position
-        if self._checkpoints.count_max and self._copies and not position["is_next"]:
+        can_copy = self._checkpoints.count_max and not self._why_no_checkpoints
+        if can_copy and not position["is_next"] and not position.get("over"):
             one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), self._cursor)
-            if not self._is_over and self._checkpoints.add(one):
+            if self._checkpoints.add(one):
                 return
         self.family.kill(self._cursor)
 
@@ -267,14 +265,6 @@ class CheckpointTree:
         return answer["position"] if answer["reason"] == "breakpoint" else None
 
     # -- checkpoints -------------------------------------------------------------------------------
-
-    @property
-    def _copies(self) -> bool:
-        return not self._why_no_checkpoints
-
-    @property
-    def _is_over(self) -> bool:
-        return bool(self.position.get("over"))
 
     def _interval(self) -> float:
         return _INTERVAL_S if self._checkpoints.count_max else 0.0

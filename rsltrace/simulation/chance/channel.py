@@ -249,13 +249,8 @@ class NetworkPlan:
     def topic_model(self, topic: str, sender: str, receiver: str) -> Model | None:
         """Return the model of a link between two nodes, or None."""
         model = self._link_model(topic, sender, receiver)
-        if model is None:
-            model = _by_name(self.topics, topic)
-        if model is None:
-            model = _by_name(self.table, topic)
-        if model is None and topic not in QUIET_TOPICS:
-            model = self.default
-        return model
+        model = model or _by_name(self.topics, topic) or _by_name(self.table, topic)
+        return self.default if model is None and topic not in QUIET_TOPICS else model
 
     def service_model(self, service: str) -> Model | None:
         """Return the model of a service's requests and responses, or None."""

@@ -46,13 +46,11 @@ class Place:
     told: bool = False
 
 
+@dataclass(eq=False, slots=True)
 class ExecutionCharge:
     """The execution time of the current callback; the middleware adds to it."""
 
-    __slots__ = ("duration_ns",)
-
-    def __init__(self) -> None:
-        self.duration_ns = 0
+    duration_ns: int = 0
 
 
 class _ReadyQueue:

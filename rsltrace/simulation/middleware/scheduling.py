@@ -6,7 +6,7 @@ from __future__ import annotations
 from array import array
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.simulation.chance.distribution import Distribution, Sampler
 from rsltrace.simulation.chance.stream import Stream
@@ -115,13 +115,6 @@ class SchedulingPlan:
     start_ns: int = 0
 
 
-class Schedulable(Protocol):
-    """What is in a queue of the loop: it can say what a policy has to know of it."""
-
-    def runnable(self) -> Runnable:
-        """Return what there is to know."""
-
-
 class Scheduling:
     """Describes to the loop what may run."""
 
@@ -138,7 +131,7 @@ class Scheduling:
 
     # -- what may run --------------------------------------------------------------------------
 
-    def place(self, item: Schedulable | Any) -> Place:
+    def place(self, item: Any) -> Place:
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
         workers = self._workers_of(what)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.simulation.middleware.entity import Receiver, callback_name
@@ -21,14 +22,12 @@ _REQUEST = int(OutputKind.REQUEST)
 _RESPONSE = int(OutputKind.RESPONSE)
 
 
+@dataclass(eq=False, slots=True)
 class RequestId:
-    """Who asked, and which of its requests it is (``rmw_request_id_t``)."""
+    """A request by its client and number (``rmw_request_id_t``)."""
 
-    __slots__ = ("client", "sequence_number")
-
-    def __init__(self, client: Client, sequence_number: int) -> None:
-        self.client = client
-        self.sequence_number = sequence_number
+    client: Client
+    sequence_number: int
 
 
 class ServiceInfo:

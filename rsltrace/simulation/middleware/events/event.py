@@ -124,6 +124,7 @@ class EventOwner(Protocol):
     door: Door
 
 
+@dataclass(eq=False, slots=True)
 class Event:
     """The current event: one object that each event fills in anew.
 
@@ -132,34 +133,18 @@ class Event:
     after it. ``node`` is an ``Owner`` or None.
     """
 
-    __slots__ = (
-        "busy_ns",
-        "cause_event",
-        "cause_output",
-        "entity",
-        "flags",
-        "handle",
-        "input_hash",
-        "kind",
-        "node",
-        "on_end",
-        "quiet",
-        "took_ns",
-    )
-
-    def __init__(self) -> None:
-        self.handle: Dispatchable | None = None
-        self.entity = 0
-        self.node: Any = None
-        self.kind = 0
-        self.cause_event = NO_EVENT
-        self.cause_output = 0
-        self.input_hash = 0
-        self.flags = 0
-        self.quiet = False
-        self.on_end: Callable[[], None] | None = None
-        self.busy_ns = 0
-        self.took_ns = 0
+    handle: Dispatchable | None = None
+    entity: int = 0
+    node: Any = None
+    kind: int = 0
+    cause_event: int = NO_EVENT
+    cause_output: int = 0
+    input_hash: int = 0
+    flags: int = 0
+    quiet: bool = False
+    on_end: Callable[[], None] | None = None
+    busy_ns: int = 0
+    took_ns: int = 0
 
 
 class OutsideEvent:

@@ -12,10 +12,10 @@ and restoring an old method would remove later replacements.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
-from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.trace.model.entity import Entity
 
 
@@ -47,6 +47,7 @@ class ObserverOrder(IntEnum):
 ExecuteArguments = tuple[Any, int, Any, int, Callable[..., object], tuple[Any, ...], int, int, int]
 
 
+@dataclass(eq=False, slots=True)
 class EventCall:
     """An event that is about to run; an observer may change it.
 
@@ -54,41 +55,16 @@ class EventCall:
     observer rejects the event.
     """
 
-    __slots__ = (
-        "args",
-        "callback",
-        "cause_event",
-        "cause_output",
-        "entity",
-        "handle",
-        "input_hash",
-        "kind",
-        "node",
-        "on_end",
-    )
-
-    def __init__(
-        self,
-        handle: Dispatchable,
-        entity: int,
-        node: Any,
-        kind: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        cause_event: int,
-        cause_output: int,
-        input_hash: int,
-    ) -> None:
-        self.handle: Any = handle
-        self.entity = entity
-        self.node = node
-        self.kind = kind
-        self.callback = callback
-        self.args = args
-        self.cause_event = cause_event
-        self.cause_output = cause_output
-        self.input_hash = input_hash
-        self.on_end: list[Callable[[], None]] = []
+    handle: Any
+    entity: int
+    node: Any
+    kind: int
+    callback: Callable[..., object]
+    args: tuple[Any, ...]
+    cause_event: int
+    cause_output: int
+    input_hash: int
+    on_end: list[Callable[[], None]] = field(default_factory=list)
 
     def values(self) -> ExecuteArguments:
         return (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.simulation.middleware.qos.policies import PolicyKind
 
@@ -59,20 +59,13 @@ _KINDS: dict[str, type] = {
 }
 
 
-class StatusListener(Protocol):
-    """Wants to hear of one status."""
-
-    def trigger(self) -> None:
-        """There is news, perhaps."""
-
-
 class EndpointEvents:
     """The statuses of one endpoint, and their listeners."""
 
     __slots__ = ("_statuses", "listeners")
 
     def __init__(self) -> None:
-        self.listeners: dict[str, StatusListener] = {}
+        self.listeners: dict[str, Any] = {}  # QosEvents, by status
         self._statuses: dict[str, Any] = {}
 
     def matched(self, change: int) -> None:

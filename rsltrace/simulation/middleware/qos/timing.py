@@ -20,11 +20,14 @@ from rsltrace.simulation.middleware.qos.status import (
 
 
 class _QosTimer(ABC):
-    """Calls ``_up`` when nothing was seen for ``period_ns``."""
+    """Calls ``_up`` when nothing was seen for ``period_ns`` and a callback wants ``status``."""
 
-    def __init__(self, loop: EventLoop, period_ns: int) -> None:
+    status: str
+
+    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
         self._loop = loop
         self._period_ns = period_ns
+        self._events = events
         self._due_ns = -1
         self._scheduled = False
         self.over = False
@@ -36,7 +39,7 @@ class _QosTimer(ABC):
             self._schedule()
 
     def _schedule(self) -> None:
-        if self._wanted():
+        if self.status in self._events.listeners:
             self._scheduled = True
             self._loop.schedule(self._due_ns, self._look)
 
@@ -50,23 +53,14 @@ class _QosTimer(ABC):
             self._schedule()
 
     @abstractmethod
-    def _wanted(self) -> bool:
-        """Return whether anybody listens."""
-
-    @abstractmethod
     def _up(self) -> None:
-        """Say that the time is up."""
+        """Report that the period is over."""
 
 
 class DeadlineTimer(_QosTimer):
     """Counts the periods without a message, from the first message on."""
 
-    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
-        super().__init__(loop, period_ns)
-        self._events = events
-
-    def _wanted(self) -> bool:
-        return DEADLINE_MISSED in self._events.listeners
+    status = DEADLINE_MISSED
 
     def _up(self) -> None:
         self._events.add(DEADLINE_MISSED, total=1)
@@ -77,12 +71,7 @@ class DeadlineTimer(_QosTimer):
 class OfferedLease(_QosTimer):
     """Notices that a publisher with manual liveliness has not shown life in time."""
 
-    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
-        super().__init__(loop, period_ns)
-        self._events = events
-
-    def _wanted(self) -> bool:
-        return LIVELINESS_LOST in self._events.listeners
+    status = LIVELINESS_LOST
 
     def _up(self) -> None:
         self._events.add(LIVELINESS_LOST, total=1)
@@ -95,11 +84,12 @@ class RequestedLease(_QosTimer):
     manual liveliness from its first sign of life until a lease passes without another.
     """
 
+    status = LIVELINESS_CHANGED
+
     def __init__(
         self, loop: EventLoop, lease_ns: int, kind: Liveliness, events: EndpointEvents
     ) -> None:
-        super().__init__(loop, lease_ns)
-        self._events = events
+        super().__init__(loop, lease_ns, events)
         self._manual = kind is Liveliness.MANUAL_BY_TOPIC
         self._alive: bool | None = None
         if not self._manual:
@@ -122,9 +112,6 @@ class RequestedLease(_QosTimer):
             self._events.add(LIVELINESS_CHANGED, **{_NAME[self._alive]: -1})
         self._alive = None
         self.over = True
-
-    def _wanted(self) -> bool:
-        return LIVELINESS_CHANGED in self._events.listeners
 
     def _up(self) -> None:
         self._becomes(False)
