@@ -91,8 +91,6 @@ class Engine(EventObserver):
         session.world.domain.dispatcher.add_observer(self)
         ledger.on_difference = self._differs
 
-    # -- where it is called ------------------------------------------------------------------------
-
     def after_event(self) -> None:
         if self.ledger.events >= self._mark:
             self._attend()
@@ -245,8 +243,6 @@ class Engine(EventObserver):
         trace = history.trace
         return "the end of the run" if trace is None else trace.result.get("stop_reason", "")
 
-    # -- stopping ----------------------------------------------------------------------------------
-
     def run(self) -> None:
         """Run the whole session, stopping as requested. Does not return."""
         session = self.session
@@ -368,8 +364,6 @@ class Engine(EventObserver):
             self._apart(lambda: inspection.attributes(self, request["name"]))
         else:
             raise DebugError(f"there is no request {do!r}")
-
-    # -- copies ------------------------------------------------------------------------------------
 
     def _fork_for(self, request: Message) -> None:
         other = self._forked()

@@ -200,8 +200,6 @@ class EventLedger(TraceWriter):
             return chain_hash
         return known
 
-    # -- what is kept for one event ----------------------------------------------------------------
-
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
         """Keep a message until the next event has ended."""
         self._payloads_under_way.append((channel_id, data))
@@ -217,8 +215,6 @@ class EventLedger(TraceWriter):
 
     def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
         return 0
-
-    # -- what is kept ------------------------------------------------------------------------------
 
     def add_entity(self, entity: Entity) -> int:
         self.entities[entity.id] = entity
@@ -265,8 +261,6 @@ class EventLedger(TraceWriter):
     @property
     def output_hash(self) -> int:
         return int(EVENT_REST.unpack(self.rest)[4]) if self.rest else 0
-
-    # -- in words ----------------------------------------------------------------------------------
 
     def event(self) -> dict[str, Any] | None:
         """Return the last event as an answer, None before the first."""

@@ -274,9 +274,6 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
     return {**found, **getattr(value, "__dict__", {})}
 
 
-# -- what there is ---------------------------------------------------------------------------------
-
-
 def nodes(run: StoppedRun) -> list[dict[str, Any]]:
     return [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}

@@ -86,8 +86,6 @@ class Supervisor:
             text = f"not a request of this protocol: {type(error).__name__}: {error}"
             return {"error": {"kind": "DebugError", "message": text}}
 
-    # -- forward -----------------------------------------------------------------------------------
-
     @property
     def _index(self) -> int:
         return int(self.tree.position["index"])
@@ -144,8 +142,6 @@ class Supervisor:
     def _go_on(self, request: Message) -> Message:
         return self._forward()
 
-    # -- back --------------------------------------------------------------------------------------
-
     def _reverse_step(self, request: Message) -> Message:
         goal = self._index - _count(request)
         if self.tree.position["is_next"]:
@@ -163,8 +159,6 @@ class Supervisor:
 
     def _reverse_go_on(self, request: Message) -> Message:
         return self.tree.go_back({"breakpoints": self._conditions()})
-
-    # -- searches ----------------------------------------------------------------------------------
 
     def _sent_by(self, request: Message) -> Message:
         event = self.tree.ask_cursor({"do": "event", "index": int(request["index"])})
@@ -189,8 +183,6 @@ class Supervisor:
             raise DebugError(f"{request['condition']} has not been true so far")
         return found
 
-    # -- breakpoints -------------------------------------------------------------------------------
-
     def _break(self, request: Message) -> Message:
         text = str(request["at"])
         self.tree.ask_cursor({"do": "check", "text": text})
@@ -201,8 +193,6 @@ class Supervisor:
     def _clear(self, request: Message) -> None:
         if self._breakpoints.pop(request["number"], None) is None:
             raise DebugError(f"there is no breakpoint {request['number']}")
-
-    # -- what the simulation answers itself --------------------------------------------------------
 
     def _pass_on(self, request: Message) -> Any:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})

@@ -58,8 +58,6 @@ class CheckpointTree:
         self._output, self._output_end = os.pipe()
         os.set_blocking(self._output, False)
 
-    # -- beginning ---------------------------------------------------------------------------------
-
     def start(self) -> Message:
         """Open the source; return what is known of it.
 
@@ -91,8 +89,6 @@ class CheckpointTree:
         except DebugError:
             self.family.kill(root)
             raise
-
-    # -- the cursor --------------------------------------------------------------------------------
 
     def ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
         """Send a request to the process at the session's position.
@@ -149,8 +145,6 @@ class CheckpointTree:
                 break
         self.position = answer["position"]
         return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
-
-    # -- going back --------------------------------------------------------------------------------
 
     def go_to(self, goal: Message) -> Message:
         if "until" in goal:
@@ -264,8 +258,6 @@ class CheckpointTree:
             self.family.kill(process)
         return answer["position"] if answer["reason"] == "breakpoint" else None
 
-    # -- checkpoints -------------------------------------------------------------------------------
-
     def _interval(self) -> float:
         return _INTERVAL_S if self._checkpoints.count_max else 0.0
 
@@ -329,8 +321,6 @@ class CheckpointTree:
             "bytes": self.memory(),
             "why_not": self._why_no_checkpoints,
         }
-
-    # -- talking -----------------------------------------------------------------------------------
 
     def next_request(self) -> Message | None:
         """Wait for the client's next request; None once it has disconnected."""

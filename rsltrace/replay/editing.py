@@ -256,8 +256,6 @@ class EditObserver(EventObserver):
             self.error = EditError(f"{edit.text!r} at event {self._loop.events}: {why}")
         self._loop.stop(FAILED)
 
-    # -- between two events ----------------------------------------------------------------------
-
     def _between(self, edit: Edit) -> None:
         action = edit.action
         if edit.topic is not None:
@@ -311,8 +309,6 @@ class EditObserver(EventObserver):
             return result
 
         domain.filter(topic, edited)
-
-    # -- the event that is about to run ----------------------------------------------------------
 
     def _event(self, edit: Edit, call: EventCall) -> bool:
         """Make an edit of an event; return whether the event runs now."""

@@ -128,8 +128,6 @@ class Driver:
         loop = self.loop
         return loop.events, len(loop.ready), len(loop.tasks)
 
-    # -- the gate, on the loop's stack ---------------------------------------------------------
-
     def _gate(self, next_ns: int | None) -> bool:
         if not self._news:
             if self._to_the_end:
@@ -158,8 +156,6 @@ class Driver:
         self.loop.now_ns = until_ns
         return False
 
-    # -- who listens -------------------------------------------------------------------------------
-
     def tell_later(self, callback: Callable[[Any], object], message: Any) -> None:
         self._news.append((callback, message))
 
@@ -173,8 +169,6 @@ class Driver:
         finally:
             self._who = _ActiveCode.DRIVER
         return bool(news) and not self.ended
-
-    # -- checks ------------------------------------------------------------------------------------
 
     def check_driver(self) -> None:
         """Raise RunError unless the calling code may move time."""

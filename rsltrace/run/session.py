@@ -28,7 +28,7 @@ from rsltrace.run.plans.bags import (
 )
 from rsltrace.run.plans.entries import add_job_location, hook_entries, missed_starts, node_entries
 from rsltrace.run.plans.executables import MainProgram
-from rsltrace.run.plans.faults import arm_node_faults, arm_topic_faults, missed_faults
+from rsltrace.run.plans.faults import BagFaults, arm_node_faults, arm_topic_faults, missed_faults
 from rsltrace.run.plans.guard import RunGuard, install_guard, node_packages
 from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
 from rsltrace.run.plans.processes import make_process_adapter
@@ -87,7 +87,6 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.entry import Entry
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
-    from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.simulation.chance.channel import NetworkPlan
     from rsltrace.simulation.middleware.events.recorded_order_observer import (
         NativeOrderObserver,

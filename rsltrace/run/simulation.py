@@ -103,8 +103,6 @@ class Simulation:
         self._taps: dict[str, list[TopicTap]] = {}
         self._result: RunResult | None = None
 
-    # -- from beginning to end ---------------------------------------------------------------------
-
     def __enter__(self) -> Simulation:
         """Construct the nodes and jump to the start; nothing has run yet.
 
@@ -183,8 +181,6 @@ class Simulation:
         if not self.done:
             self._driver.loop.stop(Stop(reason, exit_code))
 
-    # -- what there is -----------------------------------------------------------------------------
-
     @property
     def now_ns(self) -> int:
         return self._driver.loop.now_ns
@@ -219,8 +215,6 @@ class Simulation:
         there = f"there are: {', '.join(names) or 'none'}"
         hint = did_you_mean(f"/{name.lstrip('/')}", names, there)
         raise RunError(f"there is no node named {name}; {hint}")
-
-    # -- going on ----------------------------------------------------------------------------------
 
     def step(self) -> bool:
         """Run the next time step: all that is ready now, or else all that is due next.
@@ -328,8 +322,6 @@ class Simulation:
         finally:
             self.unsubscribe(tap)
 
-    # -- doing things from outside -----------------------------------------------------------------
-
     def publish(self, topic: str, message: Any, *, qos: Any = 10) -> int:
         """Publish a message at the present time; return to how many subscriptions it goes.
 
@@ -412,8 +404,6 @@ class Simulation:
                     driver.tell_later(tap.callback, message)
 
         return watch
-
-    # -- checks ------------------------------------------------------------------------------------
 
     def _check_going(self) -> None:
         if self.done:

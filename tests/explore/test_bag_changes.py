@@ -19,7 +19,7 @@ from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
 from rsltrace.errors import BagError  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
-from rsltrace.run.plans.bag_faults import (  # noqa: E402
+from rsltrace.run.plans.faults import (  # noqa: E402
     UnfitError,
     changer,
     check_changes,

@@ -206,8 +206,6 @@ class Shell:
         if command.repeats:
             self._last = text
 
-    # -- for commands ------------------------------------------------------------------------------
-
     def show(self, lines: Iterable[str]) -> None:
         for line in lines:
             say(line)
@@ -233,8 +231,6 @@ class Shell:
         nodes = tuple(node["name"] for node in self.session.inspect("nodes"))
         topics = tuple(link["name"] for link in links if link["kind"] in ("topic", "service"))
         return Names(nodes=nodes, topics=topics, entities=(*nodes, *topics))
-
-    # -- Ctrl-C ------------------------------------------------------------------------------------
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:

@@ -94,9 +94,6 @@ def breakpoint_lines(breakpoints: Sequence[Breakpoint]) -> Iterator[str]:
         yield printable(f"{one.number:>3}  {one.text}")
 
 
-# -- what is in a run ------------------------------------------------------------------------------
-
-
 def value_lines(value: Any) -> Iterator[str]:
     if isinstance(value, Mapping):
         yield from _mapping(value, "")
@@ -183,9 +180,6 @@ def _cell(name: str, value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return ", ".join(_cell(name, item) for item in value)
     return str(value)
-
-
-# -- source lines ----------------------------------------------------------------------------------
 
 
 def source_lines(source: Mapping[str, Any] | None) -> Iterator[str]:

@@ -139,8 +139,6 @@ class NodeReplaySession(Session):
         self.script = RecordedScript(columns, unit, self._perform)
         self._answers = ServiceAnswers(columns, unit.is_own)
 
-    # -- what is different from a run of the whole job --------------------------------------------
-
     def _open_bags(self, stack: ExitStack, notes: object) -> None:
         self._bags = []
         self._notes = ()
@@ -237,8 +235,6 @@ class NodeReplaySession(Session):
         index = place - int(self.job.hooks.before is not None)
         nodes = self.job.nodes
         return 0 <= index < len(nodes) and nodes[index].start_after is not None
-
-    # -- what others did --------------------------------------------------------------------------
 
     def _perform(
         self,

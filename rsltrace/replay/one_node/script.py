@@ -104,8 +104,6 @@ class ReplayedEntry:
         """Return the job entry of the construction at ``place`` in the trace."""
         return self._ordinals[place] if place < len(self._ordinals) else place
 
-    # -- who made what ---------------------------------------------------------------------------
-
     def _entry_of_entity(self, entity_id: int) -> int:
         entity = self.columns.trace.entities[entity_id]
         if entity.node not in (0, entity_id):
@@ -226,8 +224,6 @@ class RecordedScript:
             found.setdefault(entity, deque()).append(index)
         return found
 
-    # -- for the loop ----------------------------------------------------------------------------
-
     @property
     def next(self) -> RecordedStep | None:
         waiting = self._waiting
@@ -251,8 +247,6 @@ class RecordedScript:
         while events and events[0] < first.index:
             events.popleft()
         return events[0] if events else NEVER
-
-    # -- for the run -----------------------------------------------------------------------------
 
     def present(self, entity: int) -> int:
         """Return the entity of this run for a recorded one, or -1."""

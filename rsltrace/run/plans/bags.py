@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.job.values.names import check_topic
+from rsltrace.run.plans.faults import BagFaults, check_changes
 from rsltrace.run.plans.scheduling import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
@@ -23,7 +24,6 @@ from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle
     from rsltrace.adapters.rclpy.world import World
-    from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.trace.recordings import Bag
     from rsltrace.trace.recordings.playback import Playback
     from rsltrace.trace.recordings.topic import BagTopic, StoredTopic
@@ -186,8 +186,6 @@ def check_bag_types(job: Job, bags: list[BagInput]) -> None:
                 ) from None
             cls = check_type(where, topic)
             if changes:
-                from rsltrace.run.plans.bag_faults import check_changes
-
                 check_changes(job, name, cls)
 
 
@@ -226,7 +224,6 @@ def start_players(
     from rsltrace.adapters.player import Player, make_publisher
     from rsltrace.adapters.rclpy.wire.codec import codec_for
     from rsltrace.adapters.rclpy.wire.interfaces import get_message_class, message_type
-    from rsltrace.run.plans.bag_faults import BagFaults
 
     domain = world.domain
     faults = BagFaults(job, is_open=is_open)

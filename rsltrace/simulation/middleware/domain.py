@@ -59,8 +59,6 @@ class Domain:
                 publisher.observers = found
         return found
 
-    # -- participants without a client library ---------------------------------------------------
-
     def join(self, name: str, namespace: str = "/", door: Door | None = None) -> Participant:
         """Make a participant. Without a ``door`` of its own, an exception ends the run."""
         participant = Participant(self.dispatcher, name, namespace, door or self._door)

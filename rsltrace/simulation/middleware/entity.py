@@ -87,8 +87,6 @@ class DomainEntity:
     def settle(self) -> bool:
         return self.node is not None
 
-    # -- the trace, and who decides what runs --------------------------------------------------
-
     def entity(self) -> Entity:
         detail = self.trace_detail()
         if source := source_of(self.user_callback()):

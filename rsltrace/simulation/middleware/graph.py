@@ -55,8 +55,6 @@ class Graph:
     def services(self, service: str) -> list[Service]:
         return self._services.get(service, [])
 
-    # -- joining and leaving -------------------------------------------------------------------
-
     def add_node(self, node: Participant) -> None:
         self.nodes.append(node)
         self._named.setdefault(node.fully_qualified_name, []).append(node)
@@ -149,8 +147,6 @@ class Graph:
                 f"{other.type_name}, {endpoint.describe()} is {endpoint.type_name}. They "
                 "would never hear each other; rename or remap one of them"
             )
-
-    # -- queries ---------------------------------------------------------------------------------
 
     def endpoints_of(self, node: Participant) -> list[DomainEntity]:
         return [

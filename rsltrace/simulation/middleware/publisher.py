@@ -168,8 +168,6 @@ class Publisher(DomainEntity):
         )
         return self._channel
 
-    # -- who is connected ------------------------------------------------------------------------
-
     def connect(self, subscription: Subscription) -> None:
         """Connect a subscription; fan-out is in creation order of subscriptions."""
         if self.links is None and subscription.timed:
@@ -227,8 +225,6 @@ class Publisher(DomainEntity):
     def acknowledged_ns(self) -> int:
         """Return when all acknowledged messages have arrived."""
         return max((link.acked_ns() for link in self.links or ()), default=0)
-
-    # -- the trace -------------------------------------------------------------------------------
 
     def settle(self) -> bool:
         return True

@@ -129,8 +129,6 @@ class Scheduling:
         if plan.execution:
             dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
 
-    # -- what may run --------------------------------------------------------------------------
-
     def place(self, item: Any) -> Place:
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""

@@ -106,8 +106,6 @@ class Dispatcher:
         self.resume_observers: tuple[EventObserver, ...] = ()
         self.node_observers: tuple[EventObserver, ...] = ()
 
-    # -- who watches and steers --------------------------------------------------------------------
-
     def record(self, recorder: Recorder | None) -> None:
         """Record with ``recorder`` from now on; None: record nothing."""
         self.recorder = recorder
@@ -140,8 +138,6 @@ class Dispatcher:
     def _is_to_happen(self, call: EventCall) -> bool:
         """Ask observers before an event; the first that rejects it is the last one asked."""
         return all(observer.before_event(call) for observer in self._before)
-
-    # -- events ------------------------------------------------------------------------------------
 
     def execute(
         self,
@@ -252,8 +248,6 @@ class Dispatcher:
             yield
         finally:
             self.event.handle = handle
-
-    # -- outputs other than messages -----------------------------------------------------------
 
     def note(self, kind: OutputKind, entity: int, operation: int = 0, value: int = 0) -> int:
         """Add a small output (a timer changed, a task was made); return its position."""
