@@ -69,13 +69,13 @@ class DebugpyServer:
 
     def _trace(self, function: Trace | None) -> None:
         """Replace ``sys.settrace``, so that debugpy's own work is not part of the run."""
-        self._settrace(None if function is None else self._apart(function))
+        self._settrace(None if function is None else self._outside_run(function))
 
-    def _apart(self, function: Trace) -> Trace:
+    def _outside_run(self, function: Trace) -> Trace:
         def trace(frame: FrameType, event: str, arg: Any) -> Any:
             with self._outside():
                 following = function(frame, event, arg)
-            return None if following is None else self._apart(following)
+            return None if following is None else self._outside_run(following)
 
         return trace
 

@@ -93,7 +93,7 @@ class Engine(EventObserver):
 
     def after_event(self) -> None:
         if self.ledger.events >= self._mark:
-            self._attend()
+            self._stop_or_continue()
 
     def before_event(self, call: EventCall) -> bool:
         here = getcurrent()
@@ -148,7 +148,7 @@ class Engine(EventObserver):
         self.diverged = True
         self._mark = 0
 
-    def _attend(self) -> None:
+    def _stop_or_continue(self) -> None:
         """Stop, answer or fork after an event, as needed."""
         index, goal = self.ledger.events, self._goal
         with engage(None):
@@ -169,10 +169,10 @@ class Engine(EventObserver):
             elif goal.is_reached(index):
                 self._stop("step")
             else:
-                self._meanwhile(index)
+                self._leave_due_checkpoints(index)
                 self._set_mark(index)
 
-    def _meanwhile(self, index: int) -> None:
+    def _leave_due_checkpoints(self, index: int) -> None:
         """Leave checkpoints, and look for a request to pause."""
         goal = self._goal
         if goal.ladder and index >= goal.ladder[0]:
@@ -303,7 +303,7 @@ class Engine(EventObserver):
                     if self._begin(request):
                         return
                 elif request["do"] in ("pdb", "debugpy"):
-                    if self._begin_apart(request):
+                    if self._start_debugger(request):
                         return
                 else:
                     self._do(request)
@@ -353,7 +353,7 @@ class Engine(EventObserver):
             self._answer(ok=inspection.inspect_run(self, request["what"]))
         elif do == "evaluate":
             expression, node = request["expression"], request.get("node")
-            self._apart(lambda: inspection.evaluate(self, expression, node))
+            self._run_in_copy(lambda: inspection.evaluate(self, expression, node))
         elif do == "event":
             self._answer(ok=self._event(int(request["index"])))
         elif do == "node name":
@@ -361,7 +361,7 @@ class Engine(EventObserver):
         elif do == "check":
             self._answer(ok=parse_condition(request["text"], self.names()).text)
         elif do == "node":
-            self._apart(lambda: inspection.attributes(self, request["name"]))
+            self._run_in_copy(lambda: inspection.attributes(self, request["name"]))
         else:
             raise DebugError(f"there is no request {do!r}")
 
@@ -389,15 +389,13 @@ class Engine(EventObserver):
         self._next_checkpoint_s = now_s + max(self._goal.interval_s, 8 * self._checkpoint_s)
 
     def _forked(self) -> ForkedCopy | None:
-        """Fork; return the copy, or None in the copy itself, whose ``lines`` are new.
-
-        :raises DebugError: why there can be no copy.
-        """
+        """Fork; return the copy, or None in the copy itself, whose ``lines`` are new."""
         if not self._forks:
             raise DebugError("checkpoints are off")
         pairs = self.session.inner_pairs()
         if self._copied_at != self.ledger.events:  # else nothing has run since the last copy
-            reason = why_not(self._own_descriptors(), self._idle, pairs)
+            own = [self.lines.fileno(), *self.ledger.history.descriptors]
+            reason = why_not(own, self._idle, pairs)
             if reason:
                 raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
@@ -423,10 +421,7 @@ class Engine(EventObserver):
         with copy.end:
             self.lines.send(message, copy.end.fileno())
 
-    def _own_descriptors(self) -> list[int]:
-        return [self.lines.fileno(), *self.ledger.history.descriptors]
-
-    def _apart(self, work: Callable[[], Any]) -> None:
+    def _run_in_copy(self, work: Callable[[], Any]) -> None:
         """Run user code in a copy, so that it cannot change this process."""
         try:
             ours = self._forked()
@@ -445,11 +440,8 @@ class Engine(EventObserver):
         assert ours is not None
         self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
 
-    def _begin_apart(self, request: Message) -> bool:
-        """Let a copy call the next callbacks under a debugger; return True in the copy.
-
-        :raises DebugError: the process cannot be copied, or the run is over.
-        """
+    def _start_debugger(self, request: Message) -> bool:
+        """Let a copy call the next callbacks under a debugger; return True in the copy."""
         if self.over:
             raise DebugError(f"nothing follows: {self.over}")
         ours = self._forked()
@@ -476,10 +468,7 @@ class Engine(EventObserver):
         end_process(0)
 
     def _event(self, index: int) -> Message:
-        """Return an event that is known.
-
-        :raises DebugError: it is not.
-        """
+        """Return an event that is known."""
         history = self.ledger.history
         trace = history.trace
         try:

@@ -188,11 +188,11 @@ class EventLedger(TraceWriter):
         self.events = index + 1
         known = next(self._known, None)
         if known is None:
-            known = self._on_new_ground(index, rest, chain_hash)
+            known = self._learn(index, rest, chain_hash)
         if known != chain_hash:
             self.on_difference()
 
-    def _on_new_ground(self, index: int, rest: bytes, chain_hash: int) -> int | None:
+    def _learn(self, index: int, rest: bytes, chain_hash: int) -> int | None:
         """Add an event that the history does not know yet."""
         self._known = self.history.hashes(index)  # another process may have been here meanwhile
         known = next(self._known, None)

@@ -48,10 +48,7 @@ def main() -> None:
 def _opened(
     spec: dict[str, Any], stack: ExitStack
 ) -> tuple[Job, EventHistory, tuple[Edit, ...], list[str]]:
-    """Return the job to run, its event history, the edits in it, and notes.
-
-    :raises RsltraceError: it cannot be run here.
-    """
+    """Return the job to run, its event history, the edits in it, and notes."""
     from rsltrace.debug.event_history import RunHistory, TraceHistory
     from rsltrace.diff.file_kind import is_trace
 

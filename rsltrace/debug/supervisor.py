@@ -41,12 +41,12 @@ class Supervisor:
             "break": self._break,
             "clear": self._clear,
             "breakpoints": lambda request: self._conditions(),
-            "inspect": self._pass_on,
-            "evaluate": self._pass_on_apart,
-            "node": self._pass_on_apart,
+            "inspect": self._ask_simulation,
+            "evaluate": self._ask_copy,
+            "node": self._ask_copy,
             "pdb": self._debug,
             "debugpy": self._debug,
-            "event": self._pass_on,
+            "event": self._ask_simulation,
             "sent_by": self._sent_by,
             "last_changed": self._last_changed,
             "first_true": self._first_true,
@@ -194,18 +194,18 @@ class Supervisor:
         if self._breakpoints.pop(request["number"], None) is None:
             raise DebugError(f"there is no breakpoint {request['number']}")
 
-    def _pass_on(self, request: Message) -> Any:
+    def _ask_simulation(self, request: Message) -> Any:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
 
     def _debug(self, request: Message) -> Any:
         """Let a copy continue under a Python debugger, until that ends."""
-        answer = self.tree.ask_apart({k: v for k, v in request.items() if k != "id"}, None)
+        answer = self.tree.ask_copy({k: v for k, v in request.items() if k != "id"}, None)
         if "raised" not in answer:
             return {"ended": answer.get("text", "the end of the run"), "raised": ""}
         return answer
 
-    def _pass_on_apart(self, request: Message) -> Any:
-        return self.tree.ask_apart({k: v for k, v in request.items() if k != "id"})
+    def _ask_copy(self, request: Message) -> Any:
+        return self.tree.ask_copy({k: v for k, v in request.items() if k != "id"})
 
 
 def _count(request: Message) -> int:

@@ -98,9 +98,9 @@ class CheckpointTree:
         try:
             return self._ask(self._cursor, request, whole=whole)
         except Lost as error:
-            raise self._come_back(self.position, error) from None
+            raise self._recover(self.position, error) from None
 
-    def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
+    def ask_copy(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
         """Have a copy run user code; the copy may be killed."""
         answer = self.ask_cursor(request, whole=True)
         if "with" not in answer:
@@ -124,11 +124,8 @@ class CheckpointTree:
         self.position = answer["position"]
         return answer
 
-    def _come_back(self, before: Message, error: Lost) -> Lost:
-        """Return the session to its position after its process ended.
-
-        :raises SessionOverError: that failed.
-        """
+    def _recover(self, before: Message, error: Lost) -> Lost:
+        """Return the session to its position after its process ended."""
         self.family.kill(self._cursor)
         index = int(before["index"])
         where = f"somewhere after event {index - 1}" if index else "at the begin"
@@ -163,7 +160,7 @@ class CheckpointTree:
 
     def _jumps_ahead(self, goal: Message) -> bool:
         """Whether a checkpoint lies between here and a goal ahead."""
-        found = self._bases(goal)
+        found = self._checkpoints_before(goal)
         return bool(found) and found[0].index > int(self.position["index"])
 
     def _leave_cursor(self) -> None:
@@ -178,22 +175,22 @@ class CheckpointTree:
 
     def _at(self, goal: Message) -> tuple[SimProcess, Message]:
         """Return a new process that stands at a goal, and its answer."""
-        process, index = self._awake(self._bases(goal))
+        process, index = self._wake(self._checkpoints_before(goal))
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
             request["ladder"] = self._checkpoints.ladder(index, goal["until"])
         try:
-            return process, self._quietly(process, request)
+            return process, self._ask_silently(process, request)
         except DebugError:
             self.family.kill(process)
             raise
 
-    def _bases(self, goal: Message) -> list[Checkpoint]:
+    def _checkpoints_before(self, goal: Message) -> list[Checkpoint]:
         if "until" in goal:
             return self._checkpoints.before(goal["until"])
         return self._checkpoints.before_time(goal["until_ns"])
 
-    def _awake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
+    def _wake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
         """Return a copy of the first usable checkpoint, or a process at the beginning."""
         for one in bases:
             try:
@@ -229,9 +226,9 @@ class CheckpointTree:
         end = min(below, int(self.position["index"]))
         while True:
             bases = self._checkpoints.before(max(end - 1, 0))
-            process, index = self._awake(bases)
+            process, index = self._wake(bases)
             try:
-                answer = self._quietly(
+                answer = self._ask_silently(
                     process,
                     {
                         "do": "run",
@@ -251,9 +248,9 @@ class CheckpointTree:
 
     def first_hit(self, conditions: Message, end: int) -> Message | None:
         """Return the first place up to index ``end`` where a condition was true."""
-        process, _ = self._awake(self._checkpoints.before(0))
+        process, _ = self._wake(self._checkpoints.before(0))
         try:
-            answer = self._quietly(process, {"do": "run", "until": end, **conditions})
+            answer = self._ask_silently(process, {"do": "run", "until": end, **conditions})
         finally:
             self.family.kill(process)
         return answer["position"] if answer["reason"] == "breakpoint" else None
@@ -262,10 +259,7 @@ class CheckpointTree:
         return _INTERVAL_S if self._checkpoints.count_max else 0.0
 
     def _copy_of(self, process: SimProcess) -> SimProcess:
-        """Return a copy of a process, which stands where it does.
-
-        :raises Refused: there can be none.
-        """
+        """Return a copy of a process, which stands where it does."""
         answer = self._ask(process, {"do": "fork"}, whole=True)
         return SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
 
@@ -287,7 +281,7 @@ class CheckpointTree:
         while len(self._checkpoints) > self._checkpoints.count_max:
             if not self._drop_one(cursor):
                 return
-        self._weigh_next()
+        self._measure_next()
         while self._memory_known() > _NEARLY * self._memory_max:
             if self.memory() <= self._memory_max or not self._drop_one(cursor):
                 return
@@ -298,7 +292,7 @@ class CheckpointTree:
             self._forget(worst)
         return worst is not None
 
-    def _weigh_next(self) -> None:
+    def _measure_next(self) -> None:
         """Measure the memory of one checkpoint, in turn: all at once would be slow."""
         everyone = self._checkpoints.all()
         if everyone:
@@ -330,7 +324,7 @@ class CheckpointTree:
             self._wait_for(None, None)
         return self._waiting.popleft()
 
-    def _quietly(self, process: SimProcess, request: Message) -> Message:
+    def _ask_silently(self, process: SimProcess, request: Message) -> Message:
         """Send a request to a process that repeats known events: its output is dropped."""
         self._is_quiet = True
         try:
@@ -350,11 +344,7 @@ class CheckpointTree:
         whole: bool = False,
         limit_s: float | None = None,
     ) -> Any:
-        """Send a request to a process and return its answer.
-
-        :raises RefusedRequestError: it returned an error.
-        :raises Lost: it ended, or did not answer in time.
-        """
+        """Send a request to a process and return its answer."""
         if request is not None:
             try:
                 process.lines.send({"id": 0, **request})
@@ -395,7 +385,7 @@ class CheckpointTree:
             return
         self._why_no_checkpoints = ""
         one.bytes = memory_bytes(copy.pid)
-        self._weigh_next()
+        self._measure_next()
         is_heavy = self._memory_known() > self._memory_max
         if is_heavy or len(self._checkpoints) > self._checkpoints.count_max:
             self._drop_one(one.index)
@@ -416,12 +406,12 @@ class CheckpointTree:
         if self._output in ready:
             self._pass_output_on()
         if self._client in ready:
-            self._hear_client(process)
+            self._read_client(process)
         if process is not None and process.lines in ready:
             process.lines.read()
         self.family.reap()
 
-    def _hear_client(self, process: SimProcess | None) -> None:
+    def _read_client(self, process: SimProcess | None) -> None:
         self._client.read()
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":

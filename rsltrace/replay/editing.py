@@ -124,10 +124,7 @@ def _is_message(value: object) -> bool:
 
 
 def _change_message(message: Any, edit: Edit) -> None:
-    """Change a field, with the checks that rclpy's own messages have.
-
-    :raises EditError: there is no such field, or it cannot have the value.
-    """
+    """Change a field, with the checks that rclpy's own messages have."""
     action = edit.action
     assert isinstance(action, SetMessageEdit)
     try:

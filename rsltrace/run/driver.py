@@ -156,7 +156,7 @@ class Driver:
         self.loop.now_ns = until_ns
         return False
 
-    def tell_later(self, callback: Callable[[Any], object], message: Any) -> None:
+    def call_listener_later(self, callback: Callable[[Any], object], message: Any) -> None:
         self._news.append((callback, message))
 
     def _tell(self) -> bool:

@@ -22,12 +22,11 @@ def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
         return Expanded(job)
     from rsltrace.adapters.launch.expand import expand
 
+    def is_process(package: str, executable: str) -> bool:
+        return compiled_file(f"{package}/{executable}") is not None
+
     with search_path(job):
-        return expand(job, why_not=why_not, is_process=_is_process, programs=programs)
-
-
-def _is_process(package: str, executable: str) -> bool:
-    return compiled_file(f"{package}/{executable}") is not None
+        return expand(job, why_not=why_not, is_process=is_process, programs=programs)
 
 
 def check_output(job: Job, output: Path, replay: Path | None) -> None:

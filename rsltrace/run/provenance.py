@@ -131,12 +131,9 @@ def module_code(modules: Mapping[str, Path]) -> dict[str, str]:
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         imports = sorted({*_imported(tree, package)} & {*modules} - {name})
-        found[name] = json.dumps({"hash": _hash(tree), "imports": imports})
+        digest = hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        found[name] = json.dumps({"hash": digest, "imports": imports})
     return found
-
-
-def _hash(tree: ast.Module) -> str:
-    return hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
 
 
 def _imported(tree: ast.Module, package: str) -> Iterator[str]:

@@ -236,7 +236,7 @@ class Session:
         self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
-            self._import_what_is_named()
+            self._import_targets()
         check_bag_types(self.job, self._bags)
         self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
         if self._observer.interrupt is not None:  # from here on there is a file to be closed
@@ -266,7 +266,7 @@ class Session:
     def _make_world(self, stack: ExitStack, kind: type[World]) -> None:
         """Make the loop and the world of the job, without nodes."""
         job = self.job
-        self.loop = loop = self._kind_of_loop()(
+        self.loop = loop = self._loop_class()(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
@@ -292,7 +292,7 @@ class Session:
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
 
-    def _kind_of_loop(self) -> type[EventLoop]:
+    def _loop_class(self) -> type[EventLoop]:
         return OrderedLoop if is_ordered(self.job) else EventLoop
 
     def _order_events(self, stack: ExitStack) -> None:
@@ -306,7 +306,7 @@ class Session:
             if switches_at_lines(self.job):
                 self.world.switch_at_lines(loop, node_packages(self.job.nodes))
 
-    def _import_what_is_named(self) -> None:
+    def _import_targets(self) -> None:
         """Import stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
         self.loop.stop_conditions = tuple(
@@ -356,10 +356,7 @@ class Session:
         return payload_filter(self.job)
 
     def _interrupt(self, stop: Stop) -> None:
-        """End the run after the current event, or within it if it does not return.
-
-        :raises KeyboardInterrupt: in the second case, on the stack of the event.
-        """
+        """End the run after the current event, or within it if it does not return."""
         self.loop.stop(stop)
         if self._watchdog.has_told:
             raise KeyboardInterrupt
@@ -511,7 +508,9 @@ class Session:
             self._processes.end()
             self.world.destroy()
         error = self.world.error
-        exit_code = error.exit_code if error else self._exit_code(stop)
+        exit_code = stop.exit_code or self.world.exit_code or self._processes.exit_code
+        if error:
+            exit_code = error.exit_code
         if self._writer is not None:
             self._guarded.write(self._writer)
             write_choices(self._writer, loop)
@@ -545,9 +544,6 @@ class Session:
             guarded=self._guarded.counts,
             kept="" if self._writer is None else self._writer.kept,
         )
-
-    def _exit_code(self, stop: Stop) -> int:
-        return stop.exit_code or self.world.exit_code or self._processes.exit_code
 
     def _order_of_starts(self) -> dict[str, str]:
         """Return the order of constructions, where it is not the job's."""

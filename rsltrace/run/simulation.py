@@ -135,7 +135,7 @@ class Simulation:
         try:
             driver.leave()
             if not driver.ended:
-                driver.loop.stop(self._left_because(error))
+                driver.loop.stop(self._stop_on_exit(error))
             if self._forking is not None:
                 self._forking.settle()
             self._result = self._session.finish()
@@ -144,7 +144,7 @@ class Simulation:
         finally:
             self._session.__exit__(kind, error, where)
 
-    def _left_because(self, error: BaseException | None) -> Stop:
+    def _stop_on_exit(self, error: BaseException | None) -> Stop:
         if error is not None:
             return Stop(f"the driver of the simulation raised {type(error).__qualname__}", 1)
         loop = self._driver.loop
@@ -401,7 +401,7 @@ class Simulation:
                 message = codec_for(class_of(publisher)).deserialize(data)
                 tap.add(driver.loop.now_ns, message)
                 if tap.callback is not None:
-                    driver.tell_later(tap.callback, message)
+                    driver.call_listener_later(tap.callback, message)
 
         return watch
 
@@ -415,10 +415,7 @@ class Simulation:
 
 
 def _topic(name: str) -> str:
-    """Return a topic with its leading slash.
-
-    :raises RunError: if it cannot be a topic.
-    """
+    """Return a topic with its leading slash."""
     topic = name if name.startswith("/") else f"/{name}"
     try:
         check_topic(topic)

@@ -99,10 +99,10 @@ class Watchdog:
         domain = self._domain
         frames = list(_frames(sys._current_frames().get(self._thread)))
         if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
-            return False  # somebody is looking at a standstill that they have made themselves
+            return False  # a debugger stands still on purpose
         if frames and in_import(frames[0], _NO_PACKAGES):
-            return False  # a large library takes its time, on a slow disk above all
-        in_event = any(_is_execute(frame) for frame in frames)
+            return False  # importing a large library takes time
+        in_event = any(frame.f_code is Dispatcher.execute.__code__ for frame in frames)
         handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()
         place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
@@ -110,25 +110,17 @@ class Watchdog:
         where = f", {_place(place)}" if place is not None else ""
         if process := _process_asked(frames):
             who, where = f"{process}, in {who},", ""
-        _say(
-            f"{who} has not returned for {for_s} s of real time; simulated time stands still at "
-            f"{format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
+        tell(
+            f"rsltrace: note: {who} has not returned for {for_s} s of real time; simulated time "
+            f"stands still at {format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
         )
         return True
-
-
-def _say(text: str) -> None:
-    tell(f"rsltrace: note: {text}")
 
 
 def _frames(frame: FrameType | None) -> Iterator[FrameType]:
     while frame is not None:
         yield frame
         frame = frame.f_back
-
-
-def _is_execute(frame: FrameType) -> bool:
-    return frame.f_code is Dispatcher.execute.__code__
 
 
 def _process_asked(frames: Iterable[FrameType]) -> str:

@@ -171,10 +171,7 @@ def replay_from_bag(
 
 
 def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
-    """Yield the bags with the topics that the node subscribes to.
-
-    :raises ReplayError: there are none, or they have another type.
-    """
+    """Yield the bags with the topics that the node subscribes to."""
     names: list[str] = []
     met = False
     for path in bags:

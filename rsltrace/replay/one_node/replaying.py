@@ -149,7 +149,7 @@ class NodeReplaySession(Session):
             self.start_ns = int(jumps[0])
         self.end_ns = self.script.end_ns
 
-    def _kind_of_loop(self) -> type[EventLoop]:
+    def _loop_class(self) -> type[EventLoop]:
         ordered = is_ordered(self.job) or self.job.timer_ties != "creation"
         return OrderedRecordedInputLoop if ordered else RecordedInputLoop
 
@@ -165,7 +165,7 @@ class NodeReplaySession(Session):
             policy = self.job.policy
             loop.by_policy = policy is not None and policy.order != "fifo"
 
-    def _import_what_is_named(self) -> None:
+    def _import_targets(self) -> None:
         from rsltrace.adapters.stand_ins import StandIns
 
         job, world = self.job, self.world
@@ -298,7 +298,7 @@ class _Progress(EventObserver):
     def entity_created(self, entity: Entity) -> None:
         if entity.node == entity.id:
             self._names[entity.id] = entity.name
-        self._script.met(entity, self._names.get(entity.node, ""))
+        self._script.match_entity(entity, self._names.get(entity.node, ""))
 
     def after_event(self) -> None:
         event = self._dispatcher.event

@@ -252,7 +252,7 @@ class RecordedScript:
         """Return the entity of this run for a recorded one, or -1."""
         return self._present.get(entity, -1)
 
-    def met(self, entity: Entity, node: str) -> None:
+    def match_entity(self, entity: Entity, node: str) -> None:
         """Match a new entity with a recorded one."""
         key = (node, entity.kind, entity.name)
         recorded = self._recorded.get((key, self._counts[key]))

@@ -210,10 +210,7 @@ def _never() -> object:
 
 
 def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) -> Component:
-    """Return the component that a container loads.
-
-    :raises JobError: the service that loads components is not installed.
-    """
+    """Return the component that a container loads."""
     check_loadable(where)
     assert spec.component is not None
     assert spec.container is not None

@@ -155,10 +155,7 @@ def _limits(item: Primitive) -> tuple[float, float]:
 
 
 def _fitting(item: Primitive | Text, value: Any, name: str) -> Any:
-    """Return a value converted to the field's type.
-
-    :raises UnfitError: it does not fit.
-    """
+    """Return a value converted to the field's type."""
     if isinstance(item, Text):
         if not isinstance(value, str):
             raise UnfitError(f"{name} is text, not {value!r}")

@@ -140,7 +140,7 @@ class RunGuard:
         )
         streams.enter(guard.context.node())
 
-    def stays_threaded(self, library: str, why: str) -> None:
+    def report_unpinned_library(self, library: str, why: str) -> None:
         """Report a library whose threads cannot be pinned."""
         if self.guard is None:
             self._unpinned.append((library, why))  # met before the run
@@ -190,7 +190,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
     if job.guard.enabled:
         if job.guard.pins:
             stack.enter_context(pinned_place())
-            stack.enter_context(one_tbb_thread(made.stays_threaded))
+            stack.enter_context(one_tbb_thread(made.report_unpinned_library))
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),

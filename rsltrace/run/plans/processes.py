@@ -167,10 +167,7 @@ def _executable(path: Path, given: str, where: str) -> list[str]:
 
 
 def _message_type(name: str) -> MessageType:
-    """Return a message type; by name only if Python has no class for it.
-
-    :raises RunError: rosidl did not generate the class of that name.
-    """
+    """Return a message type; by name only if Python has no class for it."""
     try:
         found = get_message_class(name)
     except SetupError:  # its package has nothing for Python

@@ -104,7 +104,7 @@ class LinkChannel:
         if self.plain is not None:
             delay_ns = self.plain(now_ns)
         else:
-            delay_ns = self._troubled(now_ns)
+            delay_ns = self._transmit_unreliably(now_ns)
             if delay_ns < 0:
                 return delay_ns
         if self.keep_order:
@@ -120,7 +120,7 @@ class LinkChannel:
         """Let nothing arrive before ``until_ns`` where the order is kept."""
         self._last_ns = max(self._last_ns, until_ns)
 
-    def _troubled(self, now_ns: int) -> int:
+    def _transmit_unreliably(self, now_ns: int) -> int:
         """Return the delay over a link with losses, duplicates or outages.
 
         A lost message's delay is drawn, too, so losses do not change the delays of others.

@@ -7,11 +7,11 @@ others unchanged, which a shared generator cannot promise.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from hashlib import blake2b, shake_128
-from itertools import chain
+from itertools import accumulate, chain
 from math import frexp, ldexp
 
 import numpy as np
@@ -72,7 +72,8 @@ class Stream:
     def __init__(self, seed: int, name: str) -> None:
         self.name = name
         self._key = blake2b(f"{seed}\0{name}".encode(), digest_size=32, person=b"rsltrace").digest()
-        self.uniform = chain.from_iterable(self._uniforms()).__next__
+        blocks = (numbers.tolist() for numbers in self._numbers())
+        self.uniform = chain.from_iterable(blocks).__next__
 
     def below(self, count: int) -> int:
         """Return an integer from 0 to ``count`` - 1."""
@@ -80,15 +81,10 @@ class Stream:
 
     def whole_numbers(self, low: int, count: int) -> Iterator[int]:
         """Yield ``low + below(count)`` forever, from the stream's beginning, twice as fast."""
-        return chain.from_iterable(self._whole_numbers(low, float(count)))
-
-    def _uniforms(self) -> Iterator[list[float]]:
-        for numbers in self._numbers():
-            yield numbers.tolist()
-
-    def _whole_numbers(self, low: int, count: float) -> Iterator[list[int]]:
-        for numbers in self._numbers():
-            yield (np.floor(numbers * count).astype(np.int64) + low).tolist()
+        return chain.from_iterable(
+            (np.floor(numbers * float(count)).astype(np.int64) + low).tolist()
+            for numbers in self._numbers()
+        )
 
     def _numbers(self) -> Iterator[npt.NDArray[np.float64]]:
         """Yield many numbers at a time, and more the more are asked for.
@@ -130,7 +126,7 @@ class WrongClock:
         self._model = model
         self._start_ns = start_ns
         self._given_at = [at_ns for at_ns, _ in model.jumps]
-        self._given_sum = _sums([by_ns for _, by_ns in model.jumps])
+        self._given_sum = list(accumulate((by_ns for _, by_ns in model.jumps), initial=0))
         self._uniform = stream.uniform
         self._drawn_at: list[int] = []
         self._drawn_sum = [0]
@@ -167,10 +163,3 @@ class WrongClock:
             self._drawn_until_ns += gap_ns
             self._drawn_at.append(self._drawn_until_ns)
             self._drawn_sum.append(self._drawn_sum[-1] + size_ns)
-
-
-def _sums(values: Sequence[int]) -> list[int]:
-    sums = [0]
-    for value in values:
-        sums.append(sums[-1] + value)
-    return sums

@@ -175,13 +175,13 @@ class OrderedLoop(EventLoop):
         if not places:
             return None
         candidates = [place.candidate for place in places]
-        if self.hold_until is not None and self._holds(candidates):
+        if self.hold_until is not None and self._must_wait(candidates):
             return None
         place = places[self.choose(candidates)]
         self._take_out(place)
         return place
 
-    def _holds(self, ready: list[Candidate]) -> bool:
+    def _must_wait(self, ready: list[Candidate]) -> bool:
         """Whether what is ready has to wait; if so, look again when that is over."""
         assert self.hold_until is not None
         until_ns = self.hold_until(ready, Moment(self.now_ns, self.events))

@@ -142,10 +142,9 @@ class RateMonotonic:
     follows_chains = True
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        return min(range(len(ready)), key=lambda i: (self._period(ready[i]), i))
-
-    def _period(self, candidate: Candidate) -> float:
-        return float("inf") if candidate.period_ns is None else candidate.period_ns
+        never = float("inf")
+        periods = [never if one.period_ns is None else one.period_ns for one in ready]
+        return periods.index(min(periods))
 
 
 class Permutation:

@@ -91,7 +91,7 @@ class RecordedInputLoop(EventLoop):
         now_ns = self.now_ns
         self._release()
         limit = self.events + self._livelock_limit
-        while not self._interrupt and self._one():
+        while not self._interrupt and self._do_next():
             if self.events >= limit:
                 if self.now_ns == now_ns:
                     self._livelock(now_ns)
@@ -108,7 +108,7 @@ class RecordedInputLoop(EventLoop):
             released = True
         return released
 
-    def _one(self) -> bool:
+    def _do_next(self) -> bool:
         """Do the next thing that is due; return False if there is none."""
         step = self.script.next
         if step is None and self.now_ns >= self.script.end_ns:
@@ -160,12 +160,14 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
     def next_timer(self) -> Any:
         """Return the next timer that does not wait for its recorded time."""
         due, after = self.timers.due(self.now_ns)
-        free = (timer for timer in due if not self._is_held(self.place(timer.owner)))  # type: ignore[arg-type]
+        free = (timer for timer in due if not self._waits_for_recording(self.place(timer.owner)))  # type: ignore[arg-type]
         return next(free, after)
 
     def _run_task(self, step: RecordedStep | None) -> bool:
         for index, place in enumerate(self._tasks.places):
-            if not self._is_held(place) or (step is not None and self._is_that_of(place, step)):
+            if not self._waits_for_recording(place) or (
+                step is not None and self._matches(place, step)
+            ):
                 del self._tasks.places[index]
                 item: Any = place.candidate.item
                 item.dispatch()
@@ -190,32 +192,32 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
     def _recorded_choice(self, places: list[Place], step: RecordedStep | None) -> Place | None:
         if step is not None:
             for place in places:
-                if not _has_no_event(place.candidate.item) and self._is_that_of(place, step):
+                if not _has_no_event(place.candidate.item) and self._matches(place, step):
                     return place
-        free = [place for place in places if not self._is_held(place)]
+        free = [place for place in places if not self._waits_for_recording(place)]
         if not free or not _has_no_event(free[0].candidate.item):
             return free[0] if free else None
         if _is_poll(free[0]):
-            return self._looked_for(free, step) if self.by_policy else free[0]
+            return self._next_for_poll(free, step) if self.by_policy else free[0]
         # An executor of the user's own takes them in the order in which it gets them.
         others = [p for p in free if _has_no_event(p.candidate.item) and not _is_poll(p)]
         entity, following = self.script.entity, self.script.following
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
 
-    def _looked_for(self, free: list[Place], step: RecordedStep | None) -> Place:
+    def _next_for_poll(self, free: list[Place], step: RecordedStep | None) -> Place:
         """Return the next recorded item if it is ready: the policy let the poll wait."""
         if step is None:
             return free[0]
-        return next((place for place in free if self._is_that_of(place, step)), free[0])
+        return next((place for place in free if self._matches(place, step)), free[0])
 
-    def _is_that_of(self, place: Place, step: RecordedStep) -> bool:
+    def _matches(self, place: Place, step: RecordedStep) -> bool:
         candidate = place.candidate
         recorded = self.script.entity(candidate.entity_id)
         if recorded < 0 and candidate.kind == _QOS_EVENT:  # which has its id when it runs first
             return step.kind == EventKind.QOS_EVENT
         return recorded == step.entity
 
-    def _is_held(self, place: Place) -> bool:
+    def _waits_for_recording(self, place: Place) -> bool:
         """Whether it waits for its recorded time."""
         candidate = place.candidate
         if (

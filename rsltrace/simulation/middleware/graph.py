@@ -59,7 +59,7 @@ class Graph:
         self.nodes.append(node)
         self._named.setdefault(node.fully_qualified_name, []).append(node)
         node.graph = self
-        self._tell_of(node)
+        self._announce(node)
 
     def add_publisher(self, publisher: Publisher) -> None:
         self._check_type(publisher)
@@ -67,7 +67,7 @@ class Graph:
         publisher.graph = self
         for subscription in self.subscriptions(publisher.topic):
             self._connect(publisher, subscription)
-        self._has_changed()
+        self._notify_changed()
 
     def add_subscription(self, subscription: Subscription) -> None:
         """Connect a new subscription; it gets what transient-local publishers kept for it."""
@@ -76,24 +76,24 @@ class Graph:
         subscription.graph = self
         for publisher in self.publishers(subscription.topic):
             self._connect(publisher, subscription)
-        self._has_changed()
+        self._notify_changed()
 
     def add_client(self, client: Client) -> None:
         self._clients.setdefault(client.service, []).append(client)
         client.graph = self
-        self._has_changed()
+        self._notify_changed()
 
     def add_service(self, service: Service) -> None:
         self._services.setdefault(service.service, []).append(service)
         service.graph = self
-        self._tell_of(service)
+        self._announce(service)
 
-    def _tell_of(self, member: DomainEntity) -> None:
+    def _announce(self, member: DomainEntity) -> None:
         for listener in self.joined:
             listener(member)
-        self._has_changed()
+        self._notify_changed()
 
-    def _has_changed(self) -> None:
+    def _notify_changed(self) -> None:
         for listener in self.changed:
             listener()
 
@@ -119,7 +119,7 @@ class Graph:
         elif isinstance(member, Participant):
             self.nodes.remove(member)
             self._named[member.fully_qualified_name].remove(member)
-        self._has_changed()
+        self._notify_changed()
 
     def settled_request(self, topic: str, requested: Qos) -> Qos:
         """Return the resolved QoS of a new subscription, given the current publishers."""

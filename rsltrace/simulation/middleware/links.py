@@ -254,7 +254,7 @@ class PublisherLink:
         if self._faults is not None:
             fault = self._faults.for_node(self.subscription.node.fully_qualified_name)
         if fault is not None:
-            self._suffer(fault, message, arrival_ns)
+            self._send_faulty(fault, message, arrival_ns)
             return
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
@@ -273,11 +273,11 @@ class PublisherLink:
                 self._hold(message, arrivals_ns, channel.held_until_ns)
                 return
             for arrival_ns in arrivals_ns:
-                self._bring(message, arrival_ns)
+                self._schedule_arrival(message, arrival_ns)
             return
-        self._bring(message, max(arrival_ns, self._behind_ns))
+        self._schedule_arrival(message, max(arrival_ns, self._behind_ns))
 
-    def _suffer(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
+    def _send_faulty(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
         """Send a message with a fault.
 
         The link's model draws for it as for any other, so later messages are not affected.
@@ -307,9 +307,9 @@ class PublisherLink:
             self._hold(message, arrivals_ns, channel.held_until_ns)
             return
         for arrival_ns in arrivals_ns:
-            self._bring(message, arrival_ns)
+            self._schedule_arrival(message, arrival_ns)
 
-    def _bring(self, message: Message, arrival_ns: int) -> None:
+    def _schedule_arrival(self, message: Message, arrival_ns: int) -> None:
         loop = self._loop
         now_ns = loop.now_ns
         if arrival_ns <= now_ns and not self.expects(self._arrive):

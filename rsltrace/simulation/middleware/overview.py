@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.graph import Graph
-from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible_policies
 from rsltrace.simulation.middleware.qos.timing import finite
@@ -78,7 +77,10 @@ def graph_overview(
 
     ``follows`` says whether ``/clock`` drives a node's time; other nodes subscribe to it in vain.
     """
-    nodes = tuple(_node(node) for node in graph.nodes)
+    nodes = tuple(
+        GraphNode(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
+        for node in graph.nodes
+    )
     links = [*_topics(graph), *_services(graph), *_actions(graph)]
     if not everything:
         links = [link for link in links if not _is_everywhere(link)]
@@ -104,10 +106,6 @@ def _namesakes(nodes: Iterable[GraphNode]) -> Iterator[str]:
                 f"{count} nodes are named {name}: their parameters, services and logs go by that "
                 "name; unless that is meant, give each a name of its own (name: or namespace:)"
             )
-
-
-def _node(node: Participant) -> GraphNode:
-    return GraphNode(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
 
 
 def _topics(graph: Graph) -> Iterator[Link]:

@@ -135,7 +135,7 @@ class Dispatcher:
     def _with(self, hook: str) -> tuple[EventObserver, ...]:
         return tuple(one for one in self._observers if overrides(one, hook))
 
-    def _is_to_happen(self, call: EventCall) -> bool:
+    def _accepted_by_observers(self, call: EventCall) -> bool:
         """Ask observers before an event; the first that rejects it is the last one asked."""
         return all(observer.before_event(call) for observer in self._before)
 
@@ -158,7 +158,7 @@ class Dispatcher:
             call = EventCall(
                 handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
             )
-            if self._is_to_happen(call):
+            if self._accepted_by_observers(call):
                 self.execute(*call.values(), True)
             call.end()
             return
@@ -180,10 +180,7 @@ class Dispatcher:
             on_end()
 
     def _raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Let the exception handler decide what happens next.
-
-        :raises OutputError: the trace cannot be written.
-        """
+        """Let the exception handler decide what happens next."""
         if isinstance(error, OutputError):
             raise error
         node = self.event.node
