@@ -76,7 +76,7 @@ class EditBranches:
         :raises OutputError: the file exists, or cannot be written.
         """
         if self.path is None:
-            raise DebugError("nothing has been edited in this session: there is no branch to keep")
+            raise DebugError("nothing has been edited in this session, so there is no branch")
         place = Path(output)
         if kind := in_the_way(place):
             raise OutputError(f"{place} is {kind}; name a file, or remove it")

@@ -299,7 +299,7 @@ class DebugSession:
         :raises OutputError: ``output`` exists (``force`` replaces it), or cannot be written.
         """
         if self._branches is None:
-            raise DebugError("nothing has been edited in this session: there is no branch to keep")
+            raise DebugError("nothing has been edited in this session, so there is no branch")
         return self._branches.keep(output, force=force)
 
     # -- talking -----------------------------------------------------------------------------------

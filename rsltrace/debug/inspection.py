@@ -167,9 +167,7 @@ def live_node(run: StoppedRun, name: str) -> Any:
     full = full_name(run, name)
     node = run.view.nodes().get(full)
     if node is None:
-        raise DebugError(
-            f"{full} is not there: it has not been made yet, or it is destroyed by now"
-        )
+        raise DebugError(f"{full} does not exist now: it is not made yet, or already destroyed")
     return node
 
 
@@ -183,7 +181,7 @@ def full_name(run: StoppedRun, name: str) -> str:
     if len(found) == 1:
         return found[0]
     if found:
-        raise DebugError(f"{name!r} may be any of {', '.join(found)}: give the full name")
+        raise DebugError(f"{name!r} matches {', '.join(found)}: give the full name")
     there = ", ".join(nodes) or "none yet"
     hint = did_you_mean(name, [*nodes, *map(short_name, nodes)], f"there are {there}")
     raise DebugError(f"no node is called {name!r}; {hint}")

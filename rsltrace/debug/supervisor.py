@@ -112,7 +112,7 @@ class Supervisor:
             return str(self.tree.ask_cursor({"do": "node name", "name": name}))
         event = self.tree.position["event"]
         if event is None or not event["node"]:
-            raise DebugError("the last event is no node's: say which node is meant")
+            raise DebugError("the last event belongs to no node: give a node")
         return str(event["node"])
 
     def _finish(self, request: Message) -> Message:
@@ -211,7 +211,7 @@ class Supervisor:
 def _count(request: Message) -> int:
     count = int(request.get("count", 1))
     if count < 1:
-        raise DebugError(f"{count} events are no step")
+        raise DebugError(f"a step has at least one event, not {count}")
     return count
 
 

@@ -168,7 +168,7 @@ def test_source_lines_have_numbers() -> None:
         " 9  def tick(self):",
         "10    1",
     ]
-    assert list(source_lines(None)) == ["there is no Python source for what runs here"]
+    assert list(source_lines(None)) == ["there is no Python source for this event"]
 
 
 class Session:

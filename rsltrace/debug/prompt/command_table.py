@@ -166,7 +166,7 @@ def _reverse_next(shell: PromptContext, rest: str) -> None:
 
 @_add("reverse-continue", "rc", topic="going back", repeats=True)
 def _reverse_continue(shell: PromptContext, rest: str) -> None:
-    """Go back to where a breakpoint stops last before here, or to the beginning."""
+    """Go back to the previous place where a breakpoint stops, or to the beginning."""
     shell.stopped(shell.session.reverse_go_on())
 
 
@@ -186,16 +186,16 @@ def _break(shell: PromptContext, rest: str) -> None:
     812                           before event 812
     t=2.5s                        before the first event at that time of the run or later
     node /ekf, entity /scan       before an event of a node, of an entity (by name or #number)
-    topic /odom                   before who receives a message, after who sends one
+    topic /odom                   before a callback receives a message, after one sends it
     /odom: pose.pose.position.x > 3    the same, of messages of which that is true
-    output 3f2a                   after an event with an output of such a hash
+    output 3f2a                   after an event with an output of this hash
     exception [TYPE]              after an event that raised
     log [LEVEL] [/TEXT/]          after a log record of that level or worse
     finding [KIND]                after an event in which the guard found something
     watch ekf.P[0][0]             after an event that changes a value
     when node("ekf").P[0][0] > 1  after the event that makes it true
-    Behind all but the last two, 'if EXPRESSION' has to be true as well. Expressions are not Python
-    but the language of checks: fields, attributes of nodes, arithmetic, fixed functions.
+    All but the last two can end with 'if EXPRESSION'. Expressions are those of checks, not Python:
+    fields, attributes of nodes, arithmetic, fixed functions.
     """
     if not rest:
         shell.show(show.breakpoint_lines(shell.session.breakpoints))
@@ -221,21 +221,21 @@ def _delete(shell: PromptContext, rest: str) -> None:
 # -- looking ---------------------------------------------------------------------------------------
 
 INFO = {
-    "breakpoints": "what stops the run",
+    "breakpoints": "the breakpoints",
     "nodes": "the nodes and their classes",
     "node": "[NODE]: the attributes and parameters of a node",
     "queues": "messages and requests that wait",
     "timers": "timers, and when they are due",
-    "stacks": "who waits for what, inside of a callback",
+    "stacks": "callbacks that wait, and for what",
     "graph": "topics, services and actions with their ends",
-    "message": "what the callback gets",
-    "checkpoints": "where copies of the run sleep, to go back to",
+    "message": "the input of the callback",
+    "checkpoints": "copies of the run to go back to",
 }
 
 
 @_add("info", "i", usage="[WHAT]", topic="looking")
 def _info(shell: PromptContext, rest: str) -> None:
-    """Show breakpoints, nodes, queues, timers, stacks, graph, …; alone, what there is."""
+    """Show breakpoints, nodes, queues, timers, stacks, graph, …; without WHAT, list these."""
     word, _, more = rest.partition(" ")
     if not word:
         shell.show(f"info {name:<12} {text}" for name, text in INFO.items())
@@ -257,14 +257,14 @@ def _info(shell: PromptContext, rest: str) -> None:
         shell.show(show.graph_lines(session.inspect(what)))
     else:
         value = session.inspect(what)
-        nothing = ["what runs here has received no message"]
+        nothing = ["this event has received no message"]
         shell.show(nothing if value is None else show.value_lines(value))
 
 
 def _node(shell: PromptContext) -> str:
     name = shell.node_here()
     if name is None:
-        raise DebugError("the event here is no node's: say which node")
+        raise DebugError("the current event belongs to no node: give a node")
     return name
 
 
@@ -272,8 +272,8 @@ def _node(shell: PromptContext) -> str:
 def _print(shell: PromptContext, rest: str) -> None:
     """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now.
 
-    This is Python, methods of nodes included, in a copy of the run: whatever it does changes
-    nothing here. Conditions (break, watch, when) have a language of their own, which only looks.
+    This is Python, methods of nodes included, in a copy of the run, so it changes nothing here.
+    Conditions (break, watch, when) use the language of checks.
     """
     if not rest:
         raise DebugError('print what? P[0][0] of this node, node("ekf").P, msg, now, event')
@@ -299,8 +299,8 @@ def _where(shell: PromptContext, rest: str) -> None:
 def _pdb(shell: PromptContext, rest: str) -> None:
     """Call the next callback under pdb, from its first line on.
 
-    It is called in a copy of the run: what it does, or you do there, changes nothing here. "c" or
-    "q" of pdb comes back to this prompt, before the callback; "step" runs it.
+    It runs in a copy, so nothing changes here. "c" or "q" of pdb returns to this prompt, before
+    the callback; "step" runs it.
     """
     raised = talk(shell.session.pdb, shell.read)
     if raised:
@@ -310,11 +310,11 @@ def _pdb(shell: PromptContext, rest: str) -> None:
 
 @_add("debugpy", usage="[PORT]", topic="looking")
 def _debugpy(shell: PromptContext, rest: str) -> None:
-    """Run on in a copy of the run, for an editor (VS Code) to stop in: port 5678.
+    """Continue in a copy of the run under debugpy, for an editor (VS Code): port 5678.
 
-    The editor stops in the first line of the next callback, and where it has breakpoints; simulated
-    time stands still meanwhile. When it disconnects, or with Ctrl-C, this prompt is back, and the
-    run stands where it stood.
+    The editor stops in the first line of the next callback, and at its breakpoints; simulated time
+    stands still meanwhile. When it disconnects, or with Ctrl-C, this prompt returns; the run has
+    not moved.
     """
     shell.show([shell.session.debugpy(_count(rest, 5678))])
     shell.show([show.position_line(shell.session.position)])
@@ -328,13 +328,13 @@ def _who_changed(shell: PromptContext, rest: str) -> None:
     """Find the last event up to here that changed an attribute: who-changed ekf P[0][0]."""
     found = _CHANGED.fullmatch(rest)
     if found is None:
-        raise DebugError("who changed what? Say a node and an attribute: who-changed ekf P[0][0]")
+        raise DebugError("give a node and an attribute: who-changed ekf P[0][0]")
     shell.show(show.found_lines(shell.session.last_changed(found["node"], found["attribute"])))
 
 
 @_add("who-sent", "ws", usage="[EVENT]", topic="searching")
 def _who_sent(shell: PromptContext, rest: str) -> None:
-    """Find the event that sent what this one (or EVENT) has received."""
+    """Find the event that sent the input of this one, or of EVENT."""
     position = shell.session.position
     index = _count(rest, position.index if position.is_next else position.index - 1)
     if index < 0:
@@ -374,13 +374,13 @@ def _as_condition(text: str, shell: PromptContext) -> str:
 
 @_add("edit", usage="EDIT", topic="what if")
 def _edit(shell: PromptContext, rest: str) -> None:
-    """Change something from here on, and go on in the branch that comes of it.
+    """Change something here, and continue in a branch of the run.
 
-    message.data = 3.0                what the event that follows receives
+    message.data = 3.0                the message that the next event receives
     topic("/odom").x += 1             the next message on a topic
     node("/ekf").P[0][0] = 1e-3       an attribute
     parameters("/ekf")["rate"] = 20   a parameter
-    drop()  delay("5ms")  defer()     the event that follows: not, later, after the others
+    drop()  delay("5ms")  defer()     the next event: leave out, delay, run after the others
     812: drop()                       the same at event 812, or at a time (2.5s: ...)
     """
     position = shell.session.edit(rest)
@@ -389,9 +389,9 @@ def _edit(shell: PromptContext, rest: str) -> None:
 
 @_add("keep", usage="FILE", topic="what if")
 def _keep(shell: PromptContext, rest: str) -> None:
-    """Write the trace of the branch in which the session is since an edit."""
+    """Write the trace of the current branch to FILE."""
     if not rest:
-        raise DebugError("where to? keep FILE, as branch.mcap")
+        raise DebugError("give a file: keep branch.mcap")
     shell.show([f"wrote {shell.session.branch(rest)}"])
 
 
@@ -400,7 +400,7 @@ def _keep(shell: PromptContext, rest: str) -> None:
 
 @_add("help", "h", "?", usage="[COMMAND]", topic="the rest")
 def _help(shell: PromptContext, rest: str) -> None:
-    """Show this, or more of a command."""
+    """Show this list, or the help of COMMAND."""
     shell.show(COMMANDS.help(rest))
 
 

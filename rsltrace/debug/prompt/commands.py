@@ -115,4 +115,4 @@ class PromptCommands:
                     short = next((n for n in command.names[1:] if len(n) < 4), "")
                     first = command.help.splitlines()[0]
                     yield f"  {short:<4} {said:<{width}}  {first}"
-        yield "The beginning of a name will do; 'help COMMAND' says more. An empty line steps on."
+        yield "Commands can be abbreviated; 'help COMMAND' says more. An empty line repeats a step."

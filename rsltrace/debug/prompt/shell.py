@@ -199,7 +199,7 @@ class Shell:
             return
         word, _, rest = text.partition(" ")
         if "/" in word and not word.startswith("/"):  # print/x of gdb
-            raise DebugError(f"{word!r}: there are no formats; say it in Python: hex(…)")
+            raise DebugError(f"{word!r}: there are no formats; use Python: hex(…)")
         command = COMMANDS.find(word)
         with self._interruptible():
             command.run(self, rest.strip())

@@ -184,14 +184,14 @@ def _cell(name: str, value: Any) -> str:
 
 def source_lines(source: Mapping[str, Any] | None) -> Iterator[str]:
     if source is None:
-        yield "there is no Python source for what runs here"
+        yield "there is no Python source for this event"
         return
     file = Path(source["file"])
     near = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
     yield printable(f"{source['name']}, {near}:{source['line']}")
     lines = source.get("lines") or []
     if not lines:
-        yield "(its source is not here)"
+        yield "(its source is not available)"
     first = int(source["line"])
     width = len(str(first + len(lines)))
     at = source.get("at")
