@@ -358,7 +358,7 @@ class Session:
     def _interrupt(self, stop: Stop) -> None:
         """End the run after the current event, or within it if it does not return."""
         self.loop.stop(stop)
-        if self._watchdog.has_told:
+        if self._watchdog.has_warned:
             raise KeyboardInterrupt
 
     @property
@@ -564,8 +564,8 @@ class Session:
 
 def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
     """Return the texts of a deadlock and of calls that still waited at the end, for the trace."""
-    told = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
-    return told | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
+    found = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
+    return found | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
 
 
 def _without_folders(text: str) -> str:

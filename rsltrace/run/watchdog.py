@@ -45,7 +45,7 @@ class Watchdog:
         self._domain = domain
         self._thread = thread
         self._process = os.getpid()
-        self.has_told = False
+        self.has_warned = False
         """Whether a note on the current callback was printed."""
         self._running = False
         self._stopping = allocate_lock()
@@ -85,13 +85,13 @@ class Watchdog:
                 still = min(still + 1, _LOOKS_MAX)
             else:
                 seen[0], seen[1] = loop.events, loop.now_ns
-                still, self.has_told = 0, False
+                still, self.has_warned = 0, False
             del loop
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):
                     if self._tell(int(still * LOOK_EVERY_S)):
-                        since_note, self.has_told = 0, True
+                        since_note, self.has_warned = 0, True
         self._ended.release()
 
     def _tell(self, for_s: int) -> bool:

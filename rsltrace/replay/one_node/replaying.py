@@ -188,11 +188,11 @@ class NodeReplaySession(Session):
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
         super()._open_trace(stack, path)
         assert self._writer is not None
-        told = {
+        values = {
             "node": self._unit.node.name,
             "entries": ",".join(map(str, self._unit.entries)),
         }
-        self._writer.add_metadata(METADATA_FED, told)
+        self._writer.add_metadata(METADATA_FED, values)
         dispatcher = self.world.domain.dispatcher
         dispatcher.add_observer(_Progress(dispatcher, self.script))
 

@@ -228,7 +228,7 @@ def start_players(
     domain = world.domain
     faults = BagFaults(job, is_open=is_open)
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
-    told: list[Any] = []
+    progress_publishers: list[Any] = []
 
     def publisher(node: NodeHandle, topic: str, cls: type, qos: dict[str, Any]) -> Any:
         name = node.resolve(topic, service=False)
@@ -253,7 +253,7 @@ def start_players(
             streams.append(_messages(entry.playback, ends))
         if job.progress is not None:
             progress = get_message_class("std_msgs/msg/Float32")
-            told.append(publisher(player.handle, job.progress, progress, {}))
+            progress_publishers.append(publisher(player.handle, job.progress, progress, {}))
         world.keep(player)
 
     world.run_outside("the bag player", EventKind.CONSTRUCT, build)
@@ -269,8 +269,8 @@ def start_players(
     if len(streams) > 1:
         merged = heapq.merge(*streams, key=lambda message: message[0])
     merged = faults.played(merged)
-    if told:
-        merged = with_progress(merged, told[0], bags)
+    if progress_publishers:
+        merged = with_progress(merged, progress_publishers[0], bags)
     paths = " and ".join(entry.spec.path for entry in bags)
     name = f"the {'bag' if len(bags) == 1 else 'bags'} {paths}"
     Player(domain, merged, name, on_end).start()
@@ -294,13 +294,13 @@ def with_progress(
 ) -> Iterator[tuple[int, Any, bytes]]:
     """Insert progress messages from 0 to 1, at each full percent."""
     start_ns, end_ns = _span_ns(bags)
-    told, stamp_ns = -1, start_ns
+    last_percent, stamp_ns = -1, start_ns
     for message in messages:
         yield message
         stamp_ns = message[0]
         percent = min((stamp_ns - start_ns) * 100 // max(end_ns - start_ns, 1), 99)
-        if percent > told:
-            told = percent
+        if percent > last_percent:
+            last_percent = percent
             yield stamp_ns, publisher, _float32(percent)
     yield stamp_ns, publisher, _float32(100)
 

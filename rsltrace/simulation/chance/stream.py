@@ -131,7 +131,7 @@ class WrongClock:
         self._drawn_at: list[int] = []
         self._drawn_sum = [0]
         self._drawn_until_ns = 0
-        self._told = 0
+        self._reported = 0
 
     def shows(self, now_ns: int) -> int:
         model = self._model
@@ -150,8 +150,8 @@ class WrongClock:
             return 0
         since_ns = now_ns - self._start_ns
         self._draw_until(since_ns)
-        count = max(bisect_right(self._drawn_at, since_ns), self._told)
-        before, self._told = self._told, count
+        count = max(bisect_right(self._drawn_at, since_ns), self._reported)
+        before, self._reported = self._reported, count
         return self._drawn_sum[count] - self._drawn_sum[before]
 
     def _draw_until(self, since_ns: int) -> None:

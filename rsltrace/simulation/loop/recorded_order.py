@@ -137,9 +137,9 @@ def has_event(item: Any) -> bool:
     own executors, or if it wakes a call that may continue to wait.
     """
     node = getattr(item, "node", None)
-    is_told = getattr(node, "mailbox", None) is not None
+    is_handed_over = getattr(node, "mailbox", None) is not None
     is_there = bool(getattr(item, "queue", True)) and not getattr(item, "destroyed", False)
-    return is_there and not is_told and not getattr(item, "quiet", False)
+    return is_there and not is_handed_over and not getattr(item, "quiet", False)
 
 
 # The order of a native run can only be followed approximately: its timers drift, its messages take

@@ -123,10 +123,12 @@ def is_own_frame(frame: FrameType) -> bool:
 def user_traceback(error: BaseException) -> str:
     """Return the traceback without rsltrace's frames, if others remain."""
     with contextlib.suppress(Exception):
-        told = traceback.TracebackException(type(error), error, error.__traceback__, compact=True)
-        if not all(map(_is_own_line, told.stack)):
-            _leave_out_own(told)
-        return _writable("".join(told.format()))
+        summary = traceback.TracebackException(
+            type(error), error, error.__traceback__, compact=True
+        )
+        if not all(map(_is_own_line, summary.stack)):
+            _leave_out_own(summary)
+        return _writable("".join(summary.format()))
     return f"{type(error).__qualname__} (its text could not be made)"
 
 
@@ -134,12 +136,12 @@ def _is_own_line(line: traceback.FrameSummary) -> bool:
     return line.filename.startswith(_OWN_FILES)
 
 
-def _leave_out_own(told: traceback.TracebackException | None) -> None:
-    while told is not None:
-        told.stack = traceback.StackSummary.from_list(
-            [line for line in told.stack if not _is_own_line(line)]
+def _leave_out_own(summary: traceback.TracebackException | None) -> None:
+    while summary is not None:
+        summary.stack = traceback.StackSummary.from_list(
+            [line for line in summary.stack if not _is_own_line(line)]
         )
-        for one in getattr(told, "exceptions", None) or ():  # of a group, from Python 3.11 on
+        for one in getattr(summary, "exceptions", None) or ():  # of a group, from Python 3.11 on
             _leave_out_own(one)
-        _leave_out_own(told.__context__)
-        told = told.__cause__
+        _leave_out_own(summary.__context__)
+        summary = summary.__cause__
