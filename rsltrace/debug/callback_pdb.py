@@ -29,7 +29,7 @@ class PdbConnection:
     def __init__(self, address: str) -> None:
         """Connect to the socket of a path.
 
-        :raises DebugError: nobody listens there.
+        :raises DebugError: no client listens there.
         """
         self._end = socket.socket(socket.AF_UNIX)
         try:

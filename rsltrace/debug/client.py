@@ -36,7 +36,7 @@ class DebugSession:
     Use as a context manager, or ``close`` it. It begins before the first event. Indices count
     events from 0; a position with index 812 is the one in which events 0 to 811 have ended.
 
-    ``events`` is how many the run has, None if nobody knows (a job). ``notes`` are texts for
+    ``events`` is how many the run has, None if unknown (a job). ``notes`` are texts for
     people: what is not as it was when the trace was recorded.
     """
 

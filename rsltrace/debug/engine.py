@@ -85,7 +85,7 @@ class Engine(EventObserver):
         self._calls: dict[greenlet, CallbackCall] = {}
         """What each stack has called last that is not yet over."""
         self._is_unasked = False
-        """Whether a callback goes on of which nobody knows yet if that makes an event."""
+        """Whether a callback resumes and it is not yet known if that makes an event."""
         self._apart_calls: Callable[..., None] | None = None
         """What calls callbacks in a copy made for a debugger."""
         session.world.domain.dispatcher.add_observer(self)

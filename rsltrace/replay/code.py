@@ -94,7 +94,7 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
         found = source_of(name, where="")
     except JobError:
         if not any(Path(folder, "package.xml").is_file() for folder in folders):
-            yield name, None  # else it is one of a package that nobody has built
+            yield name, None  # else it is one of an unbuilt package
         return
     if isinstance(found, Path):
         yield name, found

@@ -50,7 +50,7 @@ class EventVerification(EventObserver):
         self.diverged = False
         self.stop: Stop | None = None
         self.is_last = False
-        """Whether the run was ended where the trace's was, by somebody outside of the job."""
+        """Whether the run was ended where the trace's was, from outside of the job."""
         self.has_branched_off = False
         self._trace = trace
         self._limit, self._at_limit = limit_of(trace, until)

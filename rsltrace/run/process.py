@@ -40,7 +40,7 @@ _HEAP_BLOCK_BYTES = 8 << 20
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Callbacks of whoever starts a run. ``progress`` gets (simulated ns, end ns or None, events)
+    """Callbacks of the caller of a run. ``progress`` gets (simulated ns, end ns or None, events)
     about every thousand events; ``interrupt`` gets a function that ends the run properly; ``note``
     gets notes from before the run (an incomplete bag, ignored parts of a launch file)."""
 
@@ -68,7 +68,7 @@ def housekeeping(
                 gc.collect(1)
         if observer.progress is None:
             return collect_at
-        with engage(None):  # whoever watches lives in real time
+        with engage(None):  # the caller's code runs in real time
             observer.progress(dispatcher().loop.now_ns, end_ns, events)
         return min(collect_at, events + _PROGRESS_EVERY_EVENTS)
 
@@ -134,7 +134,7 @@ def kept_process() -> Iterator[None]:
     change the process on purpose.
     """
     folder = ""
-    with suppress(FileNotFoundError):  # somebody may have removed it, before or meanwhile
+    with suppress(FileNotFoundError):  # it may have been removed
         folder = os.getcwd()
     argv, words, environment = sys.argv, list(sys.argv), dict(os.environ)
     mask = os.umask(0o077)

@@ -202,7 +202,7 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Shell]:
         ("info nods", "no info 'nods'; did you mean 'nodes'?"),
         ("print", "print what?"),
         ("p/x speed", "there are no formats"),
-        ("who-changed speed", "Say a node and an attribute"),
+        ("who-changed speed", "give a node and an attribute"),
         ("when", "when what?"),
     ],
 )

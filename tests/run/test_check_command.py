@@ -88,8 +88,8 @@ actions:
   /count  test_msgs/action/Fibonacci  /caller  ->  /filter
 
 to look at:
-  service /reset: /filter calls, and nobody serves
-  topic /nothing: /filter subscribes, and nobody publishes
+  service /reset: /filter calls, but it has no server
+  topic /nothing: /filter subscribes, but it has no publisher
   topic /raw: /sensor and /filter do not connect: reliability \
 (/sensor offers best effort, volatile, keep last 5; \
 /filter asks for reliable, volatile, keep last 10)
@@ -116,8 +116,8 @@ class Moves(Node):
     alone = "nodes: [{node: nodes_under_test:Listens}]\nstop: {duration: 1s}\n"
     job_file(alone, code)
     done = command("check", "job.yaml")
-    assert "topic /tf: /listens subscribes, and nobody publishes" in done.stdout
-    assert "topic /tf_static: /listens subscribes, and nobody publishes" in done.stdout
+    assert "topic /tf: /listens subscribes, but it has no publisher" in done.stdout
+    assert "topic /tf_static: /listens subscribes, but it has no publisher" in done.stdout
     job_file(alone.replace("}]", "}, {node: nodes_under_test:Moves}]", 1), code)
     done = command("check", "job.yaml")
     assert (done.returncode, "nothing looks wrong" in done.stdout) == (0, True)
@@ -158,7 +158,7 @@ def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., P
         (
             "[{node: /talker, source: topic}]",
             (
-                "topic /clock: /talker goes by it (clocks: source: topic), and nobody publishes: "
+                "topic /clock: /talker uses it (clocks: source: topic), but it has no publisher: "
                 "ROS time stands still at 0",
             ),
         ),

@@ -28,7 +28,7 @@ class PromptContext(Protocol):
         """Print where and why the run has stopped."""
 
     def read(self, prompt: str) -> str | None:
-        """Return the next line, for somebody else; None if there are no more."""
+        """Return the next line for pdb; None at the end."""
 
     def node_here(self) -> str | None:
         """Return the node whose event is about to run, or has just ended."""

@@ -46,14 +46,14 @@ def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None)
         after = spec.start_after
         if after is None:
             continue
-        for key, names, nobody in (
-            ("topic", topics, "nobody publishes {}"),
-            ("service", services, "nobody serves {}"),
+        for key, names, missing in (
+            ("topic", topics, "{} has no publisher"),
+            ("service", services, "{} has no server"),
             ("node", nodes, "no entry makes a node {}"),
         ):
             name = getattr(after, key)
             if name is not None and name not in names:
-                why = nobody.format(name) + did_you_mean(name, names)
+                why = missing.format(name) + did_you_mean(name, names)
                 yield f"{_where(job, index, key)}: {spec.target} never starts: {why}"
         if end_ns is not None and start_ns + after.delay_ns > end_ns:
             yield (

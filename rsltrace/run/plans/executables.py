@@ -278,7 +278,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     compiled = unbuilt_programs(package)
     if name in compiled:
         raise JobError(
-            f"{target} is a program that nobody has built (CMakeLists.txt of {package}): build it "
+            f"{target} is a program that is not built (CMakeLists.txt of {package}): build it "
             "(colcon build) and source its workspace (install/setup.bash)",
             where=where,
         )

@@ -1,8 +1,8 @@
 """The delay, loss and order of messages on one link.
 
-``Model`` describes a link, ``LinkChannel`` is its state in a run. Each purpose (delay, drop, burst,
-duplicate, the delay of the copy) has a random stream of its own, so enabling one does not change
-what others draw.
+``Model`` describes a link, ``LinkChannel`` is its state in a run. Each purpose (delay,
+drop, burst, duplicate, the delay of the copy) has a random stream of its own, so
+enabling one does not change what others draw.
 """
 
 from __future__ import annotations

@@ -197,16 +197,15 @@ def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:
             waiting = [node for node in nodes if follows(node)]
             if waiting:
                 yield (
-                    f"topic {_CLOCK}: {_who(waiting, 'goes by it', 'go by it')} (clocks: source: "
-                    "topic), and nobody publishes: ROS time stands still at 0"
+                    f"topic {_CLOCK}: {_who(waiting, 'uses it', 'use it')} (clocks: source: "
+                    "topic), but it has no publisher: ROS time stands still at 0"
                 )
         elif link.name not in NODE_TOPICS:
-            yield (
-                f"topic {link.name}: {_who(nodes, 'subscribes', 'subscribe')}, and nobody publishes"
-            )
+            who = _who(nodes, "subscribes", "subscribe")
+            yield f"topic {link.name}: {who}, but it has no publisher"
     if link.senders and not link.receivers and link.kind != "topic":
         who = _who([end.node for end in link.senders], "calls", "call")
-        yield f"{link.kind} {link.name}: {who}, and nobody serves"
+        yield f"{link.kind} {link.name}: {who}, but it has no server"
 
 
 def _who(nodes: Iterable[str], one: str, several: str) -> str:

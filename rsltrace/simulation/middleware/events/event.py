@@ -47,8 +47,8 @@ class NameRegistry(EventObserver):
         self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
         self.described: dict[int, str] | None = None
-        """Every entity as in ``entity_text``, by its id, if somebody wants to know: a run may make
-        a thread in each of a million callbacks."""
+        """Every entity as in ``entity_text``, by its id, if needed: a run may make a
+        thread in each of a million callbacks."""
 
     def entity_created(self, entity: Entity) -> None:
         if entity.kind is EntityKind.NODE:
