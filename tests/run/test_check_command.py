@@ -165,8 +165,8 @@ def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., P
         (
             "{source: topic}",
             (
-                "topic /clock: /talker and /listener go by it (clocks: source: topic), and nobody "
-                "publishes: ROS time stands still at 0",
+                "topic /clock: /talker and /listener use it (clocks: source: topic), but it has no "
+                "publisher: ROS time stands still at 0",
             ),
         ),
     ],
