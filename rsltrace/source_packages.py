@@ -115,6 +115,3 @@ def _walk(top: Path, *, inside: bool) -> Iterator[Path]:
                 for name, is_folder in reversed(entries)
                 if is_folder and not name.startswith(".") and name not in _NO_SOURCES
             ]
-
-
-__all__ = ["SourcePackage", "source_packages", "workspace_of"]

@@ -272,9 +272,8 @@ RUNS_CODE = {
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/user_modules.py": "compile exec_module",  # the same, with our calls
     "rsltrace/guard/virtual/set_order.py": "pickle",  # makes its pickles of sets ordered
-    "rsltrace/run/plans/executables.py": "import_module",  # main: of a package, by its own program
     "rsltrace/adapters/workspace/imports.py": "import_module",  # interfaces that were just made
-    "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
+    "rsltrace/run/plans/executables.py": "exec import_module",  # main: a program, or a function
     "rsltrace/run/plans/scheduling.py": "import_module",  # node: module:Class
     "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
@@ -287,7 +286,7 @@ RUNS_CODE = {
     "rsltrace/native/apart/wire.py": "pickle",  # of user code: plain values only
     "rsltrace/run/forked.py": "pickle",  # what a copy of the simulation returns
     # Who sits at the prompt of a session, in a run whose code they have agreed to run.
-    "rsltrace/debug/python_expression.py": "compile eval",
+    "rsltrace/debug/inspection.py": "compile eval",
 }
 """The modules that turn text into code, or could, with what they use and why they may.
 

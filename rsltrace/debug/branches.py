@@ -1,6 +1,6 @@
-"""What if, in a debugging session: branches of its run, made by replaying it with edits.
+"""Branches of a debugging session: its run, repeated with edits.
 
-A branch is a trace, so a session goes on in it as in any other: ahead, back, and verified.
+A branch is a trace, so a session continues in it as in any other.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _ERROR = "rsltrace: error: "
 _HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")
 
 
-class Branches:
-    """The branches of the run of a trace or job; ``path`` is the trace of the last one."""
+class EditBranches:
+    """Branches of the run of a trace or job. ``path`` is the trace of the last one."""
 
     def __init__(
         self, source: str | Path, job_folder: str | Path | None, overrides: Sequence[str]
@@ -38,11 +38,10 @@ class Branches:
 
     @property
     def job_folder(self) -> str:
-        """The folder of the job, once there is a branch."""
+        """The folder of the job; known once a branch exists."""
         return str(self._job_folder)
 
     def close(self) -> None:
-        """Forget them all."""
         self._processes.kill()
         if self._temporary is not None:
             self._temporary.cleanup()
@@ -77,7 +76,7 @@ class Branches:
         :raises OutputError: the file exists, or cannot be written.
         """
         if self.path is None:
-            raise DebugError("nothing has been edited in this session: there is no branch to keep")
+            raise DebugError("nothing has been edited in this session, so there is no branch")
         place = Path(output)
         if kind := in_the_way(place):
             raise OutputError(f"{place} is {kind}; name a file, or remove it")
@@ -98,16 +97,16 @@ class Branches:
         return Path(self._temporary.name)
 
     def _first(self, folder: Path) -> Path:
-        """Return the trace to branch off: the session's, or one of its job, recorded for that."""
+        """Return the trace to branch from: the session's, or a recording of its job."""
         from rsltrace.diff.file_kind import is_trace
 
         if is_trace(os.fspath(self._source)):
             if self._job_folder is None:
-                from rsltrace.replay.preparation import folder_of
+                from rsltrace.replay.preparation import job_folder_of
                 from rsltrace.trace.reader import Trace
 
                 with Trace.open(self._source) as trace:
-                    self._job_folder = folder_of(trace, None).absolute()
+                    self._job_folder = job_folder_of(trace, None).absolute()
             return self._source
         self._job_folder = self._source.parent.absolute()
         path = folder / "run.mcap"
@@ -124,6 +123,6 @@ class Branches:
 
 
 def _said(done: Done) -> str:
-    """Return what a command has said of its failure."""
+    """Return the error message of a failed command."""
     before, error, message = done.errors.partition(_ERROR)
     return (message if error else before).strip() or f"it ended with status {done.exit_code}"

@@ -1,7 +1,7 @@
-"""``pdb`` in the first line of a callback, spoken through a socket: a simulation has no terminal.
+"""``pdb`` in the first line of a callback, over a socket: a simulation has no terminal.
 
-The lines of the conversation are JSON: ``{"write": text}`` and ``{"read": true}`` from here,
-``{"line": text}`` (null: there are no more) from the client, in answer to the second.
+The lines are JSON: ``{"write": text}`` and ``{"read": true}`` from here, ``{"line": text}`` (null
+at the end) as the client's answer to the second.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
-from rsltrace.debug.source import is_users
+from rsltrace.debug.current_event import is_users
 from rsltrace.errors import DebugError
 from rsltrace.guard.guard import engage
 
@@ -23,24 +23,23 @@ _SKIPPED = ("rsltrace", "rsltrace.*", "rclpy", "rclpy.*", "greenlet", "greenlet.
 """What is neither stopped in nor stepped into: it stands between a run and its callbacks."""
 
 
-class Conversation:
-    """A terminal that is somewhere else, as far as ``pdb`` needs one."""
+class PdbConnection:
+    """A remote terminal, as far as ``pdb`` needs one."""
 
     def __init__(self, address: str) -> None:
         """Connect to the socket of a path.
 
-        :raises DebugError: nobody listens there.
+        :raises DebugError: no client listens there.
         """
         self._end = socket.socket(socket.AF_UNIX)
         try:
             self._end.connect(address)
         except OSError as error:
             self._end.close()
-            raise DebugError(f"nobody listens at {address}: {error}") from error
+            raise DebugError(f"no client listens at {address}: {error}") from error
         self._lines = self._end.makefile("rw", encoding="utf-8")
 
     def write(self, text: str) -> int:
-        """Have a text shown."""
         self._send({"write": text})
         return len(text)
 
@@ -48,7 +47,7 @@ class Conversation:
         """Do nothing: every text is sent at once."""
 
     def readline(self) -> str:
-        """Ask for a line; empty once there are no more."""
+        """Return a line from the client; empty at the end."""
         self._send({"read": True})
         with suppress(OSError, ValueError):
             line = json.loads(self._lines.readline() or '{"line": null}').get("line")
@@ -56,7 +55,6 @@ class Conversation:
         return ""
 
     def close(self) -> None:
-        """Hang up."""
         with suppress(OSError):
             self._lines.close()
         self._end.close()
@@ -68,9 +66,9 @@ class Conversation:
 
 
 class CallbackPdb(pdb.Pdb):
-    """Stops in the first line of the user's in what it calls."""
+    """Stops in the first line of user code below the function it calls."""
 
-    def __init__(self, conversation: Conversation) -> None:
+    def __init__(self, conversation: PdbConnection) -> None:
         super().__init__(
             stdin=conversation,  # type: ignore[arg-type]
             stdout=conversation,  # type: ignore[arg-type]
@@ -81,12 +79,11 @@ class CallbackPdb(pdb.Pdb):
         self._has_begun = False
 
     def user_call(self, frame: FrameType, argument_list: Any) -> None:
-        """Wait for the first line: that a function is called is known."""
+        """Skip the call event: the first line follows."""
         if self._has_begun:
             super().user_call(frame, argument_list)
 
     def user_line(self, frame: FrameType) -> None:
-        """Stop at a line, the first of which is the user's."""
         if not (self._has_begun or is_users(frame.f_code)):
             self.set_step()
             return
@@ -94,28 +91,26 @@ class CallbackPdb(pdb.Pdb):
         super().user_line(frame)
 
     def user_return(self, frame: FrameType, return_value: Any) -> None:
-        """Stop where a function returns, once there was a line of the user's."""
         if self._has_begun:
             super().user_return(frame, return_value)
 
     def user_exception(self, frame: FrameType, exc_info: Any) -> None:
-        """Stop where something is raised, once there was a line of the user's."""
         if self._has_begun:
             super().user_exception(frame, exc_info)
 
     def interaction(self, *where: Any) -> None:
-        """Talk; what is evaluated is nobody's callback."""
+        """Talk to the user; the guard does not apply to what they evaluate."""
         with engage(None):
             super().interaction(*where)
 
 
 def call_under_pdb(callback: Callable[..., Any], args: tuple[Any, ...], address: str) -> str:
-    """Call a callback under ``pdb``; return what it raised, as a text, empty if nothing.
+    """Call a callback under ``pdb``; return the exception it raised as text, or "".
 
-    :raises DebugError: nobody listens at ``address``.
+    :raises DebugError: no client listens at ``address``.
     """
     with engage(None):
-        conversation = Conversation(address)
+        conversation = PdbConnection(address)
         debugger = CallbackPdb(conversation)
     try:
         debugger.runcall(callback, *args)

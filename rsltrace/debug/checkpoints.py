@@ -1,4 +1,4 @@
-"""Which checkpoints there are, and which of too many is to go."""
+"""Positions, breakpoints and stops of a session; and which checkpoints to keep."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ from typing import Any
 from rsltrace.debug.processes import SimProcess
 from rsltrace.trace.model.texts import format_seconds
 
-# Where a debugged run stands, as clients see it.
-
 
 @dataclass(frozen=True, slots=True)
-class Position:
+class RunPosition:
     """A place between two events. ``index`` is how many have ended, ``stamp_ns`` simulated time.
 
     ``event`` is the one that has ended last, None before the first: ``index``, ``stamp_ns``,
@@ -54,14 +52,13 @@ class Stopped:
     """
 
     reason: str
-    position: Position
+    position: RunPosition
     breakpoint: Breakpoint | None = None
     text: str = ""
 
 
-def position_of(values: dict[str, Any]) -> Position:
-    """Return the position in an answer."""
-    return Position(
+def position_of(values: dict[str, Any]) -> RunPosition:
+    return RunPosition(
         index=int(values["index"]),
         stamp_ns=int(values["stamp_ns"]),
         event=values.get("event"),
@@ -71,7 +68,6 @@ def position_of(values: dict[str, Any]) -> Position:
 
 
 def stopped_of(values: dict[str, Any]) -> Stopped:
-    """Return what an answer says about a stop."""
     found = values.get("breakpoint")
     return Stopped(
         reason=str(values["reason"]),
@@ -94,8 +90,7 @@ goes back another."""
 
 @dataclass(order=True)
 class Checkpoint:
-    """A process asleep at an index (and time, in ns); ``bytes`` is its memory (PSS) when last
-    looked at."""
+    """A sleeping process at an index and time (ns); ``bytes`` is its last measured memory (PSS)."""
 
     index: int
     stamp_ns: int
@@ -114,32 +109,30 @@ class Checkpoints:
         return len(self._all)
 
     def all(self) -> list[Checkpoint]:
-        """Return them in order."""
         return list(self._all)
 
     def add(self, checkpoint: Checkpoint) -> bool:
-        """Add one, unless one is there already."""
+        """Add a checkpoint, unless its index has one; return whether it was added."""
         if any(one.index == checkpoint.index for one in self._all):
             return False
         insort(self._all, checkpoint)
         return True
 
     def remove(self, checkpoint: Checkpoint) -> None:
-        """Forget one."""
         self._all = [one for one in self._all if one is not checkpoint]
 
     def before(self, index: int) -> list[Checkpoint]:
-        """Return those at ``index`` or before it, the nearest first."""
+        """Return the checkpoints at ``index`` or before it, the nearest first."""
         at = bisect_right([one.index for one in self._all], index)
         return self._all[:at][::-1]
 
     def before_time(self, stamp_ns: int) -> list[Checkpoint]:
-        """Return those that are no later than a time, the latest first."""
+        """Return the checkpoints no later than a time, the latest first."""
         return [one for one in self._all if one.stamp_ns <= stamp_ns][::-1]
 
     def least_useful(self, cursor: int) -> Checkpoint | None:
-        """Return the one whose loss costs least: its neighbours are close to each other, as seen
-        from the cursor. So they are log-spaced around it. The first one stays."""
+        """Return the checkpoint to drop: the one whose neighbours are closest, relative to the
+        distance from the cursor. So checkpoints are log-spaced around it. The first one stays."""
         best, least = None, 0.0
         for place in range(1, len(self._all)):
             one = self._all[place]
@@ -153,5 +146,5 @@ class Checkpoints:
         return best
 
     def ladder(self, start: int, goal: int) -> list[int]:
-        """Return the indices at which to leave checkpoints on the way from ``start`` to a goal."""
+        """Return the indices at which to leave checkpoints between ``start`` and ``goal``."""
         return [goal - step for step in LADDER if goal - step >= start + step]

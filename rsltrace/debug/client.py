@@ -1,4 +1,4 @@
-"""A debugging session, from Python: what runs user code is a process of its own.
+"""The Python API of a debugging session. User code runs in a process of its own.
 
 >>> import rsltrace
 >>> with rsltrace.DebugSession("run.mcap") as session:    # doctest: +SKIP
@@ -21,8 +21,8 @@ from typing import Any
 
 from rsltrace import errors
 from rsltrace.child_processes import start_connected
-from rsltrace.debug.branches import Branches
-from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped, position_of, stopped_of
+from rsltrace.debug.branches import EditBranches
+from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 
@@ -35,7 +35,7 @@ class DebugSession:
     Use as a context manager, or ``close`` it. It begins before the first event. Indices count
     events from 0; a position with index 812 is the one in which events 0 to 811 have ended.
 
-    ``events`` is how many the run has, None if nobody knows (a job). ``notes`` are texts for
+    ``events`` is how many the run has, None if unknown (a job). ``notes`` are texts for
     people: what is not as it was when the trace was recorded.
     """
 
@@ -75,14 +75,13 @@ class DebugSession:
             "overrides": list(overrides),
         }
         self._spec = spec
-        self._branches: Branches | None = None
+        self._branches: EditBranches | None = None
         self._last_id = 0
         self._lock = threading.Lock()
         self._sending = threading.Lock()
         self._open(spec)
 
     def _open(self, spec: dict[str, Any]) -> None:
-        """Start the processes of the session."""
         try:
             self._process, ours = start_connected(
                 "rsltrace.debug.supervisor", [json.dumps(spec)], stdout=subprocess.DEVNULL
@@ -127,22 +126,21 @@ class DebugSession:
     # -- where it stands ---------------------------------------------------------------------------
 
     @property
-    def position(self) -> Position:
-        """Where the session stands."""
+    def position(self) -> RunPosition:
         return position_of(self._ask("position"))
 
     # -- forward -----------------------------------------------------------------------------------
 
     def step(self, count: int = 1) -> Stopped:
-        """Run so many events."""
+        """Run ``count`` events."""
         return stopped_of(self._ask("step", count=count))
 
     def next(self, node: str | None = None) -> Stopped:
-        """Run to the end of the next event of a node: by default the one of the last event."""
+        """Run to the end of the next event of a node (default: the node of the last event)."""
         return stopped_of(self._ask("next", node=node))
 
     def finish(self) -> Stopped:
-        """Run to the end of the present time step."""
+        """Run to the end of the current time step."""
         return stopped_of(self._ask("finish"))
 
     def run_to(self, place: int | str) -> Stopped:
@@ -154,24 +152,23 @@ class DebugSession:
         return stopped_of(self._ask("go_on"))
 
     def pause(self) -> None:
-        """Stop a run that another thread waits for, after its present event. A callback that does
-        not come back in five seconds is ended with its process; the session is then back where the
-        run began. A Ctrl-C does the same.
-        """
+        """Stop a run that another thread waits for, after its current event; Ctrl-C does the same.
+        A callback that does not return within five seconds is killed with its process; the session
+        then stands where the run began."""
         self._send({"id": 0, "do": "pause"})
 
     # -- back --------------------------------------------------------------------------------------
 
     def reverse_step(self, count: int = 1) -> Stopped:
-        """Go back so many events."""
+        """Go back ``count`` events."""
         return stopped_of(self._ask("reverse_step", count=count))
 
     def reverse_next(self, node: str | None = None) -> Stopped:
-        """Go back to the end of the event before the present one of a node."""
+        """Go back to the end of a node's previous event."""
         return stopped_of(self._ask("reverse_next", node=node))
 
     def reverse_go_on(self) -> Stopped:
-        """Go back to the last place before this at which a breakpoint stops, or to the begin."""
+        """Go back to the previous place where a breakpoint stops, or to the beginning."""
         return stopped_of(self._ask("reverse_go_on"))
 
     def go_to(self, place: int | str) -> Stopped:
@@ -189,12 +186,11 @@ class DebugSession:
         return Breakpoint(found["number"], found["text"])
 
     def clear(self, number: int) -> None:
-        """Remove a breakpoint."""
         self._ask("clear", number=number)
 
     @property
     def breakpoints(self) -> tuple[Breakpoint, ...]:
-        """The breakpoints, in the order in which they were set."""
+        """The breakpoints, in the order they were set."""
         return tuple(Breakpoint(one["number"], one["text"]) for one in self._ask("breakpoints"))
 
     # -- questions ---------------------------------------------------------------------------------
@@ -213,23 +209,23 @@ class DebugSession:
         return str(self._ask("evaluate", expression=expression, node=node)["repr"])
 
     def pdb(self, address: str) -> str:
-        """Call the next callback under ``pdb``, which speaks through the Unix socket ``address``.
+        """Call the next callback under ``pdb``, which uses the Unix socket ``address``.
 
-        It is called in a copy of the simulation: nothing that happens there changes the run, which
-        stands where it stood. Returns what the callback raised, as text, empty if nothing.
+        The callback runs in a copy of the simulation, so the session does not change. Returns the
+        exception that the callback raised as text, or "".
 
-        :raises DebugError: nothing follows, the run cannot be copied, or nobody listens.
+        :raises DebugError: the run is over or cannot be copied, or no client listens.
         """
         return str(self._ask("pdb", address=address)["raised"])
 
     def debugpy(self, port: int = 5678) -> str:
-        """Run on in a copy under ``debugpy``, at a port of this machine (0: any that is free).
+        """Continue in a copy of the run under ``debugpy``, on a local port (0: any free one).
 
-        A notice ``debugpy`` says that it waits for an editor. That stops in the first line of the
-        next callback, and wherever it has breakpoints; simulated time stands still meanwhile. The
-        session stands where it stood. Returns why it is over: the editor has disconnected, say.
+        A notice ``debugpy`` says that it waits for an editor. The editor stops in the first line of
+        the next callback and at its breakpoints; simulated time stands still meanwhile. The session
+        itself does not move. Returns why the copy ended.
 
-        :raises DebugError: nothing follows, the run cannot be copied, or debugpy is missing.
+        :raises DebugError: the run is over or cannot be copied, or debugpy is missing.
         """
         return str(self._ask("debugpy", port=port)["ended"])
 
@@ -243,42 +239,41 @@ class DebugSession:
         return self._ask("inspect", what=what)
 
     def event(self, index: int) -> dict[str, Any]:
-        """Return an event that is known: of a trace, or that has run."""
+        """Return an event of the trace, or one that has already run."""
         return dict(self._ask("event", index=index))
 
-    def last_changed(self, node: str, attribute: str) -> Position:
-        """Return where a node's attribute (``P[0][0]``) was changed last, up to this place."""
+    def last_changed(self, node: str, attribute: str) -> RunPosition:
+        """Return where a node's attribute (``P[0][0]``) last changed, up to here."""
         return position_of(self._ask("last_changed", node=node, attribute=attribute))
 
-    def sent_by(self, index: int) -> Position:
-        """Return the position after the event that sent what event ``index`` received."""
+    def sent_by(self, index: int) -> RunPosition:
+        """Return the position after the event that sent the input of event ``index``."""
         return position_of(self._ask("sent_by", index=index))
 
-    def first_true(self, condition: str) -> Position:
-        """Return the first position up to this one at which a condition is true."""
+    def first_true(self, condition: str) -> RunPosition:
+        """Return the first position, up to here, at which a condition is true."""
         return position_of(self._ask("first_true", condition=condition))
 
     def checkpoints(self) -> dict[str, Any]:
-        """Return ``indices`` of the checkpoints, the ``bytes`` of memory that they take (PSS), and
-        ``why_not``: why there are none, if that is so."""
+        """Return ``indices`` of the checkpoints, their memory in ``bytes`` (PSS), and ``why_not``:
+        why there are none."""
         return dict(self._ask("checkpoints"))
 
     # -- what if -----------------------------------------------------------------------------------
 
-    def edit(self, text: str) -> Position:
-        """Change something (docs/what-if.md), and go on in the branch that comes of it.
+    def edit(self, text: str) -> RunPosition:
+        """Change something (docs/what-if.md) and continue in the resulting branch.
 
-        A text without a place, as ``message.data = 3.0``, is about the event that follows. The run
-        is made again with the edit, from its beginning to its end; the session then stands where it
-        did, in the branch: going back and ahead, breakpoints and questions are those of any run. A
-        second edit branches off the branch.
+        A text without a place, as ``message.data = 3.0``, changes the next event. The whole run is
+        repeated with the edit, and the session stands at the same position in the branch. A second
+        edit branches off the branch.
 
-        :raises EditError: the edit cannot be understood, or not be made. Nothing has changed then.
+        :raises EditError: the edit is invalid or cannot be made. The session is unchanged.
         """
         position = self.position
         if self._branches is None:
             spec = self._spec
-            self._branches = Branches(spec["source"], spec["job_folder"], spec["overrides"])
+            self._branches = EditBranches(spec["source"], spec["job_folder"], spec["overrides"])
         path = self._branches.make(text, position.index)
         breakpoints = self.breakpoints
         self._end()
@@ -289,13 +284,13 @@ class DebugSession:
         return self.go_to(min(position.index, self.events or 0)).position
 
     def branch(self, output: str | Path, *, force: bool = False) -> Path:
-        """Keep the trace of the branch in which the session is: it holds the edits, and replays.
+        """Write the trace of the current branch. It holds the edits, and can be replayed.
 
         :raises DebugError: nothing has been edited.
         :raises OutputError: ``output`` exists (``force`` replaces it), or cannot be written.
         """
         if self._branches is None:
-            raise DebugError("nothing has been edited in this session: there is no branch to keep")
+            raise DebugError("nothing has been edited in this session, so there is no branch")
         return self._branches.keep(output, force=force)
 
     # -- talking -----------------------------------------------------------------------------------
@@ -322,7 +317,7 @@ class DebugSession:
             raise DebugError("the session is over") from None
 
     def _until(self, is_it: Callable[[Message], bool]) -> Message:
-        """Return the message that is waited for; notices on the way are passed on."""
+        """Return the message that satisfies ``is_it``; pass notices on."""
         while True:
             message = self._lines.receive()
             if message is None:
@@ -338,7 +333,6 @@ class DebugSession:
 
 
 def _error(said: Message) -> RsltraceError:
-    """Return the error that an answer tells of, of its own class where that takes a message."""
     cls = getattr(errors, str(said.get("kind")), None)
     if isinstance(cls, type) and issubclass(cls, RsltraceError):
         error = cls.__new__(cls)

@@ -1,8 +1,7 @@
 """The simulation's side of a debugging session: runs between events, stops, answers, forks.
 
-It is an observer of events, and stands where one has ended, or where a callback is about to be
-called. To stop is to read requests there instead of going back to the loop; whatever stack that is
-on stays as it is.
+It is an observer of events. To stop is to read requests after an event, or before a callback,
+instead of returning to the loop; the stack stays as it is.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ from rsltrace.conditions.message_fields import loaded_fields
 from rsltrace.conditions.names import Names, names_of
 from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
-from rsltrace.debug.debuggers import debugger
-from rsltrace.debug.goal import Goal, Watched, goal_of
-from rsltrace.debug.ledger import Ledger, described
-from rsltrace.debug.view import NO_CALL, Call, View, call_of
+from rsltrace.debug.current_event import NO_CALL, CallbackCall, CurrentEventView, call_of
+from rsltrace.debug.debuggers import make_debugger
+from rsltrace.debug.event_history import EventLedger, event_values
+from rsltrace.debug.goal import RunGoal, WatchedCondition, parse_goal
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage
@@ -42,7 +41,7 @@ _cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-typ
 _getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
 
 
-class Copy(NamedTuple):
+class ForkedCopy(NamedTuple):
     """A copy of this process: its id, and the socket to it."""
 
     pid: int
@@ -50,21 +49,21 @@ class Copy(NamedTuple):
 
 
 class Engine(EventObserver):
-    """One process of a debugged run, and where it stands."""
+    """The observer that runs, stops and forks one process of a debugged run."""
 
     order = ObserverOrder.DEBUGGER
 
     def __init__(
         self,
         session: Session,
-        ledger: Ledger,
+        ledger: EventLedger,
         lines: Lines,
         *,
         supervisor: int,
         checkpoints: bool,
         idle: frozenset[int],
     ) -> None:
-        """``idle`` are threads of the middleware that do nothing here, and need not be copied."""
+        """``idle`` are middleware threads that do nothing here, and need not be copied."""
         self.session = session
         self.ledger = ledger
         self.lines = lines
@@ -76,31 +75,27 @@ class Engine(EventObserver):
         self._supervisor = supervisor
         self._forks = checkpoints
         self._idle = idle
-        self.view = View(session, ledger)
-        self._goal = Goal()
+        self.view = CurrentEventView(session, ledger)
+        self._goal = RunGoal()
         self._mark = _NEVER
         self._checkpoint_s = 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
         self._copied_at = -1
-        self._calls: dict[greenlet, Call] = {}
+        self._calls: dict[greenlet, CallbackCall] = {}
         """What each stack has called last that is not yet over."""
         self._is_unasked = False
-        """Whether a callback goes on of which nobody knows yet if that makes an event."""
+        """Whether a callback resumes and it is not yet known if that makes an event."""
         self._apart_calls: Callable[..., None] | None = None
         """What calls callbacks in a copy made for a debugger."""
         session.world.domain.dispatcher.add_observer(self)
         ledger.on_difference = self._differs
 
-    # -- where it is called ------------------------------------------------------------------------
-
     def after_event(self) -> None:
-        """See whether to stop after an event."""
         if self.ledger.events >= self._mark:
-            self._attend()
+            self._stop_or_continue()
 
     def before_event(self, call: EventCall) -> bool:
-        """See whether to stop before an event."""
         here = getcurrent()
         outer = self._calls.get(here)
         self._calls[here] = self.view.call = call_of(call.callback, call.args)
@@ -123,7 +118,7 @@ class Engine(EventObserver):
         return True
 
     def resumed(self) -> None:
-        """See, on the stack of a callback that goes on, whether to stop before it does."""
+        """Decide, on the stack of a callback that resumes, whether to stop before it."""
         self.view.call = self._calls.get(getcurrent(), NO_CALL)
         self._is_unasked = False
         if not self._goal.asks_before:
@@ -136,8 +131,8 @@ class Engine(EventObserver):
             self._is_unasked, self._mark = True, 0
 
     def _is_event(self) -> bool | None:
-        """Say whether a callback that goes on makes an event; None if nobody knows: one that spins
-        does so only if something comes of it."""
+        """Whether a resuming callback makes an event; None if unknown: one that spins makes an
+        event only if something comes of it."""
         event = self.event
         if not event.quiet:
             return True
@@ -153,12 +148,12 @@ class Engine(EventObserver):
         self.diverged = True
         self._mark = 0
 
-    def _attend(self) -> None:
-        """See what is to be done after an event: stop, answer, fork."""
+    def _stop_or_continue(self) -> None:
+        """Stop, answer or fork after an event, as needed."""
         index, goal = self.ledger.events, self._goal
         with engage(None):
             if self.diverged:
-                self.over = "the run did not do in this event what it did the first time"
+                self.over = "this event differs from the first run"
                 self._stop("diverged", text=self.over)
                 return
             if goal.after and self._ask(goal.after, index):
@@ -174,11 +169,11 @@ class Engine(EventObserver):
             elif goal.is_reached(index):
                 self._stop("step")
             else:
-                self._meanwhile(index)
+                self._leave_due_checkpoints(index)
                 self._set_mark(index)
 
-    def _meanwhile(self, index: int) -> None:
-        """Do what is to be done on the way."""
+    def _leave_due_checkpoints(self, index: int) -> None:
+        """Leave checkpoints, and look for a request to pause."""
         goal = self._goal
         if goal.ladder and index >= goal.ladder[0]:
             while goal.ladder and index >= goal.ladder[0]:
@@ -201,7 +196,6 @@ class Engine(EventObserver):
         self._mark = mark
 
     def _about_to_run(self) -> None:
-        """See whether to stop before a callback."""
         goal, index = self._goal, self.ledger.events
         with engage(None):
             now_ns = self.session.loop.now_ns
@@ -215,9 +209,9 @@ class Engine(EventObserver):
                     return
                 self.view.is_next = False
 
-    def _ask(self, watched: list[Watched], index: int, *, before: bool = False) -> bool:
-        """Ask conditions; True if one of them has stopped the run. ``before`` asks what was to be
-        asked before the event that has ended."""
+    def _ask(self, watched: list[WatchedCondition], index: int, *, before: bool = False) -> bool:
+        """Evaluate conditions; return whether one has stopped the run. ``before`` evaluates those
+        that apply before an event, after it has ended."""
         is_next = self.view.is_next
         for one in watched:
             ask = one.armed.before if is_next or before else one.armed.after
@@ -249,10 +243,8 @@ class Engine(EventObserver):
         trace = history.trace
         return "the end of the run" if trace is None else trace.result.get("stop_reason", "")
 
-    # -- stopping ----------------------------------------------------------------------------------
-
     def run(self) -> None:
-        """Run the whole session, stopping as requests say. Does not return."""
+        """Run the whole session, stopping as requested. Does not return."""
         session = self.session
         with engage(None):
             self._serve()
@@ -269,7 +261,6 @@ class Engine(EventObserver):
                 self._stop("end", text=self.over)
 
     def position(self) -> Message:
-        """Return where the run stands, as an answer has it."""
         found: Message = {
             "index": self.ledger.events,
             "stamp_ns": self.session.loop.now_ns,
@@ -289,7 +280,7 @@ class Engine(EventObserver):
         return found
 
     def _stop(self, reason: str, **more: Any) -> None:
-        """Answer the request to run, and serve others until there is another one."""
+        """Answer the request to run, then serve requests."""
         answer = {"reason": reason, "position": self.position(), **more}
         if self._hit is not None:
             answer["hit"], self._hit = self._hit, None
@@ -300,7 +291,7 @@ class Engine(EventObserver):
         self._serve()
 
     def _serve(self) -> None:
-        """Answer requests until one says to run."""
+        """Serve requests until one says to run."""
         while True:
             request = self.lines.receive()
             if request is None:
@@ -312,17 +303,19 @@ class Engine(EventObserver):
                     if self._begin(request):
                         return
                 elif request["do"] in ("pdb", "debugpy"):
-                    if self._begin_apart(request):
+                    if self._start_debugger(request):
                         return
                 else:
                     self._do(request)
             except KeyError as error:
-                self._answer(error=said(DebugError(f"not a request of this protocol: no {error}")))
+                self._answer(
+                    error=error_answer(DebugError(f"not a request of this protocol: no {error}"))
+                )
             except Exception as error:
-                self._answer(error=said(error))
+                self._answer(error=error_answer(error))
 
     def _begin(self, request: Message) -> bool:
-        """Set off for a goal; False if nothing follows any more, or it is here."""
+        """Start running towards a goal; return False if it is reached or the run is over."""
         if self.diverged:
             self._answer(ok={"reason": "diverged", "position": self.position(), "text": self.over})
             return False
@@ -331,7 +324,7 @@ class Engine(EventObserver):
             return False
         was_next = self.is_next
         self.view.is_next = False
-        goal = goal_of(request, self.view, self.names)
+        goal = parse_goal(request, self.view, self.names)
         index = self.ledger.events
         if goal.is_reached(index) or (was_next and goal.is_next_at == index):
             self._answer(ok={"reason": "step", "position": self.position()})
@@ -357,10 +350,10 @@ class Engine(EventObserver):
         elif do == "pause":
             pass  # it stands already
         elif do == "inspect":
-            self._answer(ok=inspection.inspected(self, request["what"]))
+            self._answer(ok=inspection.inspect_run(self, request["what"]))
         elif do == "evaluate":
             expression, node = request["expression"], request.get("node")
-            self._apart(lambda: inspection.evaluate(self, expression, node))
+            self._run_in_copy(lambda: inspection.evaluate(self, expression, node))
         elif do == "event":
             self._answer(ok=self._event(int(request["index"])))
         elif do == "node name":
@@ -368,20 +361,16 @@ class Engine(EventObserver):
         elif do == "check":
             self._answer(ok=parse_condition(request["text"], self.names()).text)
         elif do == "node":
-            self._apart(lambda: inspection.attributes(self, request["name"]))
+            self._run_in_copy(lambda: inspection.attributes(self, request["name"]))
         else:
             raise DebugError(f"there is no request {do!r}")
 
-    # -- copies ------------------------------------------------------------------------------------
-
     def _fork_for(self, request: Message) -> None:
-        """Answer with a copy of this process that stands where this one does."""
         other = self._forked()
         if other is not None:
             self._hand_over(other, {"id": self._id, "ok": {"pid": other.pid}})
 
     def _leave_checkpoint(self) -> None:
-        """Leave a copy asleep here, and go on."""
         began_s = _cpu_s()
         try:
             other = self._forked()
@@ -399,16 +388,14 @@ class Engine(EventObserver):
         self._checkpoint_s = max(now_s - began_s, self._checkpoint_s * 0.75)
         self._next_checkpoint_s = now_s + max(self._goal.interval_s, 8 * self._checkpoint_s)
 
-    def _forked(self) -> Copy | None:
-        """Fork; return the copy, or None in the copy itself, whose ``lines`` are new.
-
-        :raises DebugError: why there can be no copy.
-        """
+    def _forked(self) -> ForkedCopy | None:
+        """Fork; return the copy, or None in the copy itself, whose ``lines`` are new."""
         if not self._forks:
             raise DebugError("checkpoints are off")
         pairs = self.session.inner_pairs()
         if self._copied_at != self.ledger.events:  # else nothing has run since the last copy
-            reason = why_not(self._own_descriptors(), self._idle, pairs)
+            own = [self.lines.fileno(), *self.ledger.history.descriptors]
+            reason = why_not(own, self._idle, pairs)
             if reason:
                 raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
@@ -421,7 +408,7 @@ class Engine(EventObserver):
         self._copied_at = self.ledger.events
         if pid:
             theirs.close()
-            return Copy(pid, ours)
+            return ForkedCopy(pid, ours)
         ours.close()
         self.lines.close()
         self.lines = Lines(theirs)
@@ -429,16 +416,13 @@ class Engine(EventObserver):
         self.session.changes_process(_getpid(), pairs)
         return None
 
-    def _hand_over(self, copy: Copy, message: Message) -> None:
-        """Send a message with the socket to a copy, which is then the supervisor's."""
+    def _hand_over(self, copy: ForkedCopy, message: Message) -> None:
+        """Give the supervisor a copy's socket."""
         with copy.end:
             self.lines.send(message, copy.end.fileno())
 
-    def _own_descriptors(self) -> list[int]:
-        return [self.lines.fileno(), *self.ledger.history.descriptors]
-
-    def _apart(self, work: Callable[[], Any]) -> None:
-        """Do what runs a user's code in a copy, so that it changes nothing here."""
+    def _run_in_copy(self, work: Callable[[], Any]) -> None:
+        """Run user code in a copy, so that it cannot change this process."""
         try:
             ours = self._forked()
         except DebugError:
@@ -449,18 +433,15 @@ class Engine(EventObserver):
             try:
                 answer = {"ok": work()}
             except BaseException as error:
-                answer = {"error": said(error)}
+                answer = {"error": error_answer(error)}
             with suppress(BaseException):
                 self.lines.send(answer)
             end_process(0)
         assert ours is not None
         self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
 
-    def _begin_apart(self, request: Message) -> bool:
-        """Let a copy call what follows under a debugger; True in the copy.
-
-        :raises DebugError: there can be no copy, or nothing follows.
-        """
+    def _start_debugger(self, request: Message) -> bool:
+        """Let a copy call the next callbacks under a debugger; return True in the copy."""
         if self.over:
             raise DebugError(f"nothing follows: {self.over}")
         ours = self._forked()
@@ -468,30 +449,26 @@ class Engine(EventObserver):
             self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
             return False
         try:
-            self._apart_calls = debugger(self, request)
+            self._apart_calls = make_debugger(self, request)
         except BaseException as error:
-            self.end_apart(error=said(error))
-        self._goal, self._mark, self.is_next = Goal(), _NEVER, False
+            self.end_apart(error=error_answer(error))
+        self._goal, self._mark, self.is_next = RunGoal(), _NEVER, False
         self.ledger.on_difference = lambda: None  # who debugs may change things
         return True
 
     @contextmanager
     def outside(self) -> Iterator[None]:
-        """Do what is no part of the run, on whatever stack."""
+        """Do work that is not part of the run, on any stack."""
         with engage(None), self.session.world.domain.dispatcher.outside_events():
             yield
 
     def end_apart(self, **answer: Any) -> None:
-        """End this copy with an answer."""
         with self.outside(), suppress(BaseException):
             self.lines.send(answer)
         end_process(0)
 
     def _event(self, index: int) -> Message:
-        """Return an event that is known.
-
-        :raises DebugError: it is not.
-        """
+        """Return an event that is known."""
         history = self.ledger.history
         trace = history.trace
         try:
@@ -500,19 +477,17 @@ class Engine(EventObserver):
             raise DebugError(
                 f"there is no event {index} (yet): {history.known} are known"
             ) from None
-        return described(
+        return event_values(
             rest, chain_hash, self.ledger.entities if trace is None else trace.entities
         )
 
     def names(self) -> Names:
-        """Return the names in the run: those of its trace, or as far as it has come."""
         trace = self.ledger.history.trace
         entities = self.ledger.entities if trace is None else trace.entities
         return names_of(entities.values(), are_all=trace is not None, fields=loaded_fields)
 
 
-def said(error: BaseException) -> Message:
-    """Return an error as an answer has it."""
+def error_answer(error: BaseException) -> Message:
     kind = type(error).__name__
     text = str(error)
     if not isinstance(error, RsltraceError):

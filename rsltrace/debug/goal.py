@@ -1,4 +1,4 @@
-"""How far to run: what a request to run says, understood."""
+"""How far to run: the goal that a request to run describes."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.view import View
+from rsltrace.debug.current_event import CurrentEventView
 from rsltrace.line_protocol import Message
 
 NOWHERE = 1 << 62
 
 
 @dataclass
-class Watched:
-    """A condition that counts in a run, with the number of its breakpoint (0: of a request)."""
+class WatchedCondition:
+    """A condition with the number of its breakpoint (0: of a request)."""
 
     number: int
     text: str
@@ -25,7 +25,7 @@ class Watched:
 
 
 @dataclass
-class Goal:
+class RunGoal:
     """Where a run stops: at ``until`` events, before the first event after ``until_ns``, where the
     callback of event ``is_next_at`` begins, and where one of the conditions is true.
 
@@ -37,8 +37,8 @@ class Goal:
     until: int | None = None
     until_ns: int | None = None
     is_next_at: int | None = None
-    before: list[Watched] = field(default_factory=list)
-    after: list[Watched] = field(default_factory=list)
+    before: list[WatchedCondition] = field(default_factory=list)
+    after: list[WatchedCondition] = field(default_factory=list)
     searches: bool = False
     below: int = NOWHERE
     ladder: list[int] = field(default_factory=list)
@@ -46,36 +46,34 @@ class Goal:
 
     @property
     def asks_before(self) -> bool:
-        """Whether to look at events that are about to run."""
+        """Whether to look at events before they run."""
         return bool(self.before) or self.until_ns is not None or self.is_next_at is not None
 
     def is_reached(self, index: int) -> bool:
-        """Say whether so many events are enough."""
         return self.until is not None and index >= self.until and self.is_next_at is None
 
     def notes(self) -> list[str]:
-        """Say of conditions which could not be evaluated why."""
+        """Return why conditions could not be evaluated."""
         found = {one.number: one for one in (*self.before, *self.after)}
         return [f"{one.text}: {one.armed.note}" for one in found.values() if one.armed.note]
 
 
-class AfterNode(Armed):
-    """After an event of a node."""
+class AfterNodeEvent(Armed):
+    """True after each event of one node."""
 
     def __init__(self, node: str) -> None:
         self._node = node
 
     def after(self, view: EventView) -> str:
-        """Compare names."""
         return self._node if view.node == self._node else ""
 
 
-def goal_of(request: Message, view: View, names: Callable[[], Names]) -> Goal:
+def parse_goal(request: Message, view: CurrentEventView, names: Callable[[], Names]) -> RunGoal:
     """Return the goal of a request; its conditions count from where the run stands now.
 
     :raises ConditionError: a condition is wrong.
     """
-    goal = Goal(
+    goal = RunGoal(
         until=request.get("until"),
         until_ns=request.get("until_ns"),
         is_next_at=request.get("is_next_at"),
@@ -86,11 +84,11 @@ def goal_of(request: Message, view: View, names: Callable[[], Names]) -> Goal:
     )
     for one in request.get("breakpoints", ()):
         condition: Condition = parse_condition(one["text"], names())
-        watched = Watched(int(one["number"]), condition.text, condition.arm(view))
+        watched = WatchedCondition(int(one["number"]), condition.text, condition.arm(view))
         if condition.before:
             goal.before.append(watched)
         if condition.after:
             goal.after.append(watched)
     if "node" in request:
-        goal.after.append(Watched(0, request["node"], AfterNode(request["node"])))
+        goal.after.append(WatchedCondition(0, request["node"], AfterNodeEvent(request["node"])))
     return goal

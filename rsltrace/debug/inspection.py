@@ -1,8 +1,11 @@
-"""What a run that stands still is asked: its nodes, queues, timers, stacks, graph and messages."""
+"""Inspect a stopped run: nodes, queues, timers, stacks, graph, messages, Python expressions."""
 
 from __future__ import annotations
 
+import ast
+import builtins
 import json
+import math
 import reprlib
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -10,18 +13,129 @@ from dataclasses import asdict
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rsltrace.conditions.names import nodes_called, short_name
-from rsltrace.debug.python_expression import PythonError, python_value
-from rsltrace.debug.source import source
-from rsltrace.errors import DebugError, did_you_mean
+from rsltrace.conditions.evaluation import (
+    Places,
+    Refused,
+    field_names,
+    parsed,
+)
+from rsltrace.conditions.expressions import (
+    check_names,
+    free_names,
+    message_of,
+    no_such_field,
+    node_named,
+)
+from rsltrace.conditions.names import Names, nodes_called, short_name
+from rsltrace.conditions.view import EventView
+from rsltrace.debug.current_event import source
+from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.simulation.middleware.entity import Receiver
-from rsltrace.simulation.middleware.overview import overview
+from rsltrace.simulation.middleware.overview import graph_overview
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.names import Names
-    from rsltrace.debug.ledger import Ledger
-    from rsltrace.debug.view import View
+    from rsltrace.debug.current_event import CurrentEventView
+    from rsltrace.debug.event_history import EventLedger
     from rsltrace.run.session import Session
+
+# ``print EXPRESSION`` and ``DebugSession.evaluate`` take Python from the user at the prompt, in a
+# copy of a run whose code they trust: it may call methods of nodes. Text from files is never
+# evaluated so: conditions, checks and metrics have their own language (``rsltrace.conditions``).
+
+_HARMLESS = (
+    "abs all any bool bytes chr dict divmod enumerate float format frozenset getattr hasattr hash "
+    "hex int isinstance issubclass iter len list max min next ord pow range repr reversed round "
+    "set slice sorted str sum tuple type vars zip"
+).split()
+_BUILTINS = {name: getattr(builtins, name) for name in _HARMLESS}
+_REFUSED: Mapping[type[ast.AST], str] = {
+    ast.NamedExpr: "an expression cannot assign (:=)",
+    ast.Await: "an expression cannot wait (await)",
+    ast.Yield: "an expression cannot yield",
+    ast.YieldFrom: "an expression cannot yield",
+}
+
+
+def python_value(text: str, names: Names, view: EventView, *, message: object, node: object) -> Any:
+    """Return the value of a Python expression.
+
+    Names are looked up in ``message`` (its fields), ``node`` (its attributes), the run's nodes by
+    short name, and Python's builtins.
+
+    :raises ConditionError: it is not an expression, or uses an unknown name.
+    :raises PythonError: it raised an exception.
+    """
+    text = text.strip()
+    tree = parsed(text, text, 0)
+    try:
+        for part in ast.walk(tree):
+            if type(part) in _REFUSED:
+                raise Refused(part, _REFUSED[type(part)])
+        others = ("self", "math", "np", *_BUILTINS)
+        check_names(tree, names, interface="", has_own=True, others=others)
+    except Refused as error:
+        raise ConditionError(error.message, text, *Places(text).of(error.node)) from None
+    try:
+        code = compile(ast.Expression(tree), "<expression>", "eval")
+        scope: dict[str, Any] = {"__builtins__": {}}
+        for name in free_names(tree):
+            scope[name] = _look_up(name, view, message, node)
+        return eval(code, scope)
+    except Exception as error:
+        raise PythonError(f"{type(error).__name__}: {error}") from error
+
+
+class PythonError(Exception):
+    """The exception that an expression raised, as text."""
+
+
+def _look_up(name: str, view: EventView, message: object, node: object) -> Any:
+    if message is not None and name in field_names(message):
+        return getattr(message, name)
+    if node is not None and name != "self":
+        try:
+            return getattr(node, name)
+        except AttributeError:
+            pass
+    found = _RUN.get(name)
+    if found is not None:
+        return found(view, message, node)
+    called = nodes_called(name, view.nodes())
+    if len(called) == 1:
+        return view.nodes()[called[0]]
+    if name in _BUILTINS:
+        return _BUILTINS[name]
+    if message is not None:
+        raise no_such_field(message, name)
+    if node is not None:
+        raise AttributeError(
+            f"{type(node).__name__} has no attribute {name!r}{did_you_mean(name, vars(node))}"
+        )
+    raise NameError(f"there is no node {name!r} (yet)")
+
+
+def _self_of(node: object) -> object:
+    if node is None:
+        raise NameError('self: say in which node, or node("name")')
+    return node
+
+
+def _numpy() -> object:
+    import numpy
+
+    return numpy
+
+
+_RUN: Mapping[str, Callable[[Any, Any, Any], Any]] = {
+    "node": lambda view, message, node: lambda name: node_named(view, name),
+    "event": lambda view, message, node: view,
+    "now": lambda view, message, node: view.stamp_ns / 1e9,
+    "msg": lambda view, message, node: message_of(view, message),
+    "self": lambda view, message, node: _self_of(node),
+    "math": lambda view, message, node: math,
+    "np": lambda view, message, node: _numpy(),
+}
+
 
 _JSON_BYTES_MAX = 1 << 20
 _ATTRIBUTES_MAX = 1000
@@ -34,63 +148,61 @@ _short.maxlist = _short.maxtuple = _short.maxset = _short.maxdict = _short.maxde
 _short.maxlevel = 6
 
 
-class Standing(Protocol):
-    """A run that stands still."""
+class StoppedRun(Protocol):
+    """A run that is stopped between two events."""
 
-    view: View
+    view: CurrentEventView
     session: Session
-    ledger: Ledger
+    ledger: EventLedger
 
     def names(self) -> Names:
         """Return the names in the run."""
 
 
-def node_named(run: Standing, name: str) -> Any:
+def live_node(run: StoppedRun, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
-    :raises DebugError: there is none, or several, or it is not there now.
+    :raises DebugError: none or several match, or it does not exist now.
     """
     full = full_name(run, name)
     node = run.view.nodes().get(full)
     if node is None:
-        raise DebugError(
-            f"{full} is not there: it has not been made yet, or it is destroyed by now"
-        )
+        raise DebugError(f"{full} does not exist now: it is not made yet, or already destroyed")
     return node
 
 
-def full_name(run: Standing, name: str) -> str:
-    """Return the full name of the node that is meant.
+def full_name(run: StoppedRun, name: str) -> str:
+    """Return the full name of a node given by any unique part.
 
-    :raises DebugError: there is none, or several.
+    :raises DebugError: none or several match.
     """
     nodes = dict.fromkeys((*run.view.nodes(), *run.names().nodes))
     found = nodes_called(name, nodes)
     if len(found) == 1:
         return found[0]
     if found:
-        raise DebugError(f"{name!r} may be any of {', '.join(found)}: give the full name")
+        raise DebugError(f"{name!r} matches {', '.join(found)}: give the full name")
     there = ", ".join(nodes) or "none yet"
     hint = did_you_mean(name, [*nodes, *map(short_name, nodes)], f"there are {there}")
     raise DebugError(f"no node is called {name!r}; {hint}")
 
 
-def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]:
-    """Return the value of a Python expression as JSON, and how Python shows it.
+def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, Any]:
+    """Return the value of a Python expression as JSON, and its ``repr``.
 
-    :raises ConditionError: it is no expression, or names what is not there.
-    :raises DebugError: it raised.
+    :raises ConditionError: it is not an expression, or uses an unknown name.
+    :raises DebugError: it raised an exception.
     """
-    owner = None if node is None else node_named(run, node)
+    owner = None if node is None else live_node(run, node)
     received = run.view.received()
     message = None if received is None else received[1]
     try:
         value = python_value(expression, run.names(), run.view, message=message, node=owner)
     except PythonError as error:
         raise DebugError(f"{expression}: {error}") from error
-    answer: dict[str, Any] = {"repr": text_of(value), "type": type(value).__qualname__}
+    answer: dict[str, Any] = {"repr": short_repr(value), "type": type(value).__qualname__}
     try:
-        text = json.dumps(plain(value), allow_nan=False)
+        text = json.dumps(json_value(value), allow_nan=False)
         if len(text) <= _JSON_BYTES_MAX:
             answer["value"] = json.loads(text)
     except (TypeError, ValueError, RecursionError):
@@ -98,44 +210,46 @@ def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]
     return answer
 
 
-def text_of(value: object) -> str:
-    """Return how Python shows a value, cut where it is long."""
+def short_repr(value: object) -> str:
+    """Return a value's ``repr``, shortened."""
     try:
         return _short.repr(value)
     except Exception as error:
         return f"<{type(value).__qualname__} whose repr raised {type(error).__name__}: {error}>"
 
 
-def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: arrays are lists, messages objects.
+def json_value(value: Any) -> Any:
+    """Return a value as JSON has it: arrays are lists, messages are objects.
 
-    :raises TypeError: it cannot be.
+    :raises TypeError: JSON has no such value.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if hasattr(value, "get_fields_and_field_types"):
-        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+        return {
+            name: json_value(getattr(value, name)) for name in value.get_fields_and_field_types()
+        }
     if hasattr(value, "tolist"):  # of numpy, array.array
-        return plain(value.tolist())
+        return json_value(value.tolist())
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [json_value(item) for item in value]
     if isinstance(value, (bytes, bytearray)):
         return list(value)
     raise TypeError(f"{type(value).__qualname__} is not JSON")
 
 
-def attributes(run: Standing, name: str) -> dict[str, str]:
-    """Return a node's own attributes and parameters as Python shows them.
+def attributes(run: StoppedRun, name: str) -> dict[str, str]:
+    """Return a node's own attributes and parameters with their ``repr``.
 
-    Of objects that Python shows by their address only there are the attributes: ``_ekf.P``.
+    An object without a ``repr`` of its own is listed by its attributes: ``_ekf.P``.
     """
     from rsltrace.adapters.rclpy.handles.node_state import own_attributes
 
-    own = own_attributes(node_named(run, name))
+    own = own_attributes(live_node(run, name))
     found = islice(_within(own, "", _DEPTH_MAX), _ATTRIBUTES_MAX)
-    return {path: text_of(value) for path, value in found}
+    return {path: short_repr(value) for path, value in found}
 
 
 def _within(values: Mapping[str, Any], prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
@@ -148,7 +262,7 @@ def _within(values: Mapping[str, Any], prefix: str, depth: int) -> Iterator[tupl
 
 
 def _plain_parts(value: object) -> Mapping[str, Any]:
-    """Return the attributes of an object of the user's that has no text of its own."""
+    """Return the attributes of a user object without a ``repr`` of its own."""
     kind = type(value)
     of = {one.__module__.partition(".")[0] for one in kind.__mro__[:-1]}
     if kind.__repr__ is not object.__repr__ or not of.isdisjoint(_NO_USERS):
@@ -158,19 +272,14 @@ def _plain_parts(value: object) -> Mapping[str, Any]:
     return {**found, **getattr(value, "__dict__", {})}
 
 
-# -- what there is ---------------------------------------------------------------------------------
-
-
-def nodes(run: Standing) -> list[dict[str, Any]]:
-    """Return the nodes there are."""
+def nodes(run: StoppedRun) -> list[dict[str, Any]]:
     return [
         {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
         for name, node in run.view.nodes().items()
     ]
 
 
-def queues(run: Standing) -> list[dict[str, Any]]:
-    """Return what waits in the queues of subscriptions, services and clients."""
+def queues(run: StoppedRun) -> list[dict[str, Any]]:
     graph = run.session.world.domain.graph
     found = []
     for node in graph.nodes:
@@ -188,8 +297,8 @@ def queues(run: Standing) -> list[dict[str, Any]]:
     return found
 
 
-def timers(run: Standing) -> list[dict[str, Any]]:
-    """Return the timers, those that are due first before others; cancelled ones come last."""
+def timers(run: StoppedRun) -> list[dict[str, Any]]:
+    """Return the timers, the next due first, cancelled ones last."""
     found = []
     for node in run.session.world.domain.graph.nodes:
         for timer in _timers_of(node):
@@ -210,22 +319,20 @@ def _timers_of(node: Any) -> list[Any]:
     return list(node.timers) if wrapper is None else [one.handle for one in wrapper.timers]
 
 
-def stacks(run: Standing) -> list[str]:
-    """Return who waits for what, with the lines of user code that led there."""
+def stacks(run: StoppedRun) -> list[str]:
     stacks = run.session.world.stacks
     waits = [one.waits_for() for one in stacks.coroutines.suspended]
     return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
 
 
-def graph(run: Standing) -> dict[str, Any]:
-    """Return nodes, topics, services and actions with their ends."""
-    values = asdict(overview(run.session.world.domain.graph, ()))
+def graph(run: StoppedRun) -> dict[str, Any]:
+    values = asdict(graph_overview(run.session.world.domain.graph, ()))
     del values["waiting"]
     return values
 
 
-def message(run: Standing) -> dict[str, Any] | None:
-    """Return what the callback of the present event gets: the next one's, if it is about to run."""
+def message(run: StoppedRun) -> dict[str, Any] | None:
+    """Return the input message of the current (or next) callback."""
     received = run.view.received()
     if received is None:
         return None
@@ -233,11 +340,11 @@ def message(run: Standing) -> dict[str, Any] | None:
     return {
         "name": name,
         "type": "/".join([*type(content).__module__.split(".")[:2], type(content).__name__]),
-        "content": plain(content),
+        "content": json_value(content),
     }
 
 
-INSPECTED: dict[str, Callable[[Standing], Any]] = {
+INSPECTED: dict[str, Callable[[StoppedRun], Any]] = {
     "nodes": nodes,
     "queues": queues,
     "timers": timers,
@@ -248,11 +355,7 @@ INSPECTED: dict[str, Callable[[Standing], Any]] = {
 }
 
 
-def inspected(run: Standing, what: str) -> Any:
-    """Return the answer to a request to inspect.
-
-    :raises DebugError: there is no such thing to see.
-    """
+def inspect_run(run: StoppedRun, what: str) -> Any:
     if what not in INSPECTED:
         there = ", ".join(INSPECTED)
         raise DebugError(f"nothing is called {what!r}; {did_you_mean(what, INSPECTED, there)}")

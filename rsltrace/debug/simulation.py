@@ -1,7 +1,7 @@
-"""The process of a simulation that is debugged: opens a trace or a job, and does as it is told.
+"""The process of a debugged simulation: opens a trace or a job, and serves the supervisor.
 
-Run as ``python -m rsltrace.debug.simulation DESCRIPTOR SPEC`` by the supervisor, which it serves on
-that descriptor. SPEC is a JSON object.
+Run as ``python -m rsltrace.debug.simulation DESCRIPTOR SPEC`` by the supervisor; DESCRIPTOR is the
+socket, SPEC a JSON object.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from rsltrace.guard.pin import pin, unpin
 from rsltrace.line_protocol import Lines
 
 if TYPE_CHECKING:
-    from rsltrace.debug.ledger import History
+    from rsltrace.debug.event_history import EventHistory
     from rsltrace.job import Job
     from rsltrace.replay.edits import Edit
 
 
 def main() -> None:
-    """Serve the supervisor until it is gone."""
     pin()
     number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
     die_with_parent(spec["supervisor"])
@@ -40,20 +39,17 @@ def main() -> None:
             lines.move_high()
             _serve(job, history, edits, notes, spec, lines, stack)
         except (RsltraceError, OSError) as error:
-            from rsltrace.debug.engine import said
+            from rsltrace.debug.engine import error_answer
 
-            lines.send({"notice": "failed", "error": said(error)})
+            lines.send({"notice": "failed", "error": error_answer(error)})
             end_process(2)
 
 
 def _opened(
     spec: dict[str, Any], stack: ExitStack
-) -> tuple[Job, History, tuple[Edit, ...], list[str]]:
-    """Return the job to run, what is known of its run, the edits in it, and notes.
-
-    :raises RsltraceError: it cannot be run here.
-    """
-    from rsltrace.debug.ledger import RunHistory, TraceHistory
+) -> tuple[Job, EventHistory, tuple[Edit, ...], list[str]]:
+    """Return the job to run, its event history, the edits in it, and notes."""
+    from rsltrace.debug.event_history import RunHistory, TraceHistory
     from rsltrace.diff.file_kind import is_trace
 
     source = spec["source"]
@@ -73,7 +69,7 @@ def _opened(
 
 def _serve(
     job: Job,
-    history: History,
+    history: EventHistory,
     edits: tuple[Edit, ...],
     notes: list[str],
     spec: dict[str, Any],
@@ -81,8 +77,8 @@ def _serve(
     stack: ExitStack,
 ) -> None:
     from rsltrace.debug.engine import Engine
-    from rsltrace.debug.ledger import Ledger
-    from rsltrace.replay.editing import Editing
+    from rsltrace.debug.event_history import EventLedger
+    from rsltrace.replay.editing import EditObserver
     from rsltrace.run.process import Observer
     from rsltrace.run.session import Session
 
@@ -91,7 +87,7 @@ def _serve(
     recorded = None
     if trace is not None and job.guard.enabled:
         recorded = Path(os.path.abspath(trace.name))
-    ledger = Ledger(history, ends_at_size_after=None if trace is None else trace.ended_after)
+    ledger = EventLedger(history, ends_at_size_after=None if trace is None else trace.ended_after)
     session = stack.enter_context(
         Session(
             job,
@@ -103,7 +99,7 @@ def _serve(
         )
     )
     if edits:  # those that a branch was made with
-        Editing(edits, known=len(edits)).attach(session)
+        EditObserver(edits, known=len(edits)).attach(session)
     engine = Engine(
         session,
         ledger,
@@ -125,7 +121,7 @@ def _serve(
 
 
 def _middleware_threads() -> frozenset[int]:
-    """Return the threads that DDS starts when it is loaded, and nobody uses in a simulation."""
+    """Return the threads that DDS starts when it is loaded; a simulation does not use them."""
     from rsltrace.adapters.rclpy.boundary.installation import check_free
     from rsltrace.forking import other_threads
 

@@ -1,7 +1,7 @@
-"""Between the client and the processes of the simulation: who stands where, and who is woken.
+"""The process between the client and the simulation processes.
 
-Run as ``python -m rsltrace.debug.supervisor DESCRIPTOR SPEC`` by the client, which it serves on
-that descriptor until the client is gone. It runs no user code, so it can always answer.
+Run as ``python -m rsltrace.debug.supervisor DESCRIPTOR SPEC`` by the client, until the client
+disconnects. It runs no user code, so it can always answer.
 """
 
 from __future__ import annotations
@@ -15,18 +15,16 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.debug.tree import ClientGone, Over, Tree
+from rsltrace.debug.tree import CheckpointTree, ClientGoneError, SessionOverError
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 
 
 class Supervisor:
-    """Answers requests of one client."""
-
     def __init__(self, client: Lines, spec: dict[str, Any]) -> None:
         self.client = client
         self.waiting: deque[Message] = deque()
-        self.tree = Tree(spec, client, self.waiting)
+        self.tree = CheckpointTree(spec, client, self.waiting)
         self._breakpoints: dict[int, str] = {}
         self._last_number = 0
         self._do: dict[str, Callable[[Message], Any]] = {
@@ -42,13 +40,13 @@ class Supervisor:
             "go_to": self._go_to,
             "break": self._break,
             "clear": self._clear,
-            "breakpoints": lambda request: self._listed(),
-            "inspect": self._pass_on,
-            "evaluate": self._pass_on_apart,
-            "node": self._pass_on_apart,
+            "breakpoints": lambda request: self._conditions(),
+            "inspect": self._ask_simulation,
+            "evaluate": self._ask_copy,
+            "node": self._ask_copy,
             "pdb": self._debug,
             "debugpy": self._debug,
-            "event": self._pass_on,
+            "event": self._ask_simulation,
             "sent_by": self._sent_by,
             "last_changed": self._last_changed,
             "first_true": self._first_true,
@@ -57,7 +55,7 @@ class Supervisor:
         }
 
     def serve(self) -> None:
-        """Answer until the client is gone; then end everything."""
+        """Answer requests until the client disconnects, then end all processes."""
         try:
             self.client.send({"notice": "ready", **self.tree.start()})
             while True:
@@ -67,7 +65,7 @@ class Supervisor:
                 self.client.send({"id": request.get("id"), **self._answer(request)})
                 self.tree.thin()
         except RsltraceError as error:
-            if not isinstance(error, ClientGone):
+            if not isinstance(error, ClientGoneError):
                 self.client.send({"notice": "failed", "error": _said(error)})
         except ConnectionError:
             pass
@@ -80,15 +78,13 @@ class Supervisor:
             if do is None:
                 raise DebugError(f"there is no request {request.get('do')!r}")
             return {"ok": do(request)}
-        except (ClientGone, Over):
+        except (ClientGoneError, SessionOverError):
             raise
         except RsltraceError as error:
             return {"error": _said(error)}
         except (KeyError, TypeError, ValueError) as error:
             text = f"not a request of this protocol: {type(error).__name__}: {error}"
             return {"error": {"kind": "DebugError", "message": text}}
-
-    # -- forward -----------------------------------------------------------------------------------
 
     @property
     def _index(self) -> int:
@@ -110,20 +106,20 @@ class Supervisor:
         return answer
 
     def _node(self, request: Message) -> str:
-        """Return the full name of the node that is meant: by default that of the last event."""
+        """Return the full name of the requested node, by default that of the last event."""
         name = request.get("node")
         if name is not None:
             return str(self.tree.ask_cursor({"do": "node name", "name": name}))
         event = self.tree.position["event"]
         if event is None or not event["node"]:
-            raise DebugError("the last event is no node's: say which node is meant")
+            raise DebugError("the last event belongs to no node: give a node")
         return str(event["node"])
 
     def _finish(self, request: Message) -> Message:
         return self._forward(until_ns=self.tree.position["stamp_ns"])
 
     def _place(self, place: int | str) -> Message:
-        """Return the goal of an index (an int, or digits) or a time of the run."""
+        """Return the goal for an index (an int, or digits) or a time of the run."""
         text = str(place).strip()
         if text.isascii() and text.isdigit():
             return {"until": int(text)}
@@ -140,13 +136,11 @@ class Supervisor:
         goal = self._place(request["to"])
         here = self._index if "until" in goal else int(self.tree.position["stamp_ns"])
         if next(iter(goal.values())) < here:
-            raise DebugError(f"{request['to']} is behind: go_to goes back")
+            raise DebugError(f"{request['to']} is in the past: go_to goes back")
         return self._forward(**goal)
 
     def _go_on(self, request: Message) -> Message:
         return self._forward()
-
-    # -- back --------------------------------------------------------------------------------------
 
     def _reverse_step(self, request: Message) -> Message:
         goal = self._index - _count(request)
@@ -165,8 +159,6 @@ class Supervisor:
 
     def _reverse_go_on(self, request: Message) -> Message:
         return self.tree.go_back({"breakpoints": self._conditions()})
-
-    # -- searches ----------------------------------------------------------------------------------
 
     def _sent_by(self, request: Message) -> Message:
         event = self.tree.ask_cursor({"do": "event", "index": int(request["index"])})
@@ -191,8 +183,6 @@ class Supervisor:
             raise DebugError(f"{request['condition']} has not been true so far")
         return found
 
-    # -- breakpoints -------------------------------------------------------------------------------
-
     def _break(self, request: Message) -> Message:
         text = str(request["at"])
         self.tree.ask_cursor({"do": "check", "text": text})
@@ -204,29 +194,24 @@ class Supervisor:
         if self._breakpoints.pop(request["number"], None) is None:
             raise DebugError(f"there is no breakpoint {request['number']}")
 
-    def _listed(self) -> list[Message]:
-        return self._conditions()
-
-    # -- what the simulation answers itself --------------------------------------------------------
-
-    def _pass_on(self, request: Message) -> Any:
+    def _ask_simulation(self, request: Message) -> Any:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
 
     def _debug(self, request: Message) -> Any:
-        """Let a copy run on under a debugger of Python, until that is told to end."""
-        answer = self.tree.ask_apart({k: v for k, v in request.items() if k != "id"}, None)
+        """Let a copy continue under a Python debugger, until that ends."""
+        answer = self.tree.ask_copy({k: v for k, v in request.items() if k != "id"}, None)
         if "raised" not in answer:
             return {"ended": answer.get("text", "the end of the run"), "raised": ""}
         return answer
 
-    def _pass_on_apart(self, request: Message) -> Any:
-        return self.tree.ask_apart({k: v for k, v in request.items() if k != "id"})
+    def _ask_copy(self, request: Message) -> Any:
+        return self.tree.ask_copy({k: v for k, v in request.items() if k != "id"})
 
 
 def _count(request: Message) -> int:
     count = int(request.get("count", 1))
     if count < 1:
-        raise DebugError(f"{count} events are no step")
+        raise DebugError(f"a step has at least one event, not {count}")
     return count
 
 
@@ -236,7 +221,6 @@ def _said(error: RsltraceError) -> Message:
 
 
 def main() -> None:
-    """Serve a client."""
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
     os.set_inheritable(number, False)

@@ -1,4 +1,4 @@
-"""The processes of a session by what they are for: the cursor, and checkpoints asleep behind it."""
+"""The processes of a session: the cursor, and the checkpoints behind it."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ _NEARLY = 0.8
 _PIECE_BYTES = 1 << 16
 
 
-class ClientGone(DebugError):
-    """Nobody is there to answer."""
+class ClientGoneError(DebugError):
+    """The client has disconnected."""
 
 
-class Over(DebugError):
-    """The session cannot go on. The message says why."""
+class SessionOverError(DebugError):
+    """The session cannot continue. The message says why."""
 
 
-class Refused(DebugError):
-    """An error that a process of the simulation has answered; ``kind`` is the class it names."""
+class RefusedRequestError(DebugError):
+    """An error that a simulation process returned; ``kind`` is its class."""
 
     def __init__(self, message: str, kind: str) -> None:
         super().__init__(message)
         self.kind = kind
 
 
-class Tree:
-    """Where a session stands, and how it gets elsewhere. ``position`` is that of the cursor."""
+class CheckpointTree:
+    """The processes of a session: the cursor, and checkpoints. ``position`` is the cursor's."""
 
     def __init__(self, spec: dict[str, Any], client: Lines, waiting: deque[Message]) -> None:
         self.family = Family()
@@ -58,8 +58,6 @@ class Tree:
         self._output, self._output_end = os.pipe()
         os.set_blocking(self._output, False)
 
-    # -- beginning ---------------------------------------------------------------------------------
-
     def start(self) -> Message:
         """Open the source; return what is known of it.
 
@@ -69,7 +67,7 @@ class Tree:
         self.start_ns = int(ready["start_ns"])
         try:
             self._cursor = self._copy_of(root)
-        except Refused as error:
+        except RefusedRequestError as error:
             self._no_checkpoints(str(error))
             self._cursor = root
         else:
@@ -78,7 +76,7 @@ class Tree:
         return {key: value for key, value in ready.items() if key != "notice"}
 
     def _new_root(self) -> tuple[SimProcess, Message]:
-        """Start a process at the begin of the run."""
+        """Start a process at the beginning of the run."""
         root = self.family.start(self._spec, self._output_end)
         try:
             while True:
@@ -87,29 +85,24 @@ class Tree:
                     return root, message
                 if message.get("notice") == "failed":
                     error = message["error"]
-                    raise Refused(error["message"], error["kind"])
+                    raise RefusedRequestError(error["message"], error["kind"])
         except DebugError:
             self.family.kill(root)
             raise
 
-    # -- the cursor --------------------------------------------------------------------------------
+    def ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
+        """Send a request to the process at the session's position.
 
-    def ask_cursor(self, request: Message) -> Any:
-        """Ask the process that stands where the session does.
-
-        :raises Lost: it has ended; the session is back there.
+        :raises Lost: that process ended; another one stands there now.
         """
-        return self._ask_cursor(request)
-
-    def _ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
         try:
             return self._ask(self._cursor, request, whole=whole)
         except Lost as error:
-            raise self._come_back(self.position, error) from None
+            raise self._recover(self.position, error) from None
 
-    def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
-        """Ask for what runs a user's code: a copy does it, and may be killed."""
-        answer = self._ask_cursor(request, whole=True)
+    def ask_copy(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
+        """Have a copy run user code; the copy may be killed."""
+        answer = self.ask_cursor(request, whole=True)
         if "with" not in answer:
             return answer["ok"]
         copy = SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
@@ -121,42 +114,36 @@ class Tree:
     def run(self, goal: Message) -> Message:
         """Run the cursor forward; return where and why it stopped.
 
-        :raises Lost: its process has ended; the session is back where it was.
+        :raises Lost: its process ended; the session is back where it was.
         """
         before = self.position
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
             request["ladder"] = self._checkpoints.ladder(int(before["index"]), goal["until"])
-        answer: Message = self._ask_cursor(request)
+        answer: Message = self.ask_cursor(request)
         self.position = answer["position"]
         return answer
 
-    def _come_back(self, before: Message, error: Lost) -> Lost:
-        """Put the session back where it was before its process ended.
-
-        :raises Over: that cannot be done.
-        """
+    def _recover(self, before: Message, error: Lost) -> Lost:
+        """Return the session to its position after its process ended."""
         self.family.kill(self._cursor)
         index = int(before["index"])
         where = f"somewhere after event {index - 1}" if index else "at the begin"
         for is_last in (False, True):  # who kills one process may just have killed another
             try:
                 self._cursor, answer = self._at({"until": index})
-            except ClientGone:
+            except ClientGoneError:
                 raise
             except DebugError as again:
                 if is_last:
                     why = f"the simulation cannot go on: {error}; nor again: {again}"
-                    raise Over(why) from None
+                    raise SessionOverError(why) from None
             else:
                 break
         self.position = answer["position"]
         return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
 
-    # -- going back --------------------------------------------------------------------------------
-
     def go_to(self, goal: Message) -> Message:
-        """Go to an index or a time, wherever that is."""
         if "until" in goal:
             here = int(self.position["index"])
             if goal["until"] == here and not self.position["is_next"]:
@@ -172,44 +159,45 @@ class Tree:
         return answer
 
     def _jumps_ahead(self, goal: Message) -> bool:
-        """Say whether a checkpoint lies between here and a goal ahead."""
-        found = self._bases(goal)
+        """Whether a checkpoint lies between here and a goal ahead."""
+        found = self._checkpoints_before(goal)
         return bool(found) and found[0].index > int(self.position["index"])
 
     def _leave_cursor(self) -> None:
-        """Have the process that stood here sleep as a checkpoint, or end."""
+        """Keep the cursor's process as a checkpoint, or end it."""
         position = self.position
-        if self._checkpoints.count_max and self._copies and not position["is_next"]:
+        can_copy = self._checkpoints.count_max and not self._why_no_checkpoints
+        if can_copy and not position["is_next"] and not position.get("over"):
             one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), self._cursor)
-            if not self._is_over and self._checkpoints.add(one):
+            if self._checkpoints.add(one):
                 return
         self.family.kill(self._cursor)
 
     def _at(self, goal: Message) -> tuple[SimProcess, Message]:
-        """Return a new process at a goal, and its answer."""
-        process, index = self._awake(self._bases(goal))
+        """Return a new process that stands at a goal, and its answer."""
+        process, index = self._wake(self._checkpoints_before(goal))
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
             request["ladder"] = self._checkpoints.ladder(index, goal["until"])
         try:
-            return process, self._quietly(process, request)
+            return process, self._ask_silently(process, request)
         except DebugError:
             self.family.kill(process)
             raise
 
-    def _bases(self, goal: Message) -> list[Checkpoint]:
+    def _checkpoints_before(self, goal: Message) -> list[Checkpoint]:
         if "until" in goal:
             return self._checkpoints.before(goal["until"])
         return self._checkpoints.before_time(goal["until_ns"])
 
-    def _awake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
-        """Return a copy of the first checkpoint that can be woken, or a process at the begin."""
+    def _wake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
+        """Return a copy of the first usable checkpoint, or a process at the beginning."""
         for one in bases:
             try:
                 return self._copy_of(one.process), one.index
             except Lost:
                 self._forget(one)
-            except Refused as error:
+            except RefusedRequestError as error:
                 self._no_checkpoints(str(error))
                 break
         if not bases or self._why_no_checkpoints:
@@ -218,7 +206,7 @@ class Tree:
         return root, 0
 
     def go_back(self, conditions: Message) -> Message:
-        """Go back to the last place at which one of the conditions was true; else to the begin."""
+        """Go back to the last place where a condition was true, else to the beginning."""
         # Where it stands before a callback, what ended just before that is behind, too.
         hit = self.last_hit(conditions, int(self.position["index"]) + self.position["is_next"])
         if hit is None:
@@ -234,13 +222,13 @@ class Tree:
         return answer
 
     def last_hit(self, conditions: Message, below: int) -> Message | None:
-        """Return the last place at an index ``below`` so many where a condition was true."""
+        """Return the last place before index ``below`` where a condition was true."""
         end = min(below, int(self.position["index"]))
         while True:
             bases = self._checkpoints.before(max(end - 1, 0))
-            process, index = self._awake(bases)
+            process, index = self._wake(bases)
             try:
-                answer = self._quietly(
+                answer = self._ask_silently(
                     process,
                     {
                         "do": "run",
@@ -260,31 +248,18 @@ class Tree:
 
     def first_hit(self, conditions: Message, end: int) -> Message | None:
         """Return the first place up to index ``end`` where a condition was true."""
-        process, _ = self._awake(self._checkpoints.before(0))
+        process, _ = self._wake(self._checkpoints.before(0))
         try:
-            answer = self._quietly(process, {"do": "run", "until": end, **conditions})
+            answer = self._ask_silently(process, {"do": "run", "until": end, **conditions})
         finally:
             self.family.kill(process)
         return answer["position"] if answer["reason"] == "breakpoint" else None
-
-    # -- checkpoints -------------------------------------------------------------------------------
-
-    @property
-    def _copies(self) -> bool:
-        return not self._why_no_checkpoints
-
-    @property
-    def _is_over(self) -> bool:
-        return bool(self.position.get("over"))
 
     def _interval(self) -> float:
         return _INTERVAL_S if self._checkpoints.count_max else 0.0
 
     def _copy_of(self, process: SimProcess) -> SimProcess:
-        """Return a copy of a process, which stands where it does.
-
-        :raises Refused: there can be none.
-        """
+        """Return a copy of a process, which stands where it does."""
         answer = self._ask(process, {"do": "fork"}, whole=True)
         return SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
 
@@ -298,7 +273,7 @@ class Tree:
         self.family.kill(one.process)
 
     def thin(self) -> None:
-        """Keep number and memory of checkpoints within their bounds, after a move."""
+        """Keep checkpoints within their limits of number and memory, after a move."""
         cursor = int(self.position["index"])
         if cursor == self._thinned_at:
             return
@@ -306,7 +281,7 @@ class Tree:
         while len(self._checkpoints) > self._checkpoints.count_max:
             if not self._drop_one(cursor):
                 return
-        self._weigh_next()
+        self._measure_next()
         while self._memory_known() > _NEARLY * self._memory_max:
             if self.memory() <= self._memory_max or not self._drop_one(cursor):
                 return
@@ -317,8 +292,8 @@ class Tree:
             self._forget(worst)
         return worst is not None
 
-    def _weigh_next(self) -> None:
-        """Look at the memory of one checkpoint, in turns: all of them would take long."""
+    def _measure_next(self) -> None:
+        """Measure the memory of one checkpoint, in turn: all at once would be slow."""
         everyone = self._checkpoints.all()
         if everyone:
             self._weighed += 1
@@ -329,31 +304,28 @@ class Tree:
         return sum(one.bytes for one in self._checkpoints.all())
 
     def memory(self) -> int:
-        """Return how much memory the checkpoints take, in bytes (PSS)."""
+        """Measure the memory of all checkpoints, in bytes (PSS)."""
         for one in self._checkpoints.all():
             one.bytes = memory_bytes(one.process.pid)
         return self._memory_known()
 
     def described(self) -> Message:
-        """Return what checkpoints there are, as an answer has it."""
         return {
             "indices": [one.index for one in self._checkpoints.all()],
             "bytes": self.memory(),
             "why_not": self._why_no_checkpoints,
         }
 
-    # -- talking -----------------------------------------------------------------------------------
-
     def next_request(self) -> Message | None:
-        """Wait for the client's next request; None once it is gone."""
+        """Wait for the client's next request; None once it has disconnected."""
         while not self._waiting:
             if self._client.ended:
                 return None
             self._wait_for(None, None)
         return self._waiting.popleft()
 
-    def _quietly(self, process: SimProcess, request: Message) -> Message:
-        """Ask a process that repeats what has been seen: what it prints is dropped."""
+    def _ask_silently(self, process: SimProcess, request: Message) -> Message:
+        """Send a request to a process that repeats known events: its output is dropped."""
         self._is_quiet = True
         try:
             answer: Message = self._ask(process, request)
@@ -372,11 +344,7 @@ class Tree:
         whole: bool = False,
         limit_s: float | None = None,
     ) -> Any:
-        """Send a request to a process and wait for its answer.
-
-        :raises Refused: the error that it answered.
-        :raises Lost: it has ended, or does not answer in time.
-        """
+        """Send a request to a process and return its answer."""
         if request is not None:
             try:
                 process.lines.send({"id": 0, **request})
@@ -386,12 +354,12 @@ class Tree:
         while True:
             message = self._message_of(process, limit_s)
             if "error" in message:
-                raise Refused(message["error"]["message"], message["error"]["kind"])
+                raise RefusedRequestError(message["error"]["message"], message["error"]["kind"])
             if "ok" in message:
                 return message if whole else message["ok"]
 
     def _message_of(self, process: SimProcess, limit_s: float | None = None) -> Message:
-        """Wait for what a process says that is no notice to us."""
+        """Wait for a message of a process that is not a notice."""
         while True:
             message = process.lines.next()
             if message is None:
@@ -417,13 +385,13 @@ class Tree:
             return
         self._why_no_checkpoints = ""
         one.bytes = memory_bytes(copy.pid)
-        self._weigh_next()
+        self._measure_next()
         is_heavy = self._memory_known() > self._memory_max
         if is_heavy or len(self._checkpoints) > self._checkpoints.count_max:
             self._drop_one(one.index)
 
     def _wait_for(self, process: SimProcess | None, limit_s: float | None) -> None:
-        """Wait until somebody says something: a process, the client, a node that prints."""
+        """Wait for a process, the client, or output of a node."""
         ends: list[Any] = [self._output]
         if process is not None:
             ends.append(process.lines)
@@ -438,12 +406,12 @@ class Tree:
         if self._output in ready:
             self._pass_output_on()
         if self._client in ready:
-            self._hear_client(process)
+            self._read_client(process)
         if process is not None and process.lines in ready:
             process.lines.read()
         self.family.reap()
 
-    def _hear_client(self, process: SimProcess | None) -> None:
+    def _read_client(self, process: SimProcess | None) -> None:
         self._client.read()
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":
@@ -452,10 +420,10 @@ class Tree:
             else:
                 self._waiting.append(request)
         if self._client.ended and process is not None:
-            raise ClientGone("the client is gone")
+            raise ClientGoneError("the client is gone")
 
     def _pass_output_on(self) -> None:
-        """Give the client what nodes have printed."""
+        """Send what nodes have printed to the client."""
         while True:
             try:
                 data = os.read(self._output, _PIECE_BYTES)

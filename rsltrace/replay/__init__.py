@@ -1,10 +1,10 @@
-"""Running a trace again: the same job, every event checked against the trace as it ends.
+"""Run a trace again: the same job, with every event checked against the trace.
 
 >>> import rsltrace
 >>> result = rsltrace.replay("run.mcap")                  # doctest: +SKIP
 >>> result.sentence                                       # doctest: +SKIP
 
-This package is also that function, as ``rsltrace.diff`` is. Importing it loads nothing but names.
+This package is also that function, as ``rsltrace.diff`` is.
 """
 
 from __future__ import annotations
@@ -78,17 +78,17 @@ def replay_trace(
     and the present one are tried. ``job`` is the job itself, of one made in Python that cannot be
     loaded from its text. ``echo`` prints the nodes' log records on stderr.
 
-    With ``node``, that node runs alone, fed with what the recording says it got, and its outputs
+    With ``node``, that node runs alone with its recorded inputs, and its outputs
     are compared, within what ``options`` leave out or tolerate; ``until_diverged`` ends the run at
     the first that differs. Then ``until`` has no meaning, and the result is another one. With
     ``bag`` (one rosbag2 recording or several), the node gets what is in there on the topics that it
     subscribes to; ``trace`` may be a job file, then, and what the recording has on topics that the
     node publishes is compared.
 
-    This runs the code that the trace names. Unless the job file in the present folder (or in
+    This runs the code that the trace names. Unless the job file in the working directory (or in
     ``job_folder``) says the same, that takes ``trust=True``.
 
-    ``edits`` say what is to be other than in the trace, each at an event or a time
+    ``edits`` change the run, each at an event or a time
     (``'812: message.data = 3.0'``; see ``rsltrace.replay.edits``). The run is then verified up to
     the first of them and goes on as a branch, which is compared with the trace and whose own trace
     (``output``) holds the edits: replaying it makes them again. ``until`` ends the branch, too.

@@ -1,4 +1,4 @@
-"""Whose code a job would run, and from which files: found without importing any of it."""
+"""Find the code files that a job would run, without importing any."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _OF_FILES = "file:"
 
 
 @dataclass(frozen=True, slots=True)
-class Code:
+class JobCodeFile:
     """A module (or script, or data file) of a job, and what has become of it since the recording.
 
     ``file`` is None where there is none. ``recorded`` and ``present`` are the first 16 hex digits
@@ -42,8 +42,8 @@ class Code:
         return "has changed" if self.recorded and self.recorded != self.present else ""
 
 
-def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
-    """Return the code of a job; ``sources`` are the hashes that a trace has of it."""
+def code_of(job: Job, sources: dict[str, str]) -> tuple[JobCodeFile, ...]:
+    """Return the code files of a job; ``sources`` are their hashes in a trace."""
     places = [job.resolve(folder) for folder in job.search_path]
     if any(spec.executable is not None for spec in job.nodes):
         places += module_folders(places, ask=False)  # nothing is run to find out
@@ -57,18 +57,18 @@ def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
     return tuple(_code(name, file, sources.get(name, "")) for name, file in found.items())
 
 
-def _code(name: str, file: Path | None, recorded: str) -> Code:
+def _code(name: str, file: Path | None, recorded: str) -> JobCodeFile:
     there = file is not None and file.is_file()  # no device, no pipe
     present = ""
     if there and recorded:
         assert file is not None
         with suppress(OSError):
             present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
-    return Code(name.removeprefix(_OF_FILES), file if there else None, recorded, present)
+    return JobCodeFile(name.removeprefix(_OF_FILES), file if there else None, recorded, present)
 
 
 def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
-    """Yield what a job names itself, rather than what that imports."""
+    """Yield the modules and files that the job itself names, not what they import."""
     targets: list[Any] = [job.hooks.before, job.hooks.after, job.stop.function]
     targets.append(None if job.policy is None else job.policy.function)
     targets += [spec.node or spec.main for spec in job.nodes]
@@ -94,7 +94,7 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
         found = source_of(name, where="")
     except JobError:
         if not any(Path(folder, "package.xml").is_file() for folder in folders):
-            yield name, None  # else it is one of a package that nobody has built
+            yield name, None  # else it is one of an unbuilt package
         return
     if isinstance(found, Path):
         yield name, found
@@ -104,10 +104,10 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
 
 
 def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
-    """Return the file that a module would be loaded from: of ``folders``, or, if it may be an
-    ``installed`` one, then of Python's own path."""
+    """Return the file a module would be loaded from: of ``folders``, then (``installed``) of
+    Python's path."""
     if installed:
-        spec = find_module(module, [*folders, *sys.path], _found_otherwise)
+        spec = find_module(module, [*folders, *sys.path], _editable_spec)
     else:
         spec = find_module(module, folders)
     if spec is None or not spec.origin or not spec.has_location:
@@ -115,8 +115,8 @@ def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> P
     return Path(spec.origin)
 
 
-def _found_otherwise(module: str) -> ModuleSpec | None:
-    """Ask the finders of packages that are installed in place, which know files of their own."""
+def _editable_spec(module: str) -> ModuleSpec | None:
+    """Ask the finders of packages installed in editable mode."""
     for finder in sys.meta_path:
         if finder is not PathFinder and "editable" in f"{finder!r}".lower():
             with suppress(Exception):

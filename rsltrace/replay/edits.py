@@ -1,4 +1,4 @@
-"""Edits: what is to be other than in the trace, each at one place in the run.
+"""Edits: changes to a recorded run, each at one event or time.
 
     812: message.pose.position.x = 3.0         what event 812 receives
     2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on
@@ -26,7 +26,7 @@ from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 
-Step = tuple[str, Any]
+PathStep = tuple[str, Any]
 """A step into an object: ``(".", name)`` or ``("[", key)``."""
 
 _OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
@@ -37,27 +37,27 @@ _FORMS = (
 
 
 @dataclass(frozen=True, slots=True)
-class SetMessage:
+class SetMessageEdit:
     """Change a message: what the event receives, or (``topic``) the next one published there."""
 
     topic: str | None
-    path: tuple[Step, ...]
+    path: tuple[PathStep, ...]
     operator: str
     value: Any
 
 
 @dataclass(frozen=True, slots=True)
-class SetAttribute:
+class SetAttributeEdit:
     """Change an attribute of a node, or something in it."""
 
     node: str
-    path: tuple[Step, ...]
+    path: tuple[PathStep, ...]
     operator: str
     value: Any
 
 
 @dataclass(frozen=True, slots=True)
-class SetParameter:
+class SetParameterEdit:
     """Set a parameter of a node, as ``Node.set_parameters`` does."""
 
     node: str
@@ -66,27 +66,27 @@ class SetParameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Drop:
+class DropEdit:
     """Leave out the event, or (``topic``) the next message published there."""
 
     topic: str | None
 
 
 @dataclass(frozen=True, slots=True)
-class Delay:
+class DelayEdit:
     """Let the event happen later by ``delay_ns``."""
 
     delay_ns: int
 
 
 @dataclass(frozen=True, slots=True)
-class Defer:
+class DeferEdit:
     """Let ``count`` others that are due at the event's time run before it; None: all of them."""
 
     count: int | None
 
 
-Action = SetMessage | SetAttribute | SetParameter | Drop | Delay | Defer
+Action = SetMessageEdit | SetAttributeEdit | SetParameterEdit | DropEdit | DelayEdit | DeferEdit
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,42 +100,42 @@ class Edit:
 
     @property
     def of_event(self) -> bool:
-        """Whether it changes what an event is, rather than what there is before it."""
+        """Whether it changes the event itself, not the state before it."""
         action = self.action
-        if isinstance(action, (SetMessage, Drop)):
+        if isinstance(action, (SetMessageEdit, DropEdit)):
             return action.topic is None
-        return isinstance(action, (Delay, Defer))
+        return isinstance(action, (DelayEdit, DeferEdit))
 
     @property
     def topic(self) -> str | None:
-        """The topic whose next message it is about, if it is."""
-        return self.action.topic if isinstance(self.action, (SetMessage, Drop)) else None
+        """The topic whose next message it changes, or None."""
+        return self.action.topic if isinstance(self.action, (SetMessageEdit, DropEdit)) else None
 
 
 def parse_edit(text: str) -> Edit:
-    """Return the edit that a text says.
+    """Parse the text of an edit.
 
-    :raises EditError: it says none, with the place in the text.
+    :raises EditError: with the position in the text.
     """
-    return _Parser(text).edit()
+    return _EditParser(text).edit()
 
 
 def edits_of(trace: Trace) -> tuple[str, ...]:
-    """Return the edits that a branch was made with; none of a trace that is no branch."""
+    """Return the edits of a branch; none of any other trace."""
     return tuple(
         text for key, text in sorted(trace.metadata(METADATA_EDITS).items()) if key != "of"
     )
 
 
-def as_metadata(edits: Iterable[Edit], trace: Trace) -> dict[str, str]:
-    """Return what a branch says of itself: its edits, and the digest of what it is a branch of."""
+def edits_metadata(edits: Iterable[Edit], trace: Trace) -> dict[str, str]:
+    """Return a branch's metadata: its edits, and the digest of the trace it branches from."""
     return {**{f"{n:06}": edit.text for n, edit in enumerate(edits)}, "of": trace.digest}
 
 
 def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
-    """See that what edits name is in a trace.
+    """Check that the trace has what the edits name.
 
-    :raises EditError: an event, topic or node is not.
+    :raises EditError: it lacks an event, topic or node.
     """
     names: dict[EntityKind, set[str]] = {}
     for entity in trace.entities.values():
@@ -151,12 +151,13 @@ def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
         for name, kind in ((node, EntityKind.NODE), (edit.topic, EntityKind.PUBLISHER)):
             known = names.get(kind, set())
             if name is not None and name not in known:
-                what = "is no node" if kind is EntityKind.NODE else "is published by nobody"
+                is_node = kind is EntityKind.NODE
+                what = "is not a node" if is_node else "has no publisher"
                 near = did_you_mean(name, known)
-                raise EditError(f"{edit.text!r}: {name} {what} of {trace.name}{near}")
+                raise EditError(f"{edit.text!r}: {name} {what} in {trace.name}{near}")
 
 
-class _Parser:
+class _EditParser:
     """Reads one edit."""
 
     def __init__(self, text: str) -> None:
@@ -207,12 +208,12 @@ class _Parser:
         if name == "drop":
             if given is not None and not (isinstance(given, str) and given.startswith("/")):
                 raise self._at(call, 'drop takes nothing or a topic: drop("/odom")')
-            return Drop(given)
+            return DropEdit(given)
         if name == "delay":
-            return Delay(self._delay(call, given))
+            return DelayEdit(self._delay(call, given))
         if given is not None and (type(given) is not int or given < 1):
             raise self._at(call, "defer takes nothing or how many others run first: defer(1)")
-        return Defer(given)
+        return DeferEdit(given)
 
     def _delay(self, call: ast.Call, given: Any) -> int:
         if isinstance(given, str):
@@ -225,7 +226,7 @@ class _Parser:
         raise self._at(call, 'delay takes a time: delay("5ms")')
 
     def _change(self, target: ast.expr, operator: str, value_node: ast.expr) -> Action:
-        path: list[Step] = []
+        path: list[PathStep] = []
         root: ast.expr = target
         while isinstance(root, (ast.Attribute, ast.Subscript)):
             if isinstance(root, ast.Attribute):
@@ -237,19 +238,19 @@ class _Parser:
         if operator and (isinstance(value, bool) or not isinstance(value, (int, float))):
             raise self._at(value_node, f"{operator}= takes a number")
         if isinstance(root, ast.Name) and root.id == "message" and path:
-            return SetMessage(None, tuple(path), operator, value)
+            return SetMessageEdit(None, tuple(path), operator, value)
         kind, name = self._named(root)
         if kind == "parameters" and len(path) == 1 and path[0][0] == "[" and not operator:
             if isinstance(path[0][1], str):
-                return SetParameter(name, path[0][1], value)
+                return SetParameterEdit(name, path[0][1], value)
         elif kind == "topic" and path:
-            return SetMessage(name, tuple(path), operator, value)
+            return SetMessageEdit(name, tuple(path), operator, value)
         elif kind == "node" and path and path[0][0] == ".":
-            return SetAttribute(name, tuple(path), operator, value)
+            return SetAttributeEdit(name, tuple(path), operator, value)
         raise self._at(target, f"an edit is one of {_FORMS}")
 
     def _named(self, root: ast.expr) -> tuple[str, str]:
-        """Return what is called with a name: ``node("/ekf")``."""
+        """Return function and name of ``node("/ekf")``."""
         if (
             isinstance(root, ast.Call)
             and isinstance(root.func, ast.Name)
@@ -281,8 +282,8 @@ class _Parser:
         return EditError(f"--edit: {what}\n  {shown}\n  {' ' * column}^")
 
 
-def changed(old: Any, operator: str, value: Any) -> Any:
-    """Return what ``old`` becomes: ``value``, or the two combined by an operator."""
+def combine(old: Any, operator: str, value: Any) -> Any:
+    """Return ``value``, or ``old`` and ``value`` combined by an operator."""
     if operator == "+":
         return old + value
     if operator == "-":
@@ -294,37 +295,19 @@ def changed(old: Any, operator: str, value: Any) -> Any:
     return float(value) if type(old) is float and type(value) is int else value
 
 
-def change(root: Any, path: Sequence[Step], operator: str, value: Any) -> None:
-    """Change what a path leads to from an object.
+def set_path(root: Any, path: Sequence[PathStep], operator: str, value: Any) -> None:
+    """Set what a path leads to from an object.
 
-    :raises Exception: whatever the objects on the way raise; AttributeError if there is none.
+    :raises Exception: whatever the objects on the way raise.
     """
     for kind, key in path[:-1]:
         root = getattr(root, key) if kind == "." else root[key]
     kind, key = path[-1]
     if kind == "[":
-        root[key] = changed(root[key], operator, value)
+        root[key] = combine(root[key], operator, value)
     else:
-        setattr(root, key, changed(getattr(root, key), operator, value))
+        setattr(root, key, combine(getattr(root, key), operator, value))
 
 
-def path_text(path: Iterable[Step]) -> str:
-    """Return a path as it is written."""
+def path_text(path: Iterable[PathStep]) -> str:
     return "".join(f".{key}" if kind == "." else f"[{key!r}]" for kind, key in path)
-
-
-__all__ = [
-    "Defer",
-    "Delay",
-    "Drop",
-    "Edit",
-    "SetAttribute",
-    "SetMessage",
-    "SetParameter",
-    "as_metadata",
-    "change",
-    "check_edits",
-    "edits_of",
-    "parse_edit",
-    "path_text",
-]

@@ -1,4 +1,4 @@
-"""What a replay is going to run, known before any of it runs."""
+"""What a replay is going to run, known before it starts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rsltrace.adapters.launch import ros_launch
 from rsltrace.errors import JobError, ReplayError
 from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.job.reading.resolved import job_from_resolved
-from rsltrace.replay.code import Code, code_of, file_of
+from rsltrace.replay.code import JobCodeFile, code_of, file_of
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
 from rsltrace.run.inputs import without_launch_files
 from rsltrace.run.provenance import environment
@@ -30,9 +30,9 @@ _NAME_MAX = 255
 
 
 def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
-    """Return a job without its bags, which need not be there. ``load`` gets overrides.
+    """Return a job without its bags, which need not exist. ``load`` gets overrides.
 
-    :raises JobError: if it cannot be used otherwise.
+    :raises JobError: it cannot be used.
     """
     try:
         return load(("bags=[]",))
@@ -44,15 +44,15 @@ def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
 
 
 def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
-    """Return the job that a trace holds, as if its file were in ``folder``. Nothing is run.
+    """Return the job in a trace, resolved in ``folder``. Nothing is run.
 
-    Without ``bags`` it is that job without them, and they need not be there.
+    Without ``bags``, the job has none and they need not exist.
 
-    :raises ReplayError: if the trace holds none, or one of another version.
+    :raises ReplayError: the trace holds no job, or one of another version.
     """
     try:
         resolved = _resolved(trace)
-        _let_follow(trace, resolved, folder)
+        _follow_trace_order(trace, resolved, folder)
         if not bags:
             resolved.update(bags=[], progress=None)
         return job_from_resolved(
@@ -77,8 +77,8 @@ def _resolved(trace: Trace) -> dict[str, Any]:
     return resolved
 
 
-def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
-    """Let a job that followed a recording which is gone follow the trace: it has that order."""
+def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
+    """Let a job that followed a missing recording follow the trace, which has its order."""
     policy = resolved.get("policy")
     if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
         return
@@ -87,15 +87,15 @@ def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
 
 
 def job_name(trace: Trace) -> str:
-    """Return the name of the file that a trace's job was read from, empty if it was none."""
+    """Return the file name of a trace's job, or ""."""
     name = Path(trace.job.get("name", "")).name
     return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
 
 
-def folder_of(trace: Trace, given: Path | None) -> Path:
-    """Return the folder of a trace's job: the one that is given, or one in which the job is.
+def job_folder_of(trace: Trace, given: Path | None) -> Path:
+    """Return the folder of a trace's job: the given one, or one where the job is found.
 
-    :raises ReplayError: saying what was looked for, and where.
+    :raises ReplayError: with what was looked for, and where.
     """
     if given is not None:
         if not given.is_dir():
@@ -103,9 +103,9 @@ def folder_of(trace: Trace, given: Path | None) -> Path:
         return given
     beside = [] if "://" in trace.name else [Path(trace.name).parent]
     places = list(dict.fromkeys([*beside, Path()]))
-    wanted = _wanted(trace)
-    best = max(places, key=lambda place: _found(trace, place, wanted))
-    if _found(trace, best, wanted)[0] or not wanted:
+    wanted = _folder_markers(trace)
+    best = max(places, key=lambda place: _match_folder(trace, place, wanted))
+    if _match_folder(trace, best, wanted)[0] or not wanted:
         return best
     listed = ", ".join(wanted[:5]) + (f" and {len(wanted) - 5} more" if len(wanted) > 5 else "")
     where = " and in ".join(_shown(place) for place in places)
@@ -116,18 +116,18 @@ def folder_of(trace: Trace, given: Path | None) -> Path:
 
 
 def _shown(place: Path) -> str:
-    return "the present folder" if place == Path() else str(place)
+    return "the working directory" if place == Path() else str(place)
 
 
-def _wanted(trace: Trace) -> list[str]:
-    """Return what shows that a folder is the job's: its file, or else the modules of its nodes."""
+def _folder_markers(trace: Trace) -> list[str]:
+    """Return the files that identify the job's folder: its file, or its nodes' modules."""
     if job_name(trace):
         return [job_name(trace)]
     return [name for name in trace.metadata(METADATA_SOURCES) if not name.startswith("file:")]
 
 
-def _found(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
-    """Say whether a folder has what is wanted, and whether the job file says what it said."""
+def _match_folder(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, bool]:
+    """Return whether a folder has the files, and whether the job file is unchanged."""
     if not job_name(trace):
         folders = _search(trace, folder)
         return all(file_of(name, folders, installed=False) for name in wanted), False
@@ -147,13 +147,10 @@ def _text(file: Path) -> str:
         return ""
 
 
-# Whether to run what a trace names. A trace may come from anybody, and its job may name any code.
-#
-# ``record`` runs what a job file says that somebody chose to run. A replay runs what a *trace*
-# says, and a trace looks like data. So it runs without being asked only where it does no more than
-# ``record`` of the job file in the present folder would do: the same nodes (or some of them) with
-# the same parameters, arguments, launch files, hooks and bags. What only says when, in which order
-# and for how long they run may differ.
+# A trace looks like data and may come from anyone, but its job may name any code. So it is replayed
+# without ``trust`` only if ``record`` of the job file in the working directory would run the same:
+# the same nodes (or some of them) with the same parameters, arguments, launch files, hooks and
+# bags. Settings of time and order may differ.
 
 _LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
 _MAY_DIFFER = frozenset(
@@ -175,14 +172,13 @@ _MAY_DIFFER = frozenset(
 
 
 def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: bool = True) -> str:
-    """Return why a trace runs only if somebody says so, empty if it may.
+    """Return why replaying a trace needs ``trust``, or "". Nothing is run to find out.
 
-    ``named``: the job's folder has been named by whoever runs it. Nothing is run to find out.
-    ``bags``: those of the job will play.
+    ``named``: the user has named the job's folder. ``bags``: the job's bags will play.
     """
     name = job_name(trace)
     if not named and folder.resolve() != Path.cwd():
-        return f"its job lies in {folder}, which is not the present folder"
+        return f"its job is in {folder}, which is not the working directory"
     if not name:
         return "its job was made in Python, so there is no job file here that says the same"
     try:
@@ -197,12 +193,12 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     if edits_of(trace):
         return "it holds edits, which the nodes would run with"
     if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
-        return "it holds answers from outside (of files, sockets, …) that the nodes would be given"
+        return "it holds recorded answers (of files, sockets, …) that the nodes would get"
     return ""
 
 
 def _own_job(file: Path, *, bags: bool) -> Job | None:
-    """Return the job of a job file or launch file, None if that takes running a program."""
+    """Return the job of a job or launch file, None if that needs running a program."""
     if file.name.endswith(_LAUNCH):
         spec = json.dumps({"file": file.name, "arguments": {}})
         job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
@@ -239,8 +235,8 @@ Position = int | str
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
-    """A version, or a setting of the process, that is another one than when a trace was made."""
+class EnvironmentChange:
+    """A version or setting of the process that differs from the recording."""
 
     name: str
     recorded: str
@@ -249,20 +245,20 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """A replay that could begin. ``distrust`` says why somebody has to agree, if so.
+    """A replay that is ready to start. ``distrust`` says why it needs ``trust``, or is "".
 
-    ``code`` is what would run, ``changes`` what else is not as it was. ``trace`` is open.
+    ``code`` is what would run, ``changes`` are differences of the environment. ``trace`` is open.
     """
 
     trace: Trace
     job: Job
     folder: Path
-    code: tuple[Code, ...]
-    changes: tuple[Change, ...]
+    code: tuple[JobCodeFile, ...]
+    changes: tuple[EnvironmentChange, ...]
     distrust: str
     notes: tuple[str, ...]
     edits: tuple[Edit, ...] = ()
-    """What the run was told to do otherwise, of a trace that is a branch."""
+    """The edits of the run, if the trace is a branch."""
 
 
 @contextmanager
@@ -273,13 +269,12 @@ def prepared(
     *,
     bags: bool = True,
 ) -> Iterator[Preparation]:
-    """Open a trace and see what replaying it takes. Runs nothing, imports nothing.
+    """Open a trace and find out what replaying it needs. Runs and imports nothing.
 
-    Without ``bags``, those of the job need not be there: they are not going to play.
+    Without ``bags``, those of the job need not exist. A given ``job`` replaces the trace's own, and
+    is trusted.
 
-    ``job`` stands in for the trace's own, which then has to be trusted by whoever gives it.
-
-    :raises TraceError, ReplayError: the trace is damaged, or something that it needs is not here.
+    :raises TraceError, ReplayError: the trace is damaged, or something it needs is missing.
     """
     if "://" in str(path):
         raise ReplayError(f"{path}: download a trace to replay it")
@@ -288,7 +283,7 @@ def prepared(
         if trace.event_count == 0:
             raise ReplayError(f"{path} has no events to replay")
         if job is None:
-            folder = folder_of(trace, job_folder)
+            folder = job_folder_of(trace, job_folder)
             job = job_in_trace(trace, folder, bags=bags)
             named = job_folder is not None
             distrust = why_not_trusted(trace, job, folder, named=named, bags=bags)
@@ -306,12 +301,12 @@ def prepared(
         )
 
 
-def _changes(trace: Trace) -> Iterator[Change]:
-    """Yield what of the environment is not as recorded; libraries are known once they are there."""
+def _changes(trace: Trace) -> Iterator[EnvironmentChange]:
+    """Yield the differences of environment, as far as known before libraries are loaded."""
     recorded, present = trace.environment, environment()
     for name in sorted({*recorded, *present} - {"numerics", "ros_distro", "addresses"}):
         if recorded.get(name) != present.get(name):
-            yield Change(name, recorded.get(name, ""), present.get(name, ""))
+            yield EnvironmentChange(name, recorded.get(name, ""), present.get(name, ""))
 
 
 def _notes(trace: Trace) -> Iterator[str]:
@@ -322,9 +317,9 @@ def _notes(trace: Trace) -> Iterator[str]:
 
 
 def count_to(trace: Trace, position: Position) -> int:
-    """Return how many events there are up to a position, that event (or time) included.
+    """Return the number of events up to and including a position.
 
-    :raises ReplayError: if it is no position, or before the first event.
+    :raises ReplayError: it is not a position, or before the first event.
     """
     from rsltrace.job.values.times import parse_time_in_run
 

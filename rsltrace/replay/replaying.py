@@ -1,4 +1,4 @@
-"""Running a trace's job again and checking every event on the way."""
+"""Run a trace's job again and check every event."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError
-from rsltrace.replay.editing import Editing
-from rsltrace.replay.edits import Edit, as_metadata, check_edits
+from rsltrace.replay.editing import EditObserver
+from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.result import ReplayResult
-from rsltrace.replay.verification import Verification
+from rsltrace.replay.verification import EventVerification
 from rsltrace.run import Observer, RunResult
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
@@ -52,18 +52,20 @@ def replay_prepared(
     :raises EditError: an edit cannot be made.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     """
-    fed = plan.trace.metadata(METADATA_FED).get("node")
-    if fed is not None:
+    node = plan.trace.metadata(METADATA_FED).get("node")
+    if node is not None:
         raise ReplayError(
-            f"{plan.trace.name} was made by replaying {fed} alone, without the nodes it hears: "
-            f"replay it with --node {fed}"
+            f"{plan.trace.name} is a replay of {node} alone, without the nodes that it subscribes "
+            f"to: replay it with --node {node}"
         )
 
     def on_first(session: Session) -> None:
         session.world.echo_logs(echo)
 
-    verification = Verification(plan.trace, until, first=first, on_first=on_first)
-    editing = Editing((*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off)
+    verification = EventVerification(plan.trace, until, first=first, on_first=on_first)
+    editing = EditObserver(
+        (*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off
+    )
     check_edits(edits, plan.trace)
     with place_for(output) as path:
         run = _run(plan, verification, editing, path, force=force, observer=observer)
@@ -78,7 +80,7 @@ def replay_prepared(
 
 @contextmanager
 def place_for(output: Path | None) -> Iterator[Path]:
-    """Give a place for the replay's trace: what is not asked for is gone afterwards."""
+    """Yield the path for the replay's trace: ``output``, or a temporary file."""
     if output is not None:
         yield output
         return
@@ -88,8 +90,8 @@ def place_for(output: Path | None) -> Iterator[Path]:
 
 def _run(
     plan: Preparation,
-    verification: Verification,
-    editing: Editing,
+    verification: EventVerification,
+    editing: EditObserver,
     path: Path,
     *,
     force: bool,
@@ -97,7 +99,7 @@ def _run(
 ) -> RunResult:
     recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
     edits = editing.unmade
-    metadata = {METADATA_EDITS: as_metadata(edits, plan.trace)} if edits else {}
+    metadata = {METADATA_EDITS: edits_metadata(edits, plan.trace)} if edits else {}
     with (
         kept_process(),
         Session(
@@ -123,15 +125,15 @@ def _run(
     raise error
 
 
-def _diverged(trace: Trace, verification: Verification) -> bool:
-    """Say whether a run that is over did something else, or ended where the trace goes on."""
+def _diverged(trace: Trace, verification: EventVerification) -> bool:
+    """Whether a finished run did something else, or ended before the trace does."""
     if verification.diverged:
         return True
     return not verification.has_cut_short and verification.verified < trace.event_count
 
 
 def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
-    """Return the diff of the trace and the replay, which ends with the event that differs."""
+    """Return the diff of the trace and the replay, which ends at the first differing event."""
     with Trace.open(place) as replayed:
         found = diff_traces(trace, replayed, DiffOptions(context=_CONTEXT, window=1))
     name = str(place) if kept else THE_REPLAY
@@ -151,13 +153,13 @@ def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
 
 def _branch(
     plan: Preparation,
-    verification: Verification,
-    editing: Editing,
+    verification: EventVerification,
+    editing: EditObserver,
     run: RunResult,
     place: Path,
     kept: Path | None,
 ) -> ReplayResult:
-    """Compare a branch with the run that it branches off."""
+    """Compare a branch with the trace it branches from."""
     trace = plan.trace
     with Trace.open(place) as branch:
         found = diff_traces(trace, branch, DiffOptions(context=_CONTEXT))
@@ -183,7 +185,7 @@ def _branch(
 
 def _result(
     plan: Preparation,
-    verification: Verification,
+    verification: EventVerification,
     run: RunResult,
     difference: Diff | None,
     path: Path | None,
@@ -194,7 +196,7 @@ def _result(
     recorded = trace.result.get("stop_reason", "")
     if verification.is_last and not whole:
         notes.append(
-            "what the nodes did when their run was ended from outside is not the same "
+            "the nodes' shutdown differs after the run was ended from outside "
             f"(event {verification.verified})"
         )
     elif whole and run.stop_reason != recorded:

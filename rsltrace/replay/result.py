@@ -1,4 +1,4 @@
-"""What a replay found: how far the run did what its trace says, and what it did then."""
+"""The result of a replay."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class ReplayResult:
     has ``events``. ``digest`` is the chain hash of the last of these, 16 hex digits (zeros: none),
     ``end_ns`` its simulated time in nanoseconds, ``start_ns`` that of the start. ``ended`` says in
     words why the replay ended there. ``is_whole`` is true if that is the end of the trace's run;
-    otherwise it diverged, ``until`` was reached, the trace was cut off or somebody ended one of the
-    runs.
+    otherwise it diverged, ``until`` was reached, the trace was cut off or one of the runs was
+    ended from outside.
 
     ``diff`` is None unless the run diverged; then it compares the trace (a) with the replay (b),
     which ends with the event that differs, number ``verified``. ``path`` is the replay's own trace,

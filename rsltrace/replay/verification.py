@@ -1,7 +1,7 @@
-"""Comparing a run with a trace, event by event, as the events end.
+"""Compare a run with a trace, event by event.
 
-A chain hash stands for an event and all before it, so one number per event is compared. The first
-that differs ends the run there: what the event has sent waits in queues that nobody reads any more.
+A chain hash covers an event and all before it, so one number per event is compared. The first
+difference ends the run.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ BRANCH_END = "as far as the run that it branches off"
 _BY_DRIVER = "the driver of the simulation"
 
 
-class Verification(EventObserver):
+class EventVerification(EventObserver):
     """What a run has to do, and how far it has done so.
 
     ``until`` is how many events to verify, None for all. ``verified`` events were as recorded;
@@ -50,7 +50,7 @@ class Verification(EventObserver):
         self.diverged = False
         self.stop: Stop | None = None
         self.is_last = False
-        """Whether the run was ended where the trace's was, by somebody outside of the job."""
+        """Whether the run was ended where the trace's was, from outside of the job."""
         self.has_branched_off = False
         self._trace = trace
         self._limit, self._at_limit = limit_of(trace, until)
@@ -62,7 +62,6 @@ class Verification(EventObserver):
         self._recorder: Recorder
 
     def attach(self, session: Session) -> None:
-        """Compare the events of an open session from now on."""
         dispatcher = session.world.domain.dispatcher
         assert dispatcher.recorder is not None, "a replay is recorded"
         self._session, self._recorder = session, dispatcher.recorder
@@ -72,28 +71,27 @@ class Verification(EventObserver):
 
     @property
     def chain_hash(self) -> int:
-        """The chain hash of the last event that was as recorded, 0 of none."""
+        """The chain hash of the last verified event, 0 if there is none."""
         return self._trace.event(self.verified - 1).chain_hash if self.verified else 0
 
     @property
     def end_ns(self) -> int:
-        """When that event was, the start of the trace without one."""
+        """The time of that event, or the start of the trace."""
         trace = self._trace
         return trace.event(self.verified - 1).stamp_ns if self.verified else trace.start_ns
 
     def branch_off(self) -> None:
-        """Compare nothing from now on: what follows is to be something else."""
+        """Stop comparing: what follows is a branch."""
         self.has_branched_off = True
         self._session.world.domain.dispatcher.remove_observer(self)
 
     def end_of_branch(self) -> StopCondition | None:
-        """Return what ends a branch where the run would not end by itself, or is not to go on."""
+        """Return the stop condition of a branch that would not end by itself."""
         if self._limit < 0:
             return None
         return stop_at(self._trace.event(self._limit - 1).stamp_ns, BRANCH_END)
 
     def after_event(self) -> None:
-        """See whether the event was right."""
         if self._recorder.chain_hash == next(self._expected, None):
             self.verified = verified = self.verified + 1
             if verified == self._next_mark:
@@ -117,7 +115,7 @@ class Verification(EventObserver):
 
     @property
     def interrupted(self) -> int:
-        """The exit status of a replay that somebody has interrupted, else 0."""
+        """The exit status of a replay that was interrupted, else 0."""
         stopped = self._session.loop.stopped
         if stopped is None or stopped is self.stop:
             return 0
@@ -125,13 +123,13 @@ class Verification(EventObserver):
 
     @property
     def has_cut_short(self) -> bool:
-        """Whether the replay was ended before its job ended it: by itself, or by somebody."""
+        """Whether the replay ended before its job did."""
         stopped = self._session.loop.stopped
         is_branch_end = stopped is not None and stopped.reason == BRANCH_END
         return self.stop is not None or is_branch_end or self.interrupted != 0
 
     def _end(self, stop: Stop, *, go_on: bool = False) -> None:
-        """End the run. How its nodes then end is compared only if the trace has it: ``go_on``."""
+        """End the run. The end of its nodes is compared only if the trace has it (``go_on``)."""
         if self.stop is None:
             self.stop = stop
             self._session.loop.stop(stop)
@@ -146,12 +144,12 @@ class Verification(EventObserver):
 
 
 def interruption(run: RunResult) -> int:
-    """Return the exit status of a run that somebody has interrupted, else 0."""
+    """Return the exit status of an interrupted run, else 0."""
     return run.exit_code if _INTERRUPTIONS.get(run.exit_code) == run.stop_reason else 0
 
 
 def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
-    """Return after how many events a replay ends by itself (-1: it does not), and why."""
+    """Return after how many events a replay ends by itself (-1: never), and why."""
     count, found = trace.event_count, []
     if until is not None and until < count:
         found.append((until, Stop("as far as asked for")))
@@ -167,7 +165,7 @@ def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
 
 
 def _from_outside(trace: Trace) -> Stop | None:
-    """Return how somebody outside of the job ended the trace's run, if that is how it ended."""
+    """Return how the trace's run was ended from outside of its job, if it was."""
     reason, code = trace.result.get("stop_reason", ""), trace.result.get("exit_code", "")
     if reason in _INTERRUPTIONS.values() and code in map(str, _INTERRUPTIONS):
         return Stop(reason, int(code))
@@ -177,7 +175,7 @@ def _from_outside(trace: Trace) -> Stop | None:
 
 
 def _first_outside(trace: Trace, until: int | None) -> int | None:
-    """Return the first event that whoever drove a ``Simulation`` did."""
+    """Return the first event made by the driver of a ``Simulation``."""
     first = 0
     for rows in trace.events(0, until):
         if len(found := np.flatnonzero(rows["kind"] == EventKind.OUTSIDE)):

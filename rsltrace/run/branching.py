@@ -1,7 +1,7 @@
-"""Standing still in the middle of a run, from where the runs of other jobs go on.
+"""Stop in the middle of a run, from where runs of other jobs continue.
 
-These differ in nothing but what comes later (``Session.becomes``), so each is what it would have
-been from the beginning. See ``rsltrace.search.explore.prefix`` for who makes the copies.
+Their jobs differ only in what comes later (``Session.becomes``), so each run is as if made from the
+beginning. ``rsltrace.search.explore.prefix`` makes the copies.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from greenlet import getcurrent
 
 from rsltrace.job import Job
 from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.run.driver import time_of_step
+from rsltrace.run.driver import next_step_ns
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.policy import Departures
 from rsltrace.trace.model.texts import format_seconds
 
 
 def run_up_to(session: Session, time_ns: int) -> bool:
-    """Run up to and including a simulated time; return whether anything is to come after it."""
+    """Run up to and including a simulated time; return whether anything follows."""
     loop, runners = session.loop, session.world.stacks.runners
 
     def gate(next_ns: int | None) -> bool:
-        coming_ns = time_of_step(loop, next_ns)
+        coming_ns = next_step_ns(loop, next_ns)
         if coming_ns is not None and coming_ns <= time_ns:
             return False
         loop.gate = None
@@ -40,7 +40,7 @@ def run_up_to(session: Session, time_ns: int) -> bool:
 
 
 def why_never(job: Job) -> str:
-    """Return why no other run can go on from one of a job, "" if others can."""
+    """Return why no other run can branch off one of this job, or ""."""
     if job.stop.size is not None:
         return "how large the trace is ends the run (stop.size)"
     if any(fault.of_node for fault in job.faults):
@@ -49,14 +49,14 @@ def why_never(job: Job) -> str:
 
 
 def why_not(session: Session, job: Job) -> str:
-    """Return why the run of a job cannot go on from where a session stands, "" if it can."""
+    """Return why a job's run cannot branch off where a session stands, or ""."""
     first = next(_obstacles(session, job), "")
     at = format_seconds(session.loop.now_ns - session.start_ns)
     return first and f"{first} up to {at} s"
 
 
 def _obstacles(session: Session, job: Job) -> Iterator[str]:
-    """Yield what is different already."""
+    """Yield what already differs."""
     old, loop = session.job, session.loop
     before = getattr(loop, "policy", None)
     policy = job.policy

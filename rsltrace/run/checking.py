@@ -1,4 +1,4 @@
-"""What a job is, found out without running it: nodes are constructed, the loop never runs."""
+"""Check a job without running it: nodes are constructed, the loop never runs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.run.plans.bags import PLAYER
+from rsltrace.run.plans.entries import impossible_starts
 from rsltrace.run.plans.executables import source_of
-from rsltrace.run.plans.starts import impossible_starts
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
@@ -26,7 +26,7 @@ _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_eve
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """A job that could run: when it starts (simulated ns), its graph, and notes on its bags."""
+    """A job that could run: its start time (ns), graph and notes."""
 
     job: Job
     start_ns: int
@@ -39,17 +39,17 @@ class Checked:
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """What looks wrong."""
         return (*self.overview.problems, *self.unused)
 
 
 def check_job(job: Job, *, everything: bool = False) -> Checked:
-    """Construct a job's nodes and return their graph; ``everything`` with what every node has.
+    """Construct a job's nodes and return their graph (``everything``: with each node's default
+    topics).
 
     :raises JobError, SetupError, BagError: the job cannot run.
     :raises RunError: a constructor raised.
     """
-    from rsltrace.simulation.middleware.overview import overview
+    from rsltrace.simulation.middleware.overview import graph_overview
 
     notes: list[str] = []
     observer = Observer(note=notes.append)
@@ -62,7 +62,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.finish()
             raise error
         world = session.world
-        found = overview(
+        found = graph_overview(
             world.domain.graph,
             world.blocked(),
             everything=everything,
@@ -103,12 +103,12 @@ def _divisions_by_nothing(job: Job) -> Iterator[str]:
 
 
 def _played_and_published(found: Overview) -> Iterator[str]:
-    """Yield what a bag plays although a node makes it anew: its readers would get both."""
+    """Yield the topics that both a bag and a node publish."""
     for link in found.of_kind("topic"):
         nodes = list(dict.fromkeys(end.node for end in link.senders))
         others = [node for node in nodes if node != f"/{PLAYER}"]
         if len(others) < len(nodes) and others and link.name.rpartition("/")[2] not in _OF_MANY:
             yield (
-                f"topic {link.name}: a bag plays it, and {', '.join(others)} publishes it, too; "
-                f"unless both are meant: bags: [{{path: ..., exclude: [{link.name}]}}]"
+                f"topic {link.name}: both a bag and {', '.join(others)} publish it; if that is "
+                f"not intended: bags: [{{path: ..., exclude: [{link.name}]}}]"
             )

@@ -1,8 +1,7 @@
-"""Driving a run from outside: how far the loop may go, and standing still between two steps.
+"""Drive a run from outside: say how far the loop may go, and stop it between two steps.
 
-The loop asks its gate between time steps. The gate hands control to the driver's stack where the
-driver wants it, and the run must not notice: a run that is driven and otherwise left alone does
-the same, event by event, as one that is recorded at once.
+The loop asks its gate between time steps. The gate switches to the driver's stack when the driver
+wants control. The run must not notice: it is the same, event by event, as one recorded at once.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ if TYPE_CHECKING:
 _INTERRUPTED = 130
 
 
-class _Who(Enum):
+class _ActiveCode(Enum):
     """Whose code is running."""
 
     DRIVER = "driver"
@@ -33,8 +32,8 @@ class _Who(Enum):
     LISTENER = "listener"
 
 
-def time_of_step(loop: EventLoop, next_ns: int | None) -> int | None:
-    """Return when the next time step of a loop is, at whose gate ``next_ns`` is due next."""
+def next_step_ns(loop: EventLoop, next_ns: int | None) -> int | None:
+    """Return the time of the loop's next step; ``next_ns`` is what its gate was given."""
     if next_ns is not None and loop.min_step_ns and next_ns > loop.now_ns:
         return loop.stepped(next_ns, quiet_until_ns(loop.stop_conditions))
     return next_ns
@@ -53,7 +52,7 @@ class Driver:
         self.loop = session.loop
         self.loop.gate = self._gate
         self.outside: Outside = Outside(session.world)
-        self._who = _Who.DRIVER
+        self._who = _ActiveCode.DRIVER
         self._steps: int | None = 0
         self._until_ns: int | None = None
         self._to_the_end = False
@@ -65,7 +64,7 @@ class Driver:
     def begin(self) -> None:
         """Construct the nodes and jump to the start.
 
-        :raises RunError: what went wrong.
+        :raises RunError: that failed.
         """
         self.session.begin()
         self.outside.enter()
@@ -73,11 +72,10 @@ class Driver:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over."""
         return self.session.ended
 
     def position(self) -> tuple[int, int]:
-        """Return how far the run is: events and time. Unchanged: nothing is left to happen."""
+        """Return (events, time). If it has not changed, nothing is left to happen."""
         return self.loop.events, self.loop.now_ns
 
     def go(
@@ -89,10 +87,10 @@ class Driver:
     ) -> None:
         """Let the loop run ``steps`` time steps (None: any number), none after ``until_ns``.
 
-        With ``until_ns``, time stands still there afterwards. Unless ``to_the_end``, the loop also
-        stops where nothing is left to happen.
+        With ``until_ns``, time then stands there. Unless ``to_the_end``, the loop also stops when
+        nothing is left to happen.
 
-        :raises RunError: what went wrong in the run.
+        :raises RunError: the run failed.
         """
         self.check_driver()
         if self.ended:
@@ -101,11 +99,11 @@ class Driver:
         self._counted = self.loop.events
         self._steps, self._until_ns, self._to_the_end = steps, until_ns, to_the_end
         while True:
-            self._who = _Who.RUN
+            self._who = _ActiveCode.RUN
             try:
                 self.session.go_on()
             finally:
-                self._who = _Who.DRIVER
+                self._who = _ActiveCode.DRIVER
             self.outside.enter()
             self.raise_error()
             if not self._tell():
@@ -113,10 +111,10 @@ class Driver:
             self.leave()
 
     def leave(self) -> None:
-        """Go back from the outside to the run.
+        """Return control to the run.
 
-        Where time stood still between two steps and nothing was done there, the clock is put back
-        to the last step.
+        If time stood between two steps and nothing was done there, the clock is set back to the
+        last step.
         """
         self.outside.leave()
         if self._held is not None:
@@ -126,11 +124,9 @@ class Driver:
             self._held = None
 
     def _activity(self) -> tuple[int, int, int]:
-        """Return what changes when somebody outside does something."""
+        """Return values that change when the driver does something."""
         loop = self.loop
         return loop.events, len(loop.ready), len(loop.tasks)
-
-    # -- the gate, on the loop's stack ---------------------------------------------------------
 
     def _gate(self, next_ns: int | None) -> bool:
         if not self._news:
@@ -149,7 +145,7 @@ class Driver:
 
     def _may_advance(self, next_ns: int | None) -> bool:
         until_ns, end_ns = self._until_ns, self.session.end_ns
-        next_ns = time_of_step(self.loop, next_ns)
+        next_ns = next_step_ns(self.loop, next_ns)
         if next_ns is not None and (until_ns is None or next_ns <= until_ns):
             return True
         if until_ns is None:
@@ -160,36 +156,31 @@ class Driver:
         self.loop.now_ns = until_ns
         return False
 
-    # -- who listens -------------------------------------------------------------------------------
-
-    def tell_later(self, callback: Callable[[Any], object], message: Any) -> None:
-        """Have ``callback(message)`` called at the end of the present time step."""
+    def call_listener_later(self, callback: Callable[[Any], object], message: Any) -> None:
         self._news.append((callback, message))
 
     def _tell(self) -> bool:
-        """Call who listens; return whether the loop has to go on from where it was stopped."""
+        """Call the listeners; return whether the loop has to continue."""
         news, self._news = self._news, []
-        self._who = _Who.LISTENER
+        self._who = _ActiveCode.LISTENER
         try:
             for callback, message in news:
                 callback(message)
         finally:
-            self._who = _Who.DRIVER
+            self._who = _ActiveCode.DRIVER
         return bool(news) and not self.ended
 
-    # -- checks ------------------------------------------------------------------------------------
-
     def check_driver(self) -> None:
-        """Raise RunError unless the present code may move time."""
+        """Raise RunError unless the calling code may move time."""
         self.check_outside()
-        if self._who is _Who.LISTENER:
+        if self._who is _ActiveCode.LISTENER:
             raise RunError("a callback of subscribe cannot move time; it may publish")
 
     def check_outside(self) -> None:
-        """Raise RunError if the present code is a node's, or that of another thread."""
+        """Raise RunError if a node, or another thread, calls."""
         if threading.get_ident() != self.session.world.stacks.runners.thread:
             raise RunError("a simulation is driven by the thread that has entered it")
-        if self._who is _Who.RUN:
+        if self._who is _ActiveCode.RUN:
             raise RunError("a node cannot drive the simulation that it is part of")
 
     def raise_error(self) -> None:

@@ -1,4 +1,4 @@
-"""The files that a job is made of and reads: ``--force`` must not empty one of them."""
+"""The files that a job consists of and reads. ``--force`` must not overwrite them."""
 
 from __future__ import annotations
 
@@ -11,29 +11,26 @@ from rsltrace.job import Job
 from rsltrace.run.plans.executables import compiled_file, why_not
 from rsltrace.run.process import search_path
 
-# The launch files of a job as nodes: what a job's search path has can be launched, too.
-
 
 def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
-    """Return a job whose launch files have become nodes; executables are looked for in its
-    ``search_path``, too. Python launch files are run to do so, unless ``programs`` is False.
+    """Return a job whose launch files are replaced by nodes; executables are also looked for in its
+    ``search_path``. Unless ``programs`` is False, this runs Python launch files.
 
-    :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
+    :raises JobError: a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
         return Expanded(job)
     from rsltrace.adapters.launch.expand import expand
 
+    def is_process(package: str, executable: str) -> bool:
+        return compiled_file(f"{package}/{executable}") is not None
+
     with search_path(job):
-        return expand(job, why_not=why_not, is_process=_is_process, programs=programs)
-
-
-def _is_process(package: str, executable: str) -> bool:
-    return compiled_file(f"{package}/{executable}") is not None
+        return expand(job, why_not=why_not, is_process=is_process, programs=programs)
 
 
 def check_output(job: Job, output: Path, replay: Path | None) -> None:
-    """Raise ``OutputError`` if the trace would be written over something the run reads."""
+    """Raise ``OutputError`` if the trace would overwrite a file that the run reads."""
     if not output.exists():
         return
     for what, path in _inputs(job, replay):
@@ -46,7 +43,7 @@ def check_output(job: Job, output: Path, replay: Path | None) -> None:
 
 
 def _inputs(job: Job, replay: Path | None) -> Iterator[tuple[str, Path]]:
-    """Yield (what it is, path) of all that is read while a run lasts, or made of."""
+    """Yield (description, path) of each file that the run reads."""
     yield "it is the job", job.resolve(Path(job.source_name).name)
     if job.composed is not None:
         for other in job.composed.others:

@@ -1,4 +1,4 @@
-"""What a run asks of the process: module search, memory, news for whoever watches."""
+"""Prepare the process for a run: module search, memory, and callbacks for progress."""
 
 from __future__ import annotations
 
@@ -40,11 +40,10 @@ _HEAP_BLOCK_BYTES = 8 << 20
 
 @dataclass(frozen=True, slots=True)
 class Observer:
-    """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
-    about every thousand events; ``interrupt`` gets a function that ends the run properly;
-    ``note`` gets what somebody should know before the run begins (a bag that was cut off,
-    what of a launch file is left out). ``samples_states`` puts samples of nodes' states into the
-    trace."""
+    """Callbacks of the caller of a run. ``progress`` gets (simulated ns, end ns or None, events)
+    about every thousand events; ``interrupt`` gets a function that ends the run properly; ``note``
+    gets notes from before the run (an incomplete bag, ignored parts of a launch file).
+    ``samples_states`` puts samples of nodes' states into the trace."""
 
     progress: Callable[[int, int | None, int], None] | None = None
     interrupt: Callable[[Callable[[Stop], None]], None] | None = None
@@ -55,10 +54,10 @@ class Observer:
 def housekeeping(
     dispatcher: Callable[[], Dispatcher], observer: Observer, end_ns: int | None
 ) -> Callable[[], int]:
-    """Return what is done between time steps: progress, and collecting garbage.
+    """Return the function called between time steps: it reports progress and collects garbage.
 
-    Python's collector would otherwise run finalizers in the middle of some callback; here they run
-    between steps, after the same events in every run.
+    Python's collector would run finalizers in the middle of a callback; here they run between
+    steps, after the same events in every run.
     """
     collect_at = _FIRST_GC_EVENTS
 
@@ -71,7 +70,7 @@ def housekeeping(
                 gc.collect(1)
         if observer.progress is None:
             return collect_at
-        with engage(None):  # whoever watches lives in real time
+        with engage(None):  # the caller's code runs in real time
             observer.progress(dispatcher().loop.now_ns, end_ns, events)
         return min(collect_at, events + _PROGRESS_EVERY_EVENTS)
 
@@ -79,8 +78,7 @@ def housekeeping(
 
 
 @contextmanager
-def quiet_gc() -> Iterator[None]:
-    """Keep Python's own garbage collector off."""
+def gc_disabled() -> Iterator[None]:
     was_enabled = gc.isenabled()
     gc.disable()
     try:
@@ -94,16 +92,16 @@ _lives_on = True
 
 
 def end_with_run() -> None:
-    """Let what there is before the next run be out of garbage collection up to the end of the
-    process, for a command: Python looks at it several times there, a sixth of a short command."""
+    """For a command: leave existing objects out of garbage collection until the process ends.
+    Python would look at them several times then, a sixth of a short command's time."""
     global _lives_on
     _lives_on = False
 
 
 @contextmanager
-def frozen_heap() -> Iterator[None]:
-    """Keep what there was before the run out of all garbage collection in it: it takes longer to
-    look at than what the run makes."""
+def frozen_gc() -> Iterator[None]:
+    """Exclude the objects that exist before the run from garbage collection: they take longer to
+    scan than what the run makes."""
     gc.freeze()
     try:
         yield
@@ -112,13 +110,12 @@ def frozen_heap() -> Iterator[None]:
             gc.unfreeze()
 
 
-def keep_heap() -> None:
-    """Have the C library keep the memory that is freed for what comes next.
+def keep_freed_memory() -> None:
+    """Let the C library keep freed memory for reuse.
 
-    The segments of a trace are laid out in blocks of half a megabyte, again and again. glibc gives
-    such blocks back to the kernel, and the next ones are cleared page by page: this was up to a
-    fifth of what a recorded event costs. Elsewhere, and where its environment variables are set,
-    nothing is changed (mallopt(3)).
+    Trace segments use blocks of half a megabyte again and again. glibc returns such blocks to the
+    kernel, and new ones are cleared page by page, up to a fifth of the cost of a recorded event.
+    Without mallopt(3), or with its environment variables set, nothing changes.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None and not any(name.startswith("MALLOC_") for name in os.environ):
@@ -133,13 +130,13 @@ _INSTALLED = frozenset(("site-packages", "dist-packages"))
 
 @contextmanager
 def kept_process() -> Iterator[None]:
-    """Put back afterwards what user code may change of the process: where it is, what it was told.
+    """Restore what user code may change of the process: directory, arguments, environment.
 
-    Paths of the caller (the trace, in the first place) are relative to the folder it was in. Not
-    for a ``Simulation``: who drives it may change the process, too, and mean it.
+    The caller's paths are relative to its directory. Not for a ``Simulation``, whose driver may
+    change the process on purpose.
     """
     folder = ""
-    with suppress(FileNotFoundError):  # somebody may have removed it, before or meanwhile
+    with suppress(FileNotFoundError):  # it may have been removed
         folder = os.getcwd()
     argv, words, environment = sys.argv, list(sys.argv), dict(os.environ)
     mask = os.umask(0o077)
@@ -161,7 +158,7 @@ def kept_process() -> Iterator[None]:
 
 @contextmanager
 def _kept_streams() -> Iterator[None]:
-    """Put the standard streams back: nodes exchange them, and daemons turn them to nowhere."""
+    """Restore the standard streams: nodes replace them, and daemons redirect them."""
     names = ("stdin", "stdout", "stderr")
     streams = {name: getattr(sys, name) for name in names}
     copies = {}
@@ -183,10 +180,10 @@ def _kept_streams() -> Iterator[None]:
 
 @contextmanager
 def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
-    """Let user modules be imported from the job's search path, and forget them afterwards; they
-    find the variables of a sourced ROS.
+    """Let user modules be imported from the job's search path, with the variables of a sourced ROS,
+    and unload them afterwards.
 
-    In a ``native`` run, interfaces that nobody has built cannot be sent.
+    In a ``native`` run, unbuilt interfaces cannot be sent.
     """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     old_path, old_modules = list(sys.path), set(sys.modules)
@@ -206,7 +203,7 @@ def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _sourced() -> Iterator[None]:
-    """Set what ROS's setup files set and programs ask for, if nobody has."""
+    """Set the variables of ROS's setup files that are not set."""
     values = {"ROS_VERSION": "2", "ROS_PYTHON_VERSION": "3", "ROS_DISTRO": _distribution()}
     added = {name: value for name, value in values.items() if value and name not in os.environ}
     os.environ.update(added)
@@ -219,7 +216,7 @@ def _sourced() -> Iterator[None]:
 
 @lru_cache(maxsize=1)
 def _distribution() -> str:
-    """Return the release of ROS that rclpy's wheel is of, empty if nobody knows."""
+    """Return the ROS release of rclpy's wheel, or ""."""
     spec = importlib.util.find_spec("rclpy")
     if spec is None or spec.origin is None:
         return ""
@@ -229,7 +226,7 @@ def _distribution() -> str:
 
 
 def _namespaces(folders: list[str]) -> list[str]:
-    """Return the loaded packages that are nothing but a folder in ``folders``."""
+    """Return the loaded namespace packages in ``folders``."""
     below = _below(folders)
     return [
         name
@@ -247,11 +244,11 @@ def _path_of(module: object) -> list[str]:
 
 
 def user_modules(folders: list[str]) -> dict[str, Path]:
-    """Return the files of the loaded modules that lie in ``folders``, by module name.
+    """Return the files of loaded modules in ``folders``, by module name; not of installed packages
+    or of rsltrace.
 
-    Installed packages are not the user's, even where a virtual environment lies in the folder, nor
-    is rsltrace: which of its modules are loaded depends on what was done before.
-    An episode of a ``Simulation`` asks more than once, of some thousand modules: these are texts.
+    An episode of a ``Simulation`` asks this repeatedly for thousands of modules, so it works on
+    strings.
     """
     below = _below(folders)
     found: dict[str, Path] = {}
@@ -263,7 +260,7 @@ def user_modules(folders: list[str]) -> dict[str, Path]:
 
 
 def is_below(file: str, folders: Sequence[str]) -> bool:
-    """Whether a file lies in one of ``folders`` and is not installed there."""
+    """Whether a file lies in ``folders`` and is not an installed package."""
     return _is_below(file, _below(folders))
 
 
@@ -277,9 +274,9 @@ def _is_below(file: str, below: tuple[str, ...]) -> bool:
 
 
 def run_as_main(name: str) -> ModuleSpec | None:
-    """Return what ``python -m name`` runs: the module, or the ``__main__`` of a package.
+    """Return the spec that ``python -m name`` runs: the module, or a package's ``__main__``.
 
-    The packages that it is in are imported, which may raise whatever they do.
+    Imports the parent packages, which may raise anything.
     """
     spec = importlib.util.find_spec(name)
     if spec is not None and spec.submodule_search_locations is not None:
@@ -287,7 +284,7 @@ def run_as_main(name: str) -> ModuleSpec | None:
     return spec
 
 
-def is_of_pytest(name: str) -> bool:
-    """Whether a loaded module is a test module or a conftest: pytest's own loader brought it."""
+def is_pytest_module(name: str) -> bool:
+    """Whether pytest loaded a module: a test module or a conftest."""
     spec = getattr(sys.modules.get(name), "__spec__", None)
     return type(getattr(spec, "loader", None)).__module__.startswith("_pytest.")

@@ -1,4 +1,4 @@
-"""What a trace says of its own origin: the job, the environment, which payloads it keeps."""
+"""What a trace says of its origin: job, environment, code and kept payloads."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ import os
 import platform
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 
 from rsltrace._version import __version__
-from rsltrace.guard.pin import HASH_SEED
+from rsltrace.guard.callers import is_own, is_user_file
+from rsltrace.guard.pin import HASH_SEED, thread_pools
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
-from rsltrace.run.numerical_libraries import numerical_libraries
-from rsltrace.run.process import is_below, is_of_pytest, run_as_main, user_modules
+from rsltrace.run.process import is_below, is_pytest_module, run_as_main, user_modules
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_CODE,
@@ -31,12 +32,93 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.writer import TraceWriter
 
-# What a module's code is, comments and layout apart, and which other modules it uses.
+# OpenBLAS and similar libraries round differently on different processors. A trace names their
+# kernels, but only if the job's modules use such libraries: others have the same bytes everywhere.
+
+_LIBRARIES = frozenset(
+    "numpy scipy pandas cv2 torch tensorflow jax numba sklearn casadi cvxpy filterpy pinocchio "
+    "shapely skimage".split()
+)
+
+
+def numerical_libraries(job: Job) -> str:
+    """Return the libraries with version and kernel, or "" if the job uses none.
+
+    The nodes' modules are already imported. ``LateLibraryScan`` finds later imports.
+    """
+    return _kernels() if any(map(_uses_numbers, _modules(job))) else ""
+
+
+class LateLibraryScan:
+    """Finds numerical libraries that are imported during the run, by mains or test suites."""
+
+    def __init__(self, programs: Iterable[CodeType]) -> None:
+        self._before = set(sys.modules)
+        self._programs = tuple(programs)
+
+    def find(self) -> str:
+        """Return what ``numerical_libraries`` does, for modules that user code has loaded since."""
+        loaded = [sys.modules.get(name) for name in sorted(set(sys.modules) - self._before)]
+        of_user = [one for one in loaded if one is not None and _is_of_user(one)]
+        if any(map(_uses_numbers, of_user)) or any(map(_imports_numbers, self._programs)):
+            return _kernels()
+        return ""
+
+
+def _kernels() -> str:
+    keys = ("internal_api", "version", "architecture")
+    found = {
+        " ".join(str(pool[key]) for key in keys if pool.get(key))
+        for pool in thread_pools().threadpool_info()
+    }
+    return ", ".join(sorted(found))
+
+
+def _is_of_user(module: ModuleType) -> bool:
+    file = getattr(module, "__file__", None)
+    return isinstance(file, str) and not is_own(module.__name__) and is_user_file(file)
+
+
+def _imports_numbers(code: CodeType) -> bool:
+    return any(name.partition(".")[0] in _LIBRARIES for name in code.co_names) or any(
+        _imports_numbers(part) for part in code.co_consts if isinstance(part, CodeType)
+    )
+
+
+def _modules(job: Job) -> Iterable[ModuleType]:
+    """Return the loaded user modules: of the search path, or of a node's package."""
+    names = set(user_modules([str(job.resolve(folder)) for folder in job.search_path]))
+    packages = {spec.package for spec in job.nodes} - {""}
+    names |= {name for name in sys.modules if name.partition(".")[0] in packages}
+    return [sys.modules[name] for name in sorted(names)]
+
+
+def _uses_numbers(module: ModuleType) -> bool:
+    """Whether a module has values of the libraries, or a function that imports one."""
+    file = getattr(module, "__file__", None)
+    for value in list(vars(module).values()):
+        name = value.__name__ if isinstance(value, ModuleType) else _module_of_value(value)
+        if name.partition(".")[0] in _LIBRARIES:
+            return True
+        functions = vars(value).values() if isinstance(value, type) else (value,)
+        for one in functions:
+            code = one.__code__ if type(one) is FunctionType else None
+            if code is not None and code.co_filename == file and _imports_numbers(code):
+                return True
+    return False
+
+
+def _module_of_value(value: object) -> str:
+    """Return the module of a function or class, or ""."""
+    if not isinstance(value, type) and not callable(value):
+        return ""
+    name = getattr(value, "__module__", "")
+    return name if isinstance(name, str) else ""
 
 
 def module_code(modules: Mapping[str, Path]) -> dict[str, str]:
-    """Return for each module, as JSON, ``hash`` of its syntax tree and which of the others it
-    ``imports``; what is not Python is left out."""
+    """Return, as JSON for each Python module, the ``hash`` of its syntax tree and its ``imports``
+    of the other modules."""
     found = {}
     for name, path in modules.items():
         if path.suffix != ".py":
@@ -49,16 +131,13 @@ def module_code(modules: Mapping[str, Path]) -> dict[str, str]:
             continue
         package = name if path.name == "__init__.py" else name.rpartition(".")[0]
         imports = sorted({*_imported(tree, package)} & {*modules} - {name})
-        found[name] = json.dumps({"hash": _hash(tree), "imports": imports})
+        digest = hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
+        found[name] = json.dumps({"hash": digest, "imports": imports})
     return found
 
 
-def _hash(tree: ast.Module) -> str:
-    return hashlib.sha256(ast.dump(tree).encode("utf-8", "surrogatepass")).hexdigest()[:16]
-
-
 def _imported(tree: ast.Module, package: str) -> Iterator[str]:
-    """Yield the names of modules that may be imported, those of their packages included."""
+    """Yield the modules that may be imported, with their parent packages."""
     for node in ast.walk(tree):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -76,7 +155,7 @@ _PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
 
 
 def payload_filter(job: Job) -> Callable[[str], bool]:
-    """Return the function that says whether a topic's payloads are kept."""
+    """Return the function that decides whether a topic's payloads are kept."""
     spec = job.record
 
     def keep(topic: str) -> bool:
@@ -93,7 +172,7 @@ def payload_filter(job: Job) -> Callable[[str], bool]:
 
 
 def write_job(writer: TraceWriter, job: Job) -> None:
-    """Put the job into the trace: its text, and what it means with every default filled in."""
+    """Write the job's text and its resolved form into the trace."""
     resolved = json.dumps(job.resolved(), sort_keys=True, ensure_ascii=False)
     name = Path(job.source_name).name
     writer.add_metadata(METADATA_JOB, {"name": name, "resolved": resolved})
@@ -101,17 +180,17 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 
 def source_files(job: Job) -> dict[str, Path]:
-    """Return the file of every module loaded from the job's search path, by name; and of its
-    scripts, programs and the files that its models come from (``file:`` and the path in the job).
+    """Return the files of all modules loaded from the job's search path, by name; also its scripts,
+    programs and model files (``file:`` and the path in the job).
 
-    Which tests run beside it says nothing of a job, unless its nodes are theirs.
+    Test modules are left out unless a node is in one.
     """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     of_nodes = {_module_of(target) for spec in job.nodes for target in (spec.node, spec.main)}
     modules = {
         name: path
         for name, path in user_modules(folders).items()
-        if name in of_nodes or not is_of_pytest(name)
+        if name in of_nodes or not is_pytest_module(name)
     }
     modules.update(_run_as_main(job, folders))
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
@@ -119,9 +198,9 @@ def source_files(job: Job) -> dict[str, Path]:
 
 
 def write_sources(writer: TraceWriter, job: Job, files: Mapping[str, Path] | None = None) -> None:
-    """Put hashes of the code into the trace: of its files as they are, and of what they mean.
+    """Write hashes of the code files and of their syntax trees into the trace.
 
-    ``files`` are those that other processes have loaded, None: what there is in this one.
+    ``files`` are those that other processes have loaded; None: those of this one.
     """
     if files is None:
         files = source_files(job)
@@ -132,7 +211,7 @@ def write_sources(writer: TraceWriter, job: Job, files: Mapping[str, Path] | Non
 
 
 def _run_as_main(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path]]:
-    """Yield the files of a job that run as ``__main__`` and are no loaded modules."""
+    """Yield the files that run as ``__main__`` and are not loaded modules."""
     for spec in job.nodes:
         file = spec.script or spec.program
         if file is not None:
@@ -150,9 +229,9 @@ def _module_of(target: Target | None) -> str:
 
 @lru_cache(maxsize=1)
 def _versions() -> tuple[tuple[str, str], ...]:
-    """Return the versions of the packages that matter; they stay for as long as a process lives.
+    """Return the versions of the packages that matter.
 
-    As ``importlib.metadata`` finds them, which takes as long to load as a small job to run.
+    It reads metadata itself: loading ``importlib.metadata`` takes as long as a small job.
     """
     found: dict[str, str] = {}
     for folder in sys.path:
@@ -165,7 +244,7 @@ def _versions() -> tuple[tuple[str, str], ...]:
 
 
 def _version_in(folder: str, name: str) -> Iterator[str]:
-    """Yield the version that a package's metadata in a folder of Python's path says it has."""
+    """Yield the version in a package's metadata."""
     files = {".dist-info": ("METADATA",), ".egg-info": ("PKG-INFO", "")}
     for file in files.get(os.path.splitext(name)[1], ()):
         with suppress(OSError):
@@ -178,8 +257,7 @@ def _version_in(folder: str, name: str) -> Iterator[str]:
 def environment(job: Job | None = None) -> dict[str, str]:
     """Return what a run's result may depend on: versions, never dates, names or paths.
 
-    For a job whose modules (imported already) use numerical libraries, also which kernels these
-    chose for the processor.
+    For a job whose modules (already imported) use numerical libraries, also their kernels.
     """
     values = {
         "rsltrace": __version__,

@@ -1,7 +1,7 @@
 """One run of a job in stages: open, begin, go on, finish.
 
-The one way to run a job: ``record`` goes through the stages at once, ``Simulation`` lets somebody
-outside say how far to go.
+This is the one way to run a job: ``record`` goes through the stages at once, ``Simulation`` lets a
+driver decide how far to go.
 """
 
 from __future__ import annotations
@@ -17,27 +17,25 @@ from typing import TYPE_CHECKING
 from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
-from rsltrace.run.full_queues import drop_notes, drops
 from rsltrace.run.inputs import check_output, without_launch_files
-from rsltrace.run.numerical_libraries import LateLibraries
 from rsltrace.run.plans.bags import (
     BagInput,
+    bag_notes,
     check_bag_types,
-    notes_of,
     open_bag_of,
     start_ns_of,
     start_players,
 )
-from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
-from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
-from rsltrace.run.plans.guard import RunGuard, install_guard, packages_of
-from rsltrace.run.plans.main_programs import MainProgram
+from rsltrace.run.plans.entries import add_job_location, hook_entries, missed_starts, node_entries
+from rsltrace.run.plans.executables import MainProgram
+from rsltrace.run.plans.faults import BagFaults, arm_node_faults, arm_topic_faults, missed_faults
+from rsltrace.run.plans.guard import RunGuard, install_guard, node_packages
 from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
-from rsltrace.run.plans.processes import process_door
-from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
+from rsltrace.run.plans.processes import make_process_adapter
+from rsltrace.run.plans.recorded_order import follow_recording, remember_choices, write_choices
 from rsltrace.run.plans.scheduling import (
+    continued_policy,
     end_ns_of,
-    going_on,
     is_ordered,
     policy_of_job,
     scheduling_plan,
@@ -47,18 +45,25 @@ from rsltrace.run.plans.scheduling import (
     switches_at_lines,
     unmet_departures,
 )
-from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.process import (
     Observer,
-    frozen_heap,
+    frozen_gc,
+    gc_disabled,
     housekeeping,
-    keep_heap,
-    quiet_gc,
+    keep_freed_memory,
     search_path,
 )
-from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.run.provenance import (
+    LateLibraryScan,
+    environment,
+    payload_filter,
+    write_job,
+    write_sources,
+)
 from rsltrace.run.unused_rules import (
+    drop_notes,
     has_rules,
+    queue_drops,
     unused_parameters,
     unused_ros_parameters,
     unused_rules,
@@ -68,8 +73,8 @@ from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.loop.timer_queue import timer_queue
-from rsltrace.simulation.middleware.events.event import Census
-from rsltrace.simulation.middleware.interface import FaultsOfAll
+from rsltrace.simulation.middleware.events.event import NameRegistry
+from rsltrace.simulation.middleware.interface import AllTopicFaults
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_STATES
 from rsltrace.trace.mcap.sink import unfinished
 from rsltrace.trace.model.drop import kept_drops
@@ -82,10 +87,12 @@ if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.entry import Entry
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
-    from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.run.state_samples import StateSamples
     from rsltrace.simulation.chance.channel import NetworkPlan
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import (
+        NativeOrderObserver,
+        RecordedOrderObserver,
+    )
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -153,10 +160,8 @@ class Session:
         writer: TraceWriter | None = None,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
-        """``writer`` takes what is recorded where there is no ``output``, and stays open: who gives
-        it looks after the run, too, so that nobody else watches for callbacks that hang.
-        ``metadata`` is written into the trace besides what a run writes.
-        """
+        """``writer`` records the run without an ``output``, and stays open; its owner also watches
+        for callbacks that hang. ``metadata`` is added to the trace."""
         self.job = job
         self._metadata = metadata or {}
         self._replay = replay
@@ -174,8 +179,8 @@ class Session:
         self._guarded: RunGuard
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
-        self._recorded: RecordedRun | ObservedRun | None
-        self._late: LateLibraries
+        self._recorded: RecordedOrderObserver | NativeOrderObserver | None
+        self._late: LateLibraryScan
         self._processes: ProcessDoor
         self._numerics_known = True
         self._samples: StateSamples | None = None
@@ -188,13 +193,12 @@ class Session:
         return self._has_begun
 
     def inner_pairs(self) -> list[tuple[int, int]]:
-        """Return the pipes and pairs of sockets that nodes have made, and keep both ends of."""
+        """Return the pipes and socket pairs of which nodes hold both ends."""
         guard = self._guarded.guard
         return [] if guard is None else guard.descriptors.inner_pairs()
 
     def changes_process(self, pid: int, pairs: Sequence[tuple[int, int]]) -> None:
-        """Take note that the run goes on in a copy of its process, which has these ``pairs`` of
-        descriptors anew."""
+        """Continue in a copy of the process, which has new ``pairs`` of descriptors."""
         self.world.stacks.runners.process = pid
         guard = self._guarded.guard
         if guard is not None:
@@ -230,11 +234,11 @@ class Session:
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
         self._guarded = install_guard(stack, self.job)
-        stack.enter_context(frozen_heap())  # the guard has looked at what there is
+        stack.enter_context(frozen_gc())  # the guard has looked at what there is
         self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
-            self._import_what_is_named()
+            self._import_targets()
         check_bag_types(self.job, self._bags)
         self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
         if self._observer.interrupt is not None:  # from here on there is a file to be closed
@@ -243,28 +247,28 @@ class Session:
             self._open_trace(stack, self._output)
         elif self._recorded_by is not None:
             self._record_to(self._recorded_by)
-        stack.enter_context(quiet_gc())
-        keep_heap()
+        stack.enter_context(gc_disabled())
+        keep_freed_memory()
         if self._recorded_by is None:
             stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
-        """Open the bags, from which the run may have its start and its end."""
+        """Open the bags, which may set the start and the end of the run."""
         job = self.job
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
-        self._notes = (*notes, *notes_of(job, self._bags), *clock_notes(job, self.start_ns))
+        self._notes = (*notes, *bag_notes(job, self._bags), *clock_notes(job, self.start_ns))
         if self._observer.note is not None:
             for note in self._notes:
                 self._observer.note(note)
 
     def _make_world(self, stack: ExitStack, kind: type[World]) -> None:
-        """Make the loop and the world that the job describes, still without nodes."""
+        """Make the loop and the world of the job, without nodes."""
         job = self.job
-        self.loop = loop = self._kind_of_loop()(
+        self.loop = loop = self._loop_class()(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
@@ -276,36 +280,36 @@ class Session:
         self.world = world = stack.enter_context(
             kind(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
-        self._processes = process_door(job, world)
+        self._processes = make_process_adapter(job, world)
         stack.callback(self._processes.close)
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
         if self.may_become:
-            world.domain.transport.faults = FaultsOfAll()
-        arm_topics(job.faults, world)
+            world.domain.transport.faults = AllTopicFaults()
+        arm_topic_faults(job.faults, world)
         if has_rules(job):
-            world.domain.entities.census = census = Census()
+            world.domain.entities.census = census = NameRegistry()
             world.domain.dispatcher.add_observer(census)
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
 
-    def _kind_of_loop(self) -> type[EventLoop]:
+    def _loop_class(self) -> type[EventLoop]:
         return OrderedLoop if is_ordered(self.job) else EventLoop
 
     def _order_events(self, stack: ExitStack) -> None:
-        """Say what runs when, if the job does, and for how long."""
+        """Set the scheduling policy, executors and execution times of the job."""
         loop = self.loop
-        self._recorded = recorded_run(self.job, self.world.domain, stack)
+        self._recorded = follow_recording(self.job, self.world.domain, stack)
         if isinstance(loop, OrderedLoop):
             recorded = None if self._recorded is None else self._recorded.policy
             with self._guarded.engaged():
                 self.world.use_scheduling(loop, scheduling_plan(self.job, self.start_ns, recorded))
             if switches_at_lines(self.job):
-                self.world.switch_at_lines(loop, packages_of(self.job.nodes))
+                self.world.switch_at_lines(loop, node_packages(self.job.nodes))
 
-    def _import_what_is_named(self) -> None:
-        """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
+    def _import_targets(self) -> None:
+        """Import stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
         self.loop.stop_conditions = tuple(
             stop_conditions(job, self.start_ns, world.domain.dispatcher.outside_events)
@@ -318,7 +322,7 @@ class Session:
             ]
 
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
-        """Create the file, and write down what is known before the run."""
+        """Create the file, and write what is known before the run."""
         job = self.job
         for place in (path, unfinished(path)):
             check_output(job, place, self._replay)
@@ -327,7 +331,7 @@ class Session:
         )
         if writer.place != path and self._observer.note is not None:
             self._observer.note(
-                f"{path} stays as it is until this run is over; until then it goes to "
+                f"{path} is replaced when this run is over; until then the trace is in "
                 f"{writer.place}"
             )
         self._record_to(writer)
@@ -335,7 +339,7 @@ class Session:
     def _record_to(self, writer: TraceWriter) -> None:
         job = self.job
         programs = (entry.make for entry in self._entries)
-        self._late = LateLibraries(one.code for one in programs if isinstance(one, MainProgram))
+        self._late = LateLibraryScan(one.code for one in programs if isinstance(one, MainProgram))
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.record(recorder)
         if self._observer.samples_states:
@@ -351,7 +355,7 @@ class Session:
         for name, values in self._metadata.items():
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
-        note_choices(self.loop)
+        remember_choices(self.loop)
         if job.stop.size is not None:
             self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
@@ -359,37 +363,32 @@ class Session:
         return payload_filter(self.job)
 
     def _interrupt(self, stop: Stop) -> None:
-        """End the run after the present event, or within it if it does not come back.
-
-        :raises KeyboardInterrupt: in the second case, on the stack of the event.
-        """
+        """End the run after the current event, or within it if it does not return."""
         self.loop.stop(stop)
-        if self._watchdog.has_told:
+        if self._watchdog.has_warned:
             raise KeyboardInterrupt
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over, for whatever reason."""
         return self.stop is not None or self.loop.stopped is not None
 
     @property
     def place(self) -> Path | None:
-        """Where the trace is being written, None if there is none."""
+        """Where the trace is being written, or None."""
         return None if self._writer is None else self._writer.place
 
     @property
     def error(self) -> RunError | None:
-        """What went wrong in the run, if anything did."""
         return self.world.error
 
     @property
     def digest(self) -> str:
-        """The digest so far, empty for a run that records nothing."""
+        """The digest so far, "" if nothing is recorded."""
         recorder = self.world.domain.dispatcher.recorder
         return "" if recorder is None else recorder.digest
 
     def begin(self) -> None:
-        """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
+        """Construct the nodes and jump to the start. Failures are in ``error``."""
         if self.job.stop.topic is not None:
             from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 
@@ -402,7 +401,7 @@ class Session:
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
             if not self.whole_graph:
-                self._faults = arm_nodes(self.job, self.world, self.start_ns)
+                self._faults = arm_node_faults(self.job, self.world, self.start_ns)
             stop_with(self.world, self._entries)
             self.world.stacks.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
@@ -412,7 +411,7 @@ class Session:
                 if entry in later or (entry.is_component and self.whole_graph):
                     continue
                 if not self.world.construct(entry):
-                    say_where(self.job, entry, self.world.error)
+                    add_job_location(self.job, entry, self.world.error)
                     break
             if not self.ended:
                 self.bag_faults = start_players(
@@ -424,12 +423,12 @@ class Session:
                 self.world.starts.begin(self.start_ns)
 
     def go_on(self) -> None:
-        """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
+        """Run the loop until it ends or its gate pauses it. Failures are in ``error``."""
         with self._failures(), self._engaged():
             self.world.go_on()
         failed, self.world.starts.failed = self.world.starts.failed, None
         if failed is not None:
-            say_where(self.job, failed, self.world.error)
+            add_job_location(self.job, failed, self.world.error)
 
     @contextmanager
     def _engaged(self) -> Iterator[None]:
@@ -447,9 +446,9 @@ class Session:
             self.stop = Stop(str(error).splitlines()[0], failed.exit_code)
 
     def becomes(self, job: Job) -> None:
-        """Go on as the run of another job, which is like this one's but for what is yet to come:
-        its policy, and faults beside those of this one's. ``why_not`` of ``rsltrace.run.branching``
-        says if that can be.
+        """Continue as the run of another job that differs only in what is still to come: its
+        policy, and additional faults. ``why_not`` of ``rsltrace.run.branching`` says if that is
+        possible.
 
         :raises JobError: its policy cannot be made.
         """
@@ -457,15 +456,17 @@ class Session:
         self.job = job = without_launch_files(job).job
         if isinstance(self.loop, OrderedLoop) and job.policy != old.policy:
             with self._guarded.engaged():
-                self.loop.policy = going_on(policy_of_job(job, self.start_ns), self.loop.policy)
+                self.loop.policy = continued_policy(
+                    policy_of_job(job, self.start_ns), self.loop.policy
+                )
         faults = job.faults[len(old.faults) :]
-        arm_topics(faults, self.world)
+        arm_topic_faults(faults, self.world)
         if self.bag_faults is not None:
             self.bag_faults.add(job, len(old.faults))
-        self._faults = arm_nodes(job, self.world, self.start_ns)
+        self._faults = arm_node_faults(job, self.world, self.start_ns)
 
     def settle(self, path: Path) -> None:
-        """Have what the ``writer`` has been given so far, and all to come, in a trace.
+        """Write what the ``writer`` was given so far, and all that follows, to a trace file.
 
         :raises OutputError: the trace cannot be written.
         """
@@ -477,7 +478,7 @@ class Session:
         self._writer = self._stack.enter_context(writer)
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
-        """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
+        """Return the parts of the job without effect so far; ``lasted``: the run is over."""
         from rsltrace.adapters.rclpy.parameters import parameters_of
 
         domain = self.world.domain
@@ -498,10 +499,10 @@ class Session:
         return (*rules, *parameter_notes, *starts, *faults)
 
     def finish(self, *, cut_short: bool = False) -> RunResult:
-        """Destroy the nodes, close the trace, and say how it went. Of a run that somebody has
-        ``cut_short`` nobody knows what in its job would have had nothing to do.
+        """Destroy the nodes, close the trace, and return the result. A run that was ``cut_short``
+        gets no notes on unused parts of its job.
 
-        :raises OutputError: if the rest of the trace cannot be written.
+        :raises OutputError: the rest of the trace cannot be written.
         """
         loop, outcome = self.loop, self.world.domain.outcome
         stop = self.stop or loop.stopped
@@ -516,10 +517,12 @@ class Session:
                 self._samples.take_last()
             self.world.destroy()
         error = self.world.error
-        exit_code = error.exit_code if error else self._exit_code(stop)
+        exit_code = stop.exit_code or self.world.exit_code or self._processes.exit_code
+        if error:
+            exit_code = error.exit_code
         if self._writer is not None:
             self._guarded.write(self._writer)
-            keep_choices(self._writer, loop)
+            write_choices(self._writer, loop)
             if self._samples is not None:
                 self._writer.add_metadata(METADATA_STATES, self._samples.as_metadata())
             self._writer.close(
@@ -531,7 +534,7 @@ class Session:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error, outcome.waits),
-                    **kept_drops(drops(outcome.drops)),
+                    **kept_drops(queue_drops(outcome.drops)),
                     **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,
@@ -553,11 +556,8 @@ class Session:
             kept="" if self._writer is None else self._writer.kept,
         )
 
-    def _exit_code(self, stop: Stop) -> int:
-        return stop.exit_code or self.world.exit_code or self._processes.exit_code
-
     def _order_of_starts(self) -> dict[str, str]:
-        """Return what a trace keeps of the order of its constructions where it is not the job's."""
+        """Return the order of constructions, where it is not the job's."""
         in_order = all(one.start_after is None and one.respawn is None for one in self._entries)
         if in_order and not any(fault.restart for fault in self.job.faults):
             return {}
@@ -568,18 +568,17 @@ class Session:
         return {"entries": ",".join(places)}
 
     def _late_numerics(self) -> dict[str, str]:
-        """Return which kernels numerical libraries chose that the run has imported itself."""
+        """Return the kernels of numerical libraries that the run imported itself."""
         late = "" if self._numerics_known else self._late.find()
         return {"numerics": late} if late else {}
 
 
 def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
-    """Return what a trace keeps of a deadlock, and of who waited until the end: nothing else in it
-    tells who waits for what."""
-    told = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
-    return told | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
+    """Return the texts of a deadlock and of calls that still waited at the end, for the trace."""
+    found = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
+    return found | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
 
 
 def _without_folders(text: str) -> str:
-    """Return a text without the paths of the machine that a trace was made on."""
+    """Return a text without the folders of this machine."""
     return shortened(_FOLDER.sub("", text), _WAITS_MAX)

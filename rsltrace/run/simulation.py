@@ -1,9 +1,10 @@
-"""A run that somebody outside drives step by step, like a Gym environment."""
+"""A run that its caller drives step by step, like a Gym environment."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
@@ -15,10 +16,43 @@ from rsltrace.job.values.times import parse_time, parse_time_in_run
 from rsltrace.run.driver import Driver
 from rsltrace.run.forked import ForkedRun, ForkResult
 from rsltrace.run.session import RunResult, Session
-from rsltrace.run.tap import Tap
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import format_seconds
+
+
+class TopicTap:
+    """The messages published on a topic since ``Simulation.subscribe`` was called.
+
+    ``messages`` are (simulated ns, message), oldest first, the last ``depth`` of them; ``count`` is
+    how many there were in all. Messages are seen when they are published, before any delay.
+    """
+
+    def __init__(
+        self, topic: str, callback: Callable[[Any], object] | None, depth: int | None
+    ) -> None:
+        self.topic = topic
+        self.messages: deque[tuple[int, Any]] = deque(maxlen=depth)
+        self.count = 0
+        self.callback = callback
+
+    @property
+    def latest(self) -> Any:
+        return self.messages[-1][1] if self.messages else None
+
+    def take(self) -> Any:
+        return self.messages.popleft()[1] if self.messages else None
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter([message for _, message in self.messages])
+
+    def __len__(self) -> int:
+        return len(self.messages)
+
+    def add(self, stamp_ns: int, message: Any) -> None:
+        self.count += 1
+        self.messages.append((stamp_ns, message))
+
 
 T = TypeVar("T")
 Time = str | int | float
@@ -66,10 +100,8 @@ class Simulation:
             self._forking = None
             self._session = Session(loaded, path, force=force, echo=echo)
         self._entered: Driver | None = None
-        self._taps: dict[str, list[Tap]] = {}
+        self._taps: dict[str, list[TopicTap]] = {}
         self._result: RunResult | None = None
-
-    # -- from beginning to end ---------------------------------------------------------------------
 
     def __enter__(self) -> Simulation:
         """Construct the nodes and jump to the start; nothing has run yet.
@@ -103,7 +135,7 @@ class Simulation:
         try:
             driver.leave()
             if not driver.ended:
-                driver.loop.stop(self._left_because(error))
+                driver.loop.stop(self._stop_on_exit(error))
             if self._forking is not None:
                 self._forking.settle()
             self._result = self._session.finish()
@@ -112,7 +144,7 @@ class Simulation:
         finally:
             self._session.__exit__(kind, error, where)
 
-    def _left_because(self, error: BaseException | None) -> Stop:
+    def _stop_on_exit(self, error: BaseException | None) -> Stop:
         if error is not None:
             return Stop(f"the driver of the simulation raised {type(error).__qualname__}", 1)
         loop = self._driver.loop
@@ -146,15 +178,11 @@ class Simulation:
     def stop(
         self, reason: str = "stopped by the driver of the simulation", exit_code: int = 0
     ) -> None:
-        """End the run."""
         if not self.done:
             self._driver.loop.stop(Stop(reason, exit_code))
 
-    # -- what there is -----------------------------------------------------------------------------
-
     @property
     def now_ns(self) -> int:
-        """Simulated time."""
         return self._driver.loop.now_ns
 
     @property
@@ -187,8 +215,6 @@ class Simulation:
         there = f"there are: {', '.join(names) or 'none'}"
         hint = did_you_mean(f"/{name.lstrip('/')}", names, there)
         raise RunError(f"there is no node named {name}; {hint}")
-
-    # -- going on ----------------------------------------------------------------------------------
 
     def step(self) -> bool:
         """Run the next time step: all that is ready now, or else all that is due next.
@@ -296,8 +322,6 @@ class Simulation:
         finally:
             self.unsubscribe(tap)
 
-    # -- doing things from outside -----------------------------------------------------------------
-
     def publish(self, topic: str, message: Any, *, qos: Any = 10) -> int:
         """Publish a message at the present time; return to how many subscriptions it goes.
 
@@ -346,7 +370,7 @@ class Simulation:
         callback: Callable[[Any], object] | None = None,
         *,
         depth: int | None = 1000,
-    ) -> Tap:
+    ) -> TopicTap:
         """Listen to a topic from outside: the Tap keeps the last ``depth`` messages (None: all).
 
         ``callback(message)`` is called at the end of the time step in which it was published. The
@@ -354,20 +378,19 @@ class Simulation:
         """
         self._check_there()
         topic = _topic(topic)
-        tap = Tap(topic, callback, depth)
+        tap = TopicTap(topic, callback, depth)
         if topic not in self._taps:
             self._taps[topic] = []
             self._session.world.domain.watch(topic, self._watcher(self._taps[topic]))
         self._taps[topic].append(tap)
         return tap
 
-    def unsubscribe(self, tap: Tap) -> None:
-        """Stop listening."""
+    def unsubscribe(self, tap: TopicTap) -> None:
         taps = self._taps.get(tap.topic, [])
         if tap in taps:
             taps.remove(tap)
 
-    def _watcher(self, taps: list[Tap]) -> Callable[[Any, bytes], None]:
+    def _watcher(self, taps: list[TopicTap]) -> Callable[[Any, bytes], None]:
         from rsltrace.adapters.rclpy.wire.codec import codec_for
         from rsltrace.adapters.rclpy.wire.interfaces import class_of
 
@@ -378,11 +401,9 @@ class Simulation:
                 message = codec_for(class_of(publisher)).deserialize(data)
                 tap.add(driver.loop.now_ns, message)
                 if tap.callback is not None:
-                    driver.tell_later(tap.callback, message)
+                    driver.call_listener_later(tap.callback, message)
 
         return watch
-
-    # -- checks ------------------------------------------------------------------------------------
 
     def _check_going(self) -> None:
         if self.done:
@@ -394,10 +415,7 @@ class Simulation:
 
 
 def _topic(name: str) -> str:
-    """Return a topic with its leading slash.
-
-    :raises RunError: if it cannot be a topic.
-    """
+    """Return a topic with its leading slash."""
     topic = name if name.startswith("/") else f"/{name}"
     try:
         check_topic(topic)

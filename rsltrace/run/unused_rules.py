@@ -1,12 +1,13 @@
-"""Rules of a job that had nothing to do: they name a topic, service or node that never was.
+"""Notes on rules of a job that had no effect: they name a topic, service or node that never
+existed; and on messages that full queues dropped.
 
-ROS ignores what fits nothing, and so does a run; whoever wrote the rule wants to know. Names that
-nodes create later than a run lasts are not seen, so these are notes, no errors.
+ROS ignores such rules, and so does a run. Names that nodes create after the end of a run are not
+seen, so these are notes, not errors.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
@@ -16,14 +17,45 @@ from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.run.plans.entries import entry_keys
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
-from rsltrace.simulation.middleware.events.event import Asker, Census
+from rsltrace.simulation.middleware.entity import Receiver
+from rsltrace.simulation.middleware.events.event import Asker, NameRegistry
+from rsltrace.trace.model.drop import Drop
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
 
-# Remappings of a job that remap nothing: no node has asked for the name that they replace.
-#
-# rcl itself is asked what a rule does to a name, so its forms (`~/x`, `node:x`, `rosservice://x`)
-# mean here what they mean in a run.
+_TOLD = 5
+
+Counts = Mapping[tuple[Receiver, int], int]
+"""How many, by receiver, and by how many messages a publisher holds in an outage if its queue was
+the full one (else 0)."""
+
+
+def queue_drops(counts: Counts) -> list[Drop]:
+    """Return the drops of full queues, ordered by entity."""
+    found = [
+        Drop(receiver.entity_id, held or receiver.keep or 0, count, in_outage=held > 0)
+        for (receiver, held), count in counts.items()
+    ]
+    return sorted(found, key=lambda one: (one.entity, one.in_outage))
+
+
+def drop_notes(counts: Counts) -> list[str]:
+    """Return one note that names the queues that dropped most."""
+    most = sorted(counts.items(), key=lambda item: (-item[1], item[0][0].entity_id))
+    if not most:
+        return []
+    parts = [
+        f"{receiver.describe()} {count} (depth {held or receiver.keep}"
+        f"{', of a publisher in an outage' if held else ''})"
+        for (receiver, held), count in most[:_TOLD]
+    ]
+    if len(most) > _TOLD:
+        parts.append(f"{len(most) - _TOLD} more (rsltrace info lists them)")
+    return [f"full queues dropped their oldest messages: {'; '.join(parts)}"]
+
+
+# rcl itself applies the rules, so their forms (`~/x`, `node:x`, `rosservice://x`) mean what they do
+# in a run.
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""
@@ -32,15 +64,13 @@ _ELSEWHERE = "/rsltrace/elsewhere"
 
 
 def has_remappings(job: Job) -> bool:
-    """Say whether a job has remappings that might remap nothing."""
     return bool(job.ros_arguments) or any(spec.remappings for spec in job.nodes)
 
 
-def unused_remappings(job: Job, census: Census) -> Iterator[str]:
-    """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do.
+def unused_remappings(job: Job, census: NameRegistry) -> Iterator[str]:
+    """Yield the remappings of ``nodes`` and ``ros_arguments`` without effect.
 
-    What several nodes are given alike (``<set_remap>`` of a launch file, an anchor of YAML) has
-    something to do if one of them uses it.
+    A remapping given to several nodes (``<set_remap>``, a YAML anchor) is used if one node uses it.
     """
     everybody: list[Asker] = []
     given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
@@ -63,13 +93,13 @@ def unused_remappings(job: Job, census: Census) -> Iterator[str]:
 
 
 def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
-    """Yield (index, name to be replaced) of the remappings among ROS arguments."""
+    """Yield (index, replaced name) of the remappings among ROS arguments."""
     for index, word in enumerate(words[1:], start=1):
         if words[index - 1] in ("-r", "--remap"):
             yield index, word.partition(":=")[0]
 
 
-def _is_used(old: str, askers: Iterable[Asker], census: Census) -> bool:
+def _is_used(old: str, askers: Iterable[Asker], census: NameRegistry) -> bool:
     bare = old.rpartition(":")[2]
     if bare.startswith("__") or bare in _USUAL:
         return True
@@ -82,12 +112,12 @@ def _is_used(old: str, askers: Iterable[Asker], census: Census) -> bool:
 
 
 def _forms(name: str, asker: Asker) -> list[str]:
-    """Return how a rule may name what is called ``name`` in full."""
+    """Return the names by which a rule may refer to the full name ``name``."""
     folder = asker.namespace.rstrip("/") + "/"
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
 
-def _remapping_note(old: str, askers: list[Asker], census: Census) -> str:
+def _remapping_note(old: str, askers: list[Asker], census: NameRegistry) -> str:
     names = [
         form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]
@@ -98,7 +128,6 @@ def _remapping_note(old: str, askers: list[Asker], census: Census) -> str:
 
 
 def has_rules(job: Job) -> bool:
-    """Say whether a job has rules that might fit nothing."""
     parts = (job.delay, job.execution, job.executors, job.policy, job.stop.topic)
     return bool(
         any(part is not None for part in parts)
@@ -110,9 +139,9 @@ def has_rules(job: Job) -> bool:
 
 
 def unused_rules(
-    job: Job, census: Census, plan: NetworkPlan | None, lasted_ns: int | None = None
+    job: Job, census: NameRegistry, plan: NetworkPlan | None, lasted_ns: int | None = None
 ) -> Iterator[str]:
-    """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
+    """Yield the names in a job's rules that did not exist; ``lasted_ns`` is the run's duration."""
     topics = [*census.topics, *QUIET_TOPICS]
     nodes = list(census.nodes)
     for place, glob, names, what in _single(job, topics, list(census.services), nodes):
@@ -126,7 +155,7 @@ def unused_rules(
                 yield _note(job, place, what, glob, names)
     for rule in plan.table if plan is not None else ():
         if rule.name not in topics:
-            yield f"{rule.where}: no topic is called {rule.name!r}{_instead(rule.name, topics)}"
+            yield f"{rule.where}: no topic is called {rule.name!r}{_suggestion(rule.name, topics)}"
     for place, glob in _record_globs(job):
         names = [*topics, *census.services]
         if not _fits(glob, names):
@@ -146,10 +175,11 @@ def unused_rules(
 
 
 def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -> Iterator[str]:
-    """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared.
+    """Yield the parameters of an entry that none of its nodes has declared.
 
-    What a launch file gives several nodes alike (``<set_parameter>``) is meant for who has it.
-    Until the run has ``lasted``, an unconfigured node is passed over: it may still declare them.
+    A parameter that a launch file gives to several nodes (``<set_parameter>``) need only be
+    declared by one. Until the run has ``lasted``, unconfigured nodes are skipped: they may still
+    declare it.
     """
     entries = []
     used_alike: set[tuple[str, str]] = set()
@@ -183,11 +213,11 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -
 
 
 def unused_ros_parameters(
-    job: Job, census: Census, nodes: dict[str, Parameters], *, lasted: bool
+    job: Job, census: NameRegistry, nodes: dict[str, Parameters], *, lasted: bool
 ) -> Iterator[str]:
-    """Yield the parameters among ``ros_arguments`` that no node which gets them has declared.
+    """Yield the parameters among ``ros_arguments`` that no receiving node has declared.
 
-    Unconfigured nodes are passed over as ``unused_parameters`` does it.
+    Unconfigured nodes are skipped as in ``unused_parameters``.
     """
     words = job.ros_arguments
     for index, word in enumerate(words[1:], start=1):
@@ -199,7 +229,7 @@ def unused_ros_parameters(
         place = locate(job, ("ros_arguments", index))
         if name is None:
             who = word.partition(":=")[0].rpartition(":")[0]
-            yield f"{place}: no node is called {who!r}{_instead(who, list(census.nodes))}"
+            yield f"{place}: no node is called {who!r}{_suggestion(who, list(census.nodes))}"
             continue
         who_gets = [node for node, found in given.items() if found]
         if any(node not in nodes or name in nodes[node].declared for node in who_gets):
@@ -214,7 +244,7 @@ def unused_ros_parameters(
 def _single(
     job: Job, topics: list[str], services: list[str], nodes: list[str]
 ) -> Iterator[tuple[Loc, str, list[str], str]]:
-    """Yield (place, glob, what it may fit, what that is) of the rules with one name."""
+    """Yield (place, glob, candidates, kind) of the rules with one name."""
     if job.delay is not None:
         for glob in job.delay.topics:
             yield ("delay", "topics", glob), glob, topics, "topic"
@@ -244,8 +274,8 @@ def _single(
 
 
 def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
-    """Yield (place, glob) of what the trace keeps. A glob that begins with ``*``, or stands in a
-    file that several jobs share, is a habit: about whatever there may be, here or elsewhere."""
+    """Yield (place, glob) of what the trace keeps, except globs that begin with ``*`` or stand in a
+    shared file: they are meant for other jobs, too."""
     for key, globs in (("topics", job.record.topics), ("exclude", job.record.exclude)):
         for index, glob in enumerate(globs):
             loc: Loc = ("record", key, index)
@@ -254,7 +284,7 @@ def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
                 yield loc, glob
 
 
-def _links(job: Job, census: Census) -> Iterator[str]:
+def _links(job: Job, census: NameRegistry) -> Iterator[str]:
     for index, link in enumerate(job.delay.links if job.delay is not None else ()):
         place: Loc = ("delay", "links", index)
         if not _fits(link.topic, census.topics):
@@ -266,15 +296,15 @@ def _links(job: Job, census: Census) -> Iterator[str]:
         ):
             there = [node for node, topic in ends if fnmatchcase(topic, link.topic)]
             if not _fits(glob, there):
-                near = did_you_mean(glob, there) or _there(there)
+                near = did_you_mean(glob, there) or _available(there)
                 yield (
                     f"{locate(job, (*place, key))}: no node that fits {glob!r} {what} "
                     f"{link.topic!r}{near}"
                 )
 
 
-def _entities(job: Job, census: Census) -> Iterator[str]:
-    """Yield the rules for entities of nodes, in ``execution`` and ``policy``."""
+def _entities(job: Job, census: NameRegistry) -> Iterator[str]:
+    """Yield the unmatched rules for entities, in ``execution`` and ``policy``."""
     rules: list[tuple[Loc, str, str, str | None]] = []
     if job.execution is not None:
         for index, spec in enumerate(job.execution.entities):
@@ -289,7 +319,7 @@ def _entities(job: Job, census: Census) -> Iterator[str]:
         elif entity is not None:
             names = [name for owner, name in census.entities if fnmatchcase(owner, node)]
             if not _fits(entity, names):
-                near = did_you_mean(entity, names) or _there(names)
+                near = did_you_mean(entity, names) or _available(names)
                 yield (
                     f"{locate(job, (*place, key))}: no topic, service or timer's callback of "
                     f"{node!r} fits {entity!r}{near}"
@@ -297,7 +327,7 @@ def _entities(job: Job, census: Census) -> Iterator[str]:
 
 
 def _hidden(job: Job, nodes: list[str]) -> Iterator[str]:
-    """Yield the clocks and executors whose nodes all have an earlier entry."""
+    """Yield the clocks and executors whose nodes all match an earlier entry."""
     clocks = [(("clocks", i), (spec.node,)) for i, spec in enumerate(job.clocks)]
     executors = [(("executors", i), spec.nodes) for i, spec in enumerate(job.executors or ())]
     for entries in (clocks, executors):
@@ -314,14 +344,14 @@ def _fits(glob: str, names: Iterable[str]) -> bool:
 
 
 def _note(job: Job, place: Loc, what: str, glob: str, names: list[str]) -> str:
-    return f"{locate(job, place)}: no {what} fits {glob!r}{_instead(glob, names)}"
+    return f"{locate(job, place)}: no {what} fits {glob!r}{_suggestion(glob, names)}"
 
 
-def _instead(name: str, names: list[str]) -> str:
-    return did_you_mean(name, names) or _there(names)
+def _suggestion(name: str, names: list[str]) -> str:
+    return did_you_mean(name, names) or _available(names)
 
 
-def _there(names: Iterable[str]) -> str:
+def _available(names: Iterable[str]) -> str:
     usual = (*QUIET_TOPICS, *NODE_SERVICES)
     found = sorted({name for name in names if name and not name.endswith(usual)})
     shown = ", ".join(found[:5]) + (", …" if len(found) > 5 else "")

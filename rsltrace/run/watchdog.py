@@ -1,12 +1,11 @@
-"""A word about a callback that does not come back: which one, and at which line it is.
+"""Warn about a callback that does not return: which one, and at which line it is.
 
-Simulated time stands still while a callback runs, so one that loops forever would hang a run in
-silence. A thread looks every two seconds of real time whether anything has happened.
+Simulated time stands still during a callback, so an endless one would hang a run in silence. A
+thread looks every two seconds of real time whether anything has happened.
 
-It must leave no mark. So it takes no part in the run, touches nothing but numbers as long as all
-is well, and keeps no object of the run alive from one look to the next: where the memory of an
-object lies decides the order of some sets. It counts its looks instead of asking a clock, so a
-process that was stopped, or a machine that slept, raises no alarm.
+It must not influence the run. So it touches nothing but numbers as long as all is well, and keeps
+no object of the run alive between looks: addresses decide the order of some sets. It counts its
+looks instead of reading a clock, so a suspended process or machine causes no alarm.
 """
 
 from __future__ import annotations
@@ -40,21 +39,20 @@ _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", 
 
 
 class Watchdog:
-    """Looks after one run, from a thread of its own between ``start`` and ``stop``."""
+    """Watches one run, from a thread of its own."""
 
     def __init__(self, domain: Domain, thread: int) -> None:
         self._domain = domain
         self._thread = thread
         self._process = os.getpid()
-        self.has_told = False
-        """Whether what is under way now has been told of."""
+        self.has_warned = False
+        """Whether a note on the current callback was printed."""
         self._running = False
         self._stopping = allocate_lock()
         self._ended = allocate_lock()
 
     @contextmanager
     def on_duty(self) -> Iterator[None]:
-        """Have the thread within the ``with`` block."""
         ready = allocate_lock()
         for lock in (self._stopping, self._ended, ready):
             lock.acquire()
@@ -69,7 +67,7 @@ class Watchdog:
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Expect something to happen within the ``with`` block: the run is going on."""
+        """Expect events within the ``with`` block."""
         self._running = True
         try:
             yield
@@ -87,24 +85,24 @@ class Watchdog:
                 still = min(still + 1, _LOOKS_MAX)
             else:
                 seen[0], seen[1] = loop.events, loop.now_ns
-                still, self.has_told = 0, False
+                still, self.has_warned = 0, False
             del loop
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):
                     if self._tell(int(still * LOOK_EVERY_S)):
-                        since_note, self.has_told = 0, True
+                        since_note, self.has_warned = 0, True
         self._ended.release()
 
     def _tell(self, for_s: int) -> bool:
-        """Say where the run is; return whether there was anything to say."""
+        """Report where the run is; return whether there was anything to report."""
         domain = self._domain
         frames = list(_frames(sys._current_frames().get(self._thread)))
         if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
-            return False  # somebody is looking at a standstill that they have made themselves
+            return False  # a debugger stands still on purpose
         if frames and in_import(frames[0], _NO_PACKAGES):
-            return False  # a large library takes its time, on a slow disk above all
-        in_event = any(_is_execute(frame) for frame in frames)
+            return False  # importing a large library takes time
+        in_event = any(frame.f_code is Dispatcher.execute.__code__ for frame in frames)
         handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()
         place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
@@ -112,31 +110,21 @@ class Watchdog:
         where = f", {_place(place)}" if place is not None else ""
         if process := _process_asked(frames):
             who, where = f"{process}, in {who},", ""
-        _say(
-            f"{who} has not come back for {for_s} s of real time; simulated time stands still at "
-            f"{format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
+        tell(
+            f"rsltrace: note: {who} has not returned for {for_s} s of real time; simulated time "
+            f"stands still at {format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
         )
         return True
 
 
-def _say(text: str) -> None:
-    """Print a note as the command does."""
-    tell(f"rsltrace: note: {text}")
-
-
 def _frames(frame: FrameType | None) -> Iterator[FrameType]:
-    """Yield the frames of a stack, innermost first."""
     while frame is not None:
         yield frame
         frame = frame.f_back
 
 
-def _is_execute(frame: FrameType) -> bool:
-    return frame.f_code is Dispatcher.execute.__code__
-
-
 def _process_asked(frames: Iterable[FrameType]) -> str:
-    """Name the process that the run waits for; "" if it waits for none."""
+    """Name the process that the run waits for, or ""."""
     door = sys.modules.get("rsltrace.adapters.processes.process")  # not loaded: there is none
     if door is None:
         return ""

@@ -16,7 +16,7 @@ from rsltrace.simulation.chance.channel import (
     LOST_DROP,
     LOST_OUTAGE,
     Burst,
-    Channel,
+    LinkChannel,
     LinkRule,
     Model,
     NameRule,
@@ -32,11 +32,11 @@ MS = 1_000_000
 S = 1_000_000_000
 
 
-def channel(model: Model, *, reliable: bool = False, **options: Any) -> Channel:
-    return Channel(model, seed=5, name="link", start_ns=0, reliable=reliable, **options)
+def channel(model: Model, *, reliable: bool = False, **options: Any) -> LinkChannel:
+    return LinkChannel(model, seed=5, name="link", start_ns=0, reliable=reliable, **options)
 
 
-def sent(link: Channel, count: int = N, period_ns: int = MS) -> list[int]:
+def sent(link: LinkChannel, count: int = N, period_ns: int = MS) -> list[int]:
     return [link.transmit(i * period_ns) for i in range(count)]
 
 

@@ -86,5 +86,5 @@ def test_what_a_user_types_wrong_goes_on(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_nobody_listens(tmp_path: object) -> None:
-    with pytest.raises(DebugError, match="nobody listens at"):
+    with pytest.raises(DebugError, match="no client listens at"):
         call_under_pdb(callback, (1,), f"{tmp_path}/none")

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped
+from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
 from rsltrace.debug.prompt.shell import Shell, completions
 from rsltrace.debug.prompt.show import (
@@ -90,7 +90,7 @@ def test_help_has_every_command_and_every_command_has_help() -> None:
 
 
 def test_where_a_run_stands() -> None:
-    at = Position(8, 1_500_000_000, EVENT)
+    at = RunPosition(8, 1_500_000_000, EVENT)
     line = (
         "   event 7  1.500000000  /ekf: subscription /scan  -> /odom, "
         r"log WARN too \x1b[2Jfar  [raised]"
@@ -101,14 +101,14 @@ def test_where_a_run_stands() -> None:
         "   caused by event 5, its output 0",
         f"   chain hash {'ab' * 8}",
     ]
-    assert position_line(Position(0, 0)) == "   nothing has run yet  0.000000000"
+    assert position_line(RunPosition(0, 0)) == "   nothing has run yet  0.000000000"
     following = {"kind": "timer", "node": "/ekf", "entity": "Ekf.tick", "entity_kind": "timer"}
-    coming = Position(8, 2_000_000_000, EVENT, is_next=True, next=following)
+    coming = RunPosition(8, 2_000_000_000, EVENT, is_next=True, next=following)
     assert position_line(coming) == "-> event 8  2.000000000  /ekf: timer Ekf.tick"
 
 
 def test_why_a_run_has_stopped() -> None:
-    at = Position(8, 1_500_000_000, EVENT)
+    at = RunPosition(8, 1_500_000_000, EVENT)
     hit = Stopped("breakpoint", at, Breakpoint(2, "watch ekf.x"), "ekf.x: 1 -> 2")
     assert next(stopped_lines(hit)) == "breakpoint 2 (watch ekf.x): ekf.x: 1 -> 2"
     assert len(list(stopped_lines(Stopped("step", at)))) == 1
@@ -168,14 +168,14 @@ def test_source_lines_have_numbers() -> None:
         " 9  def tick(self):",
         "10    1",
     ]
-    assert list(source_lines(None)) == ["there is no Python source for what runs here"]
+    assert list(source_lines(None)) == ["there is no Python source for this event"]
 
 
 class Session:
     """What a shell asks of a session, as far as these tests go."""
 
     breakpoints = (Breakpoint(3, "node /ekf"),)
-    position = Position(8, 1_500_000_000, EVENT)
+    position = RunPosition(8, 1_500_000_000, EVENT)
     step = go_to = None  # nothing gets so far
 
     def inspect(self, what: str) -> object:
@@ -202,7 +202,7 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Shell]:
         ("info nods", "no info 'nods'; did you mean 'nodes'?"),
         ("print", "print what?"),
         ("p/x speed", "there are no formats"),
-        ("who-changed speed", "Say a node and an attribute"),
+        ("who-changed speed", "give a node and an attribute"),
         ("when", "when what?"),
     ],
 )

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from rsltrace import DebugSession
-from rsltrace.debug.branches import Branches
+from rsltrace.debug.branches import EditBranches
 from rsltrace.errors import DebugError, OutputError, RsltraceError
 
 pytestmark = pytest.mark.ros
@@ -383,7 +383,7 @@ def test_requests_that_are_none_are_answered(folder: Path) -> None:
                 session._ask(**{"do": "", **request})  # type: ignore[arg-type]
         with pytest.raises(DebugError, match="no breakpoint 7"):
             session.clear(7)
-        with pytest.raises(DebugError, match="no step"):
+        with pytest.raises(DebugError, match="at least one event"):
             session.step(0)
         with pytest.raises(DebugError, match="no event 100000"):
             session.event(100_000)
@@ -392,7 +392,7 @@ def test_requests_that_are_none_are_answered(folder: Path) -> None:
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
 def test_a_branch_replaces_no_pipe_and_no_device(tmp_path: Path) -> None:
-    branches = Branches(tmp_path / "run.mcap", None, ())
+    branches = EditBranches(tmp_path / "run.mcap", None, ())
     branches.path = tmp_path / "branch.mcap"
     branches.path.write_bytes(b"branch")
     place = tmp_path / "kept.mcap"

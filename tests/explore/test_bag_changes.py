@@ -19,8 +19,11 @@ from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
 from rsltrace.errors import BagError  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
-from rsltrace.run.plans.bag_faults import check_changes  # noqa: E402
-from rsltrace.run.plans.changed_fields import UnfitError, changer  # noqa: E402
+from rsltrace.run.plans.faults import (  # noqa: E402
+    UnfitError,
+    changer,
+    check_changes,
+)
 from rsltrace.search.explore.outcome import Wants  # noqa: E402
 from rsltrace.search.explore.strategies.faults import FaultWalk  # noqa: E402
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult  # noqa: E402

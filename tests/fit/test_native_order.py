@@ -11,7 +11,7 @@ pytest.importorskip("rclpy")
 
 from rsltrace import RunResult, Trace, record
 from rsltrace.job import load_job
-from rsltrace.simulation.loop.recorded import CALLBACKS
+from rsltrace.simulation.loop.recorded_order import CALLBACKS
 from tests.fit.native_like import as_native
 
 pytestmark = pytest.mark.ros

@@ -12,7 +12,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
-from rsltrace.run.recording import RunResult, run
+from rsltrace.run import RunResult, run
 from rsltrace.trace.model.drop import Drop, drops_of
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace

@@ -8,7 +8,7 @@ import pytest
 
 from rsltrace.errors import JobError, RunError
 from rsltrace.job import load_job
-from rsltrace.run.recording import RunResult, run
+from rsltrace.run import RunResult, run
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

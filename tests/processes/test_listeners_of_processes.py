@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.job import load_job
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -11,7 +11,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
-from rsltrace.run.recording import RunResult, run
+from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.job import load_job
-from rsltrace.run.recording import RunResult, run
+from rsltrace.run import RunResult, run
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 

@@ -21,8 +21,7 @@ from rsltrace.adapters.processes.build import find_ros
 from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
-from rsltrace.run import watchdog
-from rsltrace.run.recording import run
+from rsltrace.run import run, watchdog
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 

@@ -12,7 +12,7 @@ import pytest
 
 from rsltrace import Job, NodeSpec, StopSpec, Trace
 from rsltrace.job import load_job
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.trace.model.event import EventKind
 
 pytestmark = pytest.mark.ros

@@ -16,7 +16,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.adapters.processes.build import find_compiler, find_ros
 from rsltrace.job import load_job
-from rsltrace.run.recording import RunResult, run
+from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace

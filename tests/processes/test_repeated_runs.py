@@ -15,7 +15,7 @@ import pytest
 
 from rsltrace.adapters.processes import child
 from rsltrace.job import load_job
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 

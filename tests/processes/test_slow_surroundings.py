@@ -15,7 +15,7 @@ import pytest
 
 from rsltrace.adapters.processes.child import Child, Life, has_memory
 from rsltrace.job import load_job
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.search.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings
 from rsltrace.trace.reader import Trace
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.job import load_job
-from rsltrace.run.recording import run
+from rsltrace.run import run
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import rsltrace
 from rsltrace.job import load_job
-from rsltrace.replay.edits import Defer, Drop, parse_edit
+from rsltrace.replay.edits import DeferEdit, DropEdit, parse_edit
 from rsltrace.run import run
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
@@ -86,9 +86,9 @@ def modelled(edits: list[str]) -> list[int]:
         item = line.pop(0)[2] if line and (is_time or not ready) else ready.popleft()
         for edit in [one for one in pending if one.index is not None and one.index <= now]:
             pending.remove(edit)
-            if isinstance(edit.action, Drop):
+            if isinstance(edit.action, DropEdit):
                 break
-            assert isinstance(edit.action, Defer)
+            assert isinstance(edit.action, DeferEdit)
             others = edit.action.count
             added += 1
             insort(line, (inf if others is None else now + others, added, item))

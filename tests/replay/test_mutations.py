@@ -17,7 +17,7 @@ import pytest
 import rsltrace
 from rsltrace.errors import RsltraceError
 from rsltrace.job import load_job
-from rsltrace.replay.one_node.outputs import outputs_of_node
+from rsltrace.replay.one_node.output_comparison import outputs_of_node
 from rsltrace.run import run
 from rsltrace.trace.reader import Trace
 from tests.replay.conftest import JOB, NODES

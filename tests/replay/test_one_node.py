@@ -134,7 +134,7 @@ def test_a_changed_node_is_seen_at_its_first_changed_output(
     assert (result.first.kind, result.first.name) == ("log", "/rosout")
     assert result.first.change.value == "changed"
     assert result.first.fields[0].path == "msg"
-    assert any("those of the recording" in note for note in result.notes)
+    assert any("its inputs are the recorded ones" in note for note in result.notes)
     first_only = rsltrace.replay(trace, node="watch", trust=True, until_diverged=True)
     assert first_only.changes == (result.first,)
     assert first_only.end_ns <= result.first.time_ns + 100_000_000

@@ -130,13 +130,13 @@ def test_the_command(robot: Path) -> None:
     done = command("run.mcap", "--node", "/filter")
     assert done.exit_code == 0, done.output
     assert done.stderr.startswith("replaying /filter of run.mcap alone (job.yaml in .), with")
-    assert done.stdout.startswith("/filter does the same: ")
+    assert done.stdout.startswith("/filter is unchanged: ")
     assert command("job.yaml", "--node", "/filter", "--bag", "bag", "-q").exit_code == 0
     change(robot, "0.125 * message.data", "0.25 * message.data")
     done = command("run.mcap", "--node", "/filter", "-q")
     assert done.exit_code == 1
     lines = done.stdout.splitlines()
-    assert lines[0].startswith("/filter does something else: message /smooth at 0.1")
+    assert lines[0].startswith("/filter diverges: message /smooth at 0.1")
     assert lines[2].split() == ["time", "(s)", "output", "field", "recorded", "now"]
     assert lines[3].split()[1:3] == ["/smooth", "data"]
     assert lines[-1] == "and 15 more outputs (--all shows them)"
@@ -169,7 +169,7 @@ def test_options_that_do_not_go_together(robot: Path, words: list[str], said: st
 def test_in_a_test(robot: Path) -> None:
     assert assert_node_unchanged("run.mcap", "/filter").compared > 30
     change(robot, "0.75 * self.state", "0.7 * self.state")
-    with pytest.raises(NodeChanged, match=r"(?s)/filter does something else: .*/smooth +data"):
+    with pytest.raises(NodeChanged, match=r"(?s)/filter diverges: .*/smooth +data"):
         assert_node_unchanged("run.mcap", "/filter")
     with pytest.raises(NodeChanged, match="/smooth"):
         assert_node_unchanged(Path("job.yaml"), "/filter", bag=Path("bag"))
@@ -192,7 +192,7 @@ def test_the_fixture(robot: Path) -> None:
         timeout=300,
     )
     assert "1 failed, 1 passed" in done.stdout, done.stdout
-    assert "/filter does something else: message /smooth" in done.stdout
+    assert "/filter diverges: message /smooth" in done.stdout
     assert "Traceback" not in done.stdout
 
 

@@ -100,7 +100,7 @@ def test_code_elsewhere(here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     above = tmp_path / "above"
     above.mkdir()
     monkeypatch.chdir(above)
-    with pytest.raises(ReplayError, match="which is not the present folder"):
+    with pytest.raises(ReplayError, match="which is not the working directory"):
         rsltrace.replay(tmp_path / "run.mcap")
     with prepared(tmp_path / "run.mcap") as plan:
         (code,) = plan.code
@@ -144,7 +144,7 @@ def test_answers_from_outside_may_be_forged(
 def test_what_is_looked_for_and_where(here: Path, tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     shutil.move(tmp_path / "job.yaml", tmp_path / "sub")
-    with pytest.raises(ReplayError, match=r"looked for job\.yaml in the present folder; n"):
+    with pytest.raises(ReplayError, match=r"looked for job\.yaml in the working directory; n"):
         rsltrace.replay(here)
     with pytest.raises(ReplayError, match="no such folder"):
         rsltrace.replay(here, job_folder="nowhere")

@@ -25,7 +25,7 @@ from rsltrace.errors import JobError, RsltraceError  # noqa: E402
 from rsltrace.job import Job, NodeSpec  # noqa: E402
 from rsltrace.job.parts.fault import FaultSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
-from rsltrace.run.plans.changed_fields import UnfitError, changer  # noqa: E402
+from rsltrace.run.plans.faults import UnfitError, changer  # noqa: E402
 from rsltrace.trace.reader import Trace  # noqa: E402
 from tests.tiers import cases  # noqa: E402
 

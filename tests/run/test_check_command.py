@@ -88,8 +88,8 @@ actions:
   /count  test_msgs/action/Fibonacci  /caller  ->  /filter
 
 to look at:
-  service /reset: /filter calls, and nobody serves
-  topic /nothing: /filter subscribes, and nobody publishes
+  service /reset: /filter calls, but it has no server
+  topic /nothing: /filter subscribes, but it has no publisher
   topic /raw: /sensor and /filter do not connect: reliability \
 (/sensor offers best effort, volatile, keep last 5; \
 /filter asks for reliable, volatile, keep last 10)
@@ -116,8 +116,8 @@ class Moves(Node):
     alone = "nodes: [{node: nodes_under_test:Listens}]\nstop: {duration: 1s}\n"
     job_file(alone, code)
     done = command("check", "job.yaml")
-    assert "topic /tf: /listens subscribes, and nobody publishes" in done.stdout
-    assert "topic /tf_static: /listens subscribes, and nobody publishes" in done.stdout
+    assert "topic /tf: /listens subscribes, but it has no publisher" in done.stdout
+    assert "topic /tf_static: /listens subscribes, but it has no publisher" in done.stdout
     job_file(alone.replace("}]", "}, {node: nodes_under_test:Moves}]", 1), code)
     done = command("check", "job.yaml")
     assert (done.returncode, "nothing looks wrong" in done.stdout) == (0, True)
@@ -158,15 +158,15 @@ def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., P
         (
             "[{node: /talker, source: topic}]",
             (
-                "topic /clock: /talker goes by it (clocks: source: topic), and nobody publishes: "
+                "topic /clock: /talker uses it (clocks: source: topic), but it has no publisher: "
                 "ROS time stands still at 0",
             ),
         ),
         (
             "{source: topic}",
             (
-                "topic /clock: /talker and /listener go by it (clocks: source: topic), and nobody "
-                "publishes: ROS time stands still at 0",
+                "topic /clock: /talker and /listener use it (clocks: source: topic), but it has no "
+                "publisher: ROS time stands still at 0",
             ),
         ),
     ],
@@ -205,8 +205,8 @@ def test_a_topic_that_is_played_and_published(command: Any, job_file: Callable[.
     assert done.returncode == 1
     assert done.stdout.endswith(
         "to look at:\n"
-        "  topic /numbers: a bag plays it, and /talker publishes it, too; "
-        "unless both are meant: bags: [{path: ..., exclude: [/numbers]}]\n"
+        "  topic /numbers: both a bag and /talker publish it; "
+        "if that is not intended: bags: [{path: ..., exclude: [/numbers]}]\n"
     )
     job_file(FINE + "bags: [{path: numbers, exclude: [/numbers]}]\n")
     assert command("check", "job.yaml").returncode == 0
@@ -312,9 +312,9 @@ class Picky(Node):
 def test_an_arrow_back_has_one_head_and_a_way_of_its_own() -> None:
     pytest.importorskip("fast_sugiyama")
     from rsltrace.cli.output.graph_svg import graph_svg
-    from rsltrace.simulation.middleware.overview import End, Link, NodeView, Overview
+    from rsltrace.simulation.middleware.overview import End, GraphNode, Link, Overview
 
-    nodes = tuple(NodeView(name, "", ()) for name in ("/plan", "/drive"))
+    nodes = tuple(GraphNode(name, "", ()) for name in ("/plan", "/drive"))
     plan, drive = End("/plan"), End("/drive")
     links = (
         Link("topic", "/cmd", "", (plan,), (drive,)),

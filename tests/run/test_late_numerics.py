@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-import rsltrace.run.numerical_libraries as numerical_libraries
+from rsltrace.run import provenance
 from rsltrace.trace.reader import Trace
 
 _MAIN = """
@@ -51,7 +51,7 @@ def test_libraries_that_a_run_imports_are_named(
     (tmp_path / "m.py").write_text(code)
     (tmp_path / "job.yaml").write_text(_JOB.format(entry=entry))
     for name in ("SkylakeX", "Haswell"):
-        monkeypatch.setattr(numerical_libraries, "_kernels", lambda name=name: f"openblas {name}")
+        monkeypatch.setattr(provenance, "_kernels", lambda name=name: f"openblas {name}")
         assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
         (tmp_path / "m.py").write_text(code.replace("done", "done otherwise"))
         for module in ("late_numbers", "late_words", "late_tests", "m"):

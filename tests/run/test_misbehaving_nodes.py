@@ -198,7 +198,7 @@ def test_force_keeps_the_old_trace_if(
     assert whole(out, digest)
     assert beside.exists() == (complete is not None)
     if complete is not None:
-        assert "run.mcap stays as it is until this run is over; until then it goes to " in (
+        assert "run.mcap is replaced when this run is over; until then the trace is in " in (
             done.stderr
         )
         with Trace.open(beside) as trace:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import JobError
-from rsltrace.simulation.loop.policy import Choices, decoded
+from rsltrace.simulation.loop.policy import PolicyChoices, decoded
 from rsltrace.trace.reader import Trace
 
 MIXED = """
@@ -125,7 +125,7 @@ def test_mains_threads_and_calls_that_block_are_followed_exactly(
 
 
 def test_choices_as_a_trace_holds_them() -> None:
-    choices = Choices()
+    choices = PolicyChoices()
     assert not choices
     numbers = [0, 1, 254, 255, 256, 70_000, 0]
     for number in numbers:

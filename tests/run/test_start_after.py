@@ -203,8 +203,8 @@ def test_check_names_what_will_never_come(job_file: Callable[..., Path]) -> None
     assert {node.name for node in checked.overview.nodes} == {"/server", "/one", "/two", "/last"}
     said = [problem.split(": ", 1) for problem in checked.problems]
     assert [(place.rsplit(":", 2)[1], text) for place, text in said] == [
-        ("3", "nodes_under_test:one never starts: nobody publishes /maps; did you mean '/map'?"),
-        ("4", "nodes_under_test:two never starts: nobody serves /went"),
+        ("3", "nodes_under_test:one never starts: /maps has no publisher; did you mean '/map'?"),
+        ("4", "nodes_under_test:two never starts: /went has no server"),
         ("4", "nodes_under_test:two never starts: no entry makes a node /sever; did you mean "
          "'/server'?"),
         ("5", "nodes_under_test:last never starts: that is 11 s after the start, and the run ends "

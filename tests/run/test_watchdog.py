@@ -1,4 +1,4 @@
-"""A callback that does not come back is named; whoever stands still on purpose is left alone."""
+"""A callback that does not return is named; a debugger that stands still is left alone."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_a_busy_loop_is_named_with_its_line(
     said = capsys.readouterr().err
     assert said.count("rsltrace: note:") == 1, said
     assert "/busy: timer" in said
-    assert "Busy.tick has not come back for 10 s of real time" in said
+    assert "Busy.tick has not returned for 10 s of real time" in said
     assert "stands still at 2.000000000 s" in said
     lines = Path(__file__).read_text().splitlines()
     first = next(n for n, line in enumerate(lines, 1) if "def __call__" in line)
@@ -160,7 +160,7 @@ def test_there_is_at_most_one_note_in_a_minute(
 ) -> None:
     record(lambda count: busy(68 if count == 1 else 6), tmp_path / "a.mcap")
     said = capsys.readouterr().err
-    assert re.findall(r"back for (\d+) s .* at (\d+)", said) == [
+    assert re.findall(r"returned for (\d+) s .* at (\d+)", said) == [
         ("10", "1"),
         ("70", "1"),
         ("130", "1"),

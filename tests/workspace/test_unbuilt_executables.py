@@ -327,7 +327,7 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
     )
     with unbuilt_packages([tmp_path]):
         for target, said in [
-            ("driver/part", "driver/part is a program that nobody has built (CMakeLists.txt of d"),
+            ("driver/part", "driver/part is a program that is not built (CMakeLists.txt of d"),
             (
                 "driver/driver_nod",
                 "did you mean 'driver_node'? It has run.py; once it is built",

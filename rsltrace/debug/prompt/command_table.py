@@ -15,11 +15,9 @@ from typing import Any
 
 from rsltrace.debug.checkpoints import Stopped
 from rsltrace.debug.prompt import show
-from rsltrace.debug.prompt.commands import Commands, Prompt
+from rsltrace.debug.prompt.commands import PromptCommands, PromptContext
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.terminal import say
-
-# The terminal's side of ``pdb`` in a callback: what it writes is shown, lines are read for it.
 
 _LOOK_S = 0.1
 
@@ -92,15 +90,15 @@ def _line(prompt: str, read: Callable[[str], str | None]) -> str | None:
             say()
 
 
-COMMANDS = Commands()
+COMMANDS = PromptCommands()
 _add = COMMANDS.add
 
 _CHANGED = re.compile(r"(?P<node>[\w/~]+)(?:\.|\s+)(?P<attribute>\S.*)")
 
 
-def _count(text: str, otherwise: int = 1) -> int:
+def _count(text: str, default: int = 1) -> int:
     if not text:
-        return otherwise
+        return default
     if not (text.isascii() and text.isdecimal()):
         raise DebugError(f"{text!r} is no whole number")
     return int(text)
@@ -116,25 +114,25 @@ def _place(text: str) -> int | str:
 
 
 @_add("step", "s", usage="[N]", topic="running", repeats=True)
-def _step(shell: Prompt, rest: str) -> None:
+def _step(shell: PromptContext, rest: str) -> None:
     """Run one event, or N."""
     shell.stopped(shell.session.step(_count(rest)))
 
 
 @_add("next", "n", usage="[NODE]", topic="running", repeats=True)
-def _next(shell: Prompt, rest: str) -> None:
+def _next(shell: PromptContext, rest: str) -> None:
     """Run to the end of the next event of this node, or of NODE."""
     shell.stopped(shell.session.next(rest or None))
 
 
 @_add("finish", "fin", topic="running", repeats=True)
-def _finish(shell: Prompt, rest: str) -> None:
+def _finish(shell: PromptContext, rest: str) -> None:
     """Run to the end of this time step."""
     shell.stopped(shell.session.finish())
 
 
 @_add("continue", "c", "cont", topic="running", repeats=True)
-def _continue(shell: Prompt, rest: str) -> None:
+def _continue(shell: PromptContext, rest: str) -> None:
     """Run to the next breakpoint, or to the end.
 
     Ctrl-C stops the run after its present event.
@@ -143,7 +141,7 @@ def _continue(shell: Prompt, rest: str) -> None:
 
 
 @_add("run-to", "until", "u", usage="PLACE", topic="running")
-def _run_to(shell: Prompt, rest: str) -> None:
+def _run_to(shell: PromptContext, rest: str) -> None:
     """Run to an event (812) or a time of the run (2.5s), or to a breakpoint before it.
 
     At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to then.
@@ -155,25 +153,25 @@ def _run_to(shell: Prompt, rest: str) -> None:
 
 
 @_add("reverse-step", "rs", usage="[N]", topic="going back", repeats=True)
-def _reverse_step(shell: Prompt, rest: str) -> None:
+def _reverse_step(shell: PromptContext, rest: str) -> None:
     """Go back one event, or N."""
     shell.stopped(shell.session.reverse_step(_count(rest)))
 
 
 @_add("reverse-next", "rn", usage="[NODE]", topic="going back", repeats=True)
-def _reverse_next(shell: Prompt, rest: str) -> None:
+def _reverse_next(shell: PromptContext, rest: str) -> None:
     """Go back to the end of the event before, of this node or of NODE."""
     shell.stopped(shell.session.reverse_next(rest or None))
 
 
 @_add("reverse-continue", "rc", topic="going back", repeats=True)
-def _reverse_continue(shell: Prompt, rest: str) -> None:
-    """Go back to where a breakpoint stops last before here, or to the beginning."""
+def _reverse_continue(shell: PromptContext, rest: str) -> None:
+    """Go back to the previous place where a breakpoint stops, or to the beginning."""
     shell.stopped(shell.session.reverse_go_on())
 
 
 @_add("goto", "g", usage="PLACE", topic="going back")
-def _goto(shell: Prompt, rest: str) -> None:
+def _goto(shell: PromptContext, rest: str) -> None:
     """Go to an event (812) or a time of the run (2.5s), ahead or back; no breakpoint stops."""
     shell.stopped(shell.session.go_to(_place(rest)))
 
@@ -182,22 +180,22 @@ def _goto(shell: Prompt, rest: str) -> None:
 
 
 @_add("break", "b", usage="CONDITION", topic="breakpoints")
-def _break(shell: Prompt, rest: str) -> None:
+def _break(shell: PromptContext, rest: str) -> None:
     """Set a breakpoint.
 
     812                           before event 812
     t=2.5s                        before the first event at that time of the run or later
     node /ekf, entity /scan       before an event of a node, of an entity (by name or #number)
-    topic /odom                   before who receives a message, after who sends one
+    topic /odom                   before a callback receives a message, after one sends it
     /odom: pose.pose.position.x > 3    the same, of messages of which that is true
-    output 3f2a                   after an event with an output of such a hash
+    output 3f2a                   after an event with an output of this hash
     exception [TYPE]              after an event that raised
     log [LEVEL] [/TEXT/]          after a log record of that level or worse
     finding [KIND]                after an event in which the guard found something
     watch ekf.P[0][0]             after an event that changes a value
     when node("ekf").P[0][0] > 1  after the event that makes it true
-    Behind all but the last two, 'if EXPRESSION' has to be true as well. Expressions are not Python
-    but the language of checks: fields, attributes of nodes, arithmetic, fixed functions.
+    All but the last two can end with 'if EXPRESSION'. Expressions are those of checks, not Python:
+    fields, attributes of nodes, arithmetic, fixed functions.
     """
     if not rest:
         shell.show(show.breakpoint_lines(shell.session.breakpoints))
@@ -207,13 +205,13 @@ def _break(shell: Prompt, rest: str) -> None:
 
 
 @_add("watch", usage="EXPRESSION", topic="breakpoints")
-def _watch(shell: Prompt, rest: str) -> None:
+def _watch(shell: PromptContext, rest: str) -> None:
     """Stop after events that change a value: ekf.P[0][0], node("ekf").P."""
     _break(shell, f"watch {rest}")
 
 
 @_add("delete", "d", usage="[NUMBER]...", topic="breakpoints")
-def _delete(shell: Prompt, rest: str) -> None:
+def _delete(shell: PromptContext, rest: str) -> None:
     """Remove breakpoints, or all."""
     numbers = [_count(word) for word in rest.split()]
     for number in numbers or [one.number for one in shell.session.breakpoints]:
@@ -223,21 +221,21 @@ def _delete(shell: Prompt, rest: str) -> None:
 # -- looking ---------------------------------------------------------------------------------------
 
 INFO = {
-    "breakpoints": "what stops the run",
+    "breakpoints": "the breakpoints",
     "nodes": "the nodes and their classes",
     "node": "[NODE]: the attributes and parameters of a node",
     "queues": "messages and requests that wait",
     "timers": "timers, and when they are due",
-    "stacks": "who waits for what, inside of a callback",
+    "stacks": "callbacks that wait, and for what",
     "graph": "topics, services and actions with their ends",
-    "message": "what the callback gets",
-    "checkpoints": "where copies of the run sleep, to go back to",
+    "message": "the input of the callback",
+    "checkpoints": "copies of the run to go back to",
 }
 
 
 @_add("info", "i", usage="[WHAT]", topic="looking")
-def _info(shell: Prompt, rest: str) -> None:
-    """Show breakpoints, nodes, queues, timers, stacks, graph, …; alone, what there is."""
+def _info(shell: PromptContext, rest: str) -> None:
+    """Show breakpoints, nodes, queues, timers, stacks, graph, …; without WHAT, list these."""
     word, _, more = rest.partition(" ")
     if not word:
         shell.show(f"info {name:<12} {text}" for name, text in INFO.items())
@@ -259,23 +257,23 @@ def _info(shell: Prompt, rest: str) -> None:
         shell.show(show.graph_lines(session.inspect(what)))
     else:
         value = session.inspect(what)
-        nothing = ["what runs here has received no message"]
+        nothing = ["this event has received no message"]
         shell.show(nothing if value is None else show.value_lines(value))
 
 
-def _node(shell: Prompt) -> str:
+def _node(shell: PromptContext) -> str:
     name = shell.node_here()
     if name is None:
-        raise DebugError("the event here is no node's: say which node")
+        raise DebugError("the current event belongs to no node: give a node")
     return name
 
 
 @_add("print", "p", usage="EXPRESSION", topic="looking")
-def _print(shell: Prompt, rest: str) -> None:
+def _print(shell: PromptContext, rest: str) -> None:
     """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now.
 
-    This is Python, methods of nodes included, in a copy of the run: whatever it does changes
-    nothing here. Conditions (break, watch, when) have a language of their own, which only looks.
+    This is Python, methods of nodes included, in a copy of the run, so it changes nothing here.
+    Conditions (break, watch, when) use the language of checks.
     """
     if not rest:
         raise DebugError('print what? P[0][0] of this node, node("ekf").P, msg, now, event')
@@ -286,23 +284,23 @@ def _print(shell: Prompt, rest: str) -> None:
 
 
 @_add("list", "l", topic="looking")
-def _list(shell: Prompt, rest: str) -> None:
+def _list(shell: PromptContext, rest: str) -> None:
     """Show the source lines of the callback."""
     shell.show(show.source_lines(shell.session.inspect("source")))
 
 
 @_add("where", "w", "bt", topic="looking")
-def _where(shell: Prompt, rest: str) -> None:
+def _where(shell: PromptContext, rest: str) -> None:
     """Show the event here, its cause and its hashes."""
     shell.show(show.where_lines(shell.session.position))
 
 
 @_add("pdb", topic="looking")
-def _pdb(shell: Prompt, rest: str) -> None:
+def _pdb(shell: PromptContext, rest: str) -> None:
     """Call the next callback under pdb, from its first line on.
 
-    It is called in a copy of the run: what it does, or you do there, changes nothing here. "c" or
-    "q" of pdb comes back to this prompt, before the callback; "step" runs it.
+    It runs in a copy, so nothing changes here. "c" or "q" of pdb returns to this prompt, before
+    the callback; "step" runs it.
     """
     raised = talk(shell.session.pdb, shell.read)
     if raised:
@@ -311,12 +309,12 @@ def _pdb(shell: Prompt, rest: str) -> None:
 
 
 @_add("debugpy", usage="[PORT]", topic="looking")
-def _debugpy(shell: Prompt, rest: str) -> None:
-    """Run on in a copy of the run, for an editor (VS Code) to stop in: port 5678.
+def _debugpy(shell: PromptContext, rest: str) -> None:
+    """Continue in a copy of the run under debugpy, for an editor (VS Code): port 5678.
 
-    The editor stops in the first line of the next callback, and where it has breakpoints; simulated
-    time stands still meanwhile. When it disconnects, or with Ctrl-C, this prompt is back, and the
-    run stands where it stood.
+    The editor stops in the first line of the next callback, and at its breakpoints; simulated time
+    stands still meanwhile. When it disconnects, or with Ctrl-C, this prompt returns; the run has
+    not moved.
     """
     shell.show([shell.session.debugpy(_count(rest, 5678))])
     shell.show([show.position_line(shell.session.position)])
@@ -326,17 +324,17 @@ def _debugpy(shell: Prompt, rest: str) -> None:
 
 
 @_add("who-changed", "wc", usage="NODE ATTRIBUTE", topic="searching")
-def _who_changed(shell: Prompt, rest: str) -> None:
+def _who_changed(shell: PromptContext, rest: str) -> None:
     """Find the last event up to here that changed an attribute: who-changed ekf P[0][0]."""
     found = _CHANGED.fullmatch(rest)
     if found is None:
-        raise DebugError("who changed what? Say a node and an attribute: who-changed ekf P[0][0]")
+        raise DebugError("give a node and an attribute: who-changed ekf P[0][0]")
     shell.show(show.found_lines(shell.session.last_changed(found["node"], found["attribute"])))
 
 
 @_add("who-sent", "ws", usage="[EVENT]", topic="searching")
-def _who_sent(shell: Prompt, rest: str) -> None:
-    """Find the event that sent what this one (or EVENT) has received."""
+def _who_sent(shell: PromptContext, rest: str) -> None:
+    """Find the event that sent the input of this one, or of EVENT."""
     position = shell.session.position
     index = _count(rest, position.index if position.is_next else position.index - 1)
     if index < 0:
@@ -345,7 +343,7 @@ def _who_sent(shell: Prompt, rest: str) -> None:
 
 
 @_add("when", usage="CONDITION", topic="searching")
-def _when(shell: Prompt, rest: str) -> None:
+def _when(shell: PromptContext, rest: str) -> None:
     """Find the first event up to here at which a condition (see break) is true.
 
     An expression alone is one, too: when ekf.P[0][0] > 1.
@@ -355,7 +353,7 @@ def _when(shell: Prompt, rest: str) -> None:
     shell.show(show.found_lines(shell.session.first_true(_as_condition(rest, shell))))
 
 
-def _as_condition(text: str, shell: Prompt) -> str:
+def _as_condition(text: str, shell: PromptContext) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
     from rsltrace.conditions.expressions import parse_expression
     from rsltrace.conditions.text import parse_condition
@@ -375,14 +373,14 @@ def _as_condition(text: str, shell: Prompt) -> str:
 
 
 @_add("edit", usage="EDIT", topic="what if")
-def _edit(shell: Prompt, rest: str) -> None:
-    """Change something from here on, and go on in the branch that comes of it.
+def _edit(shell: PromptContext, rest: str) -> None:
+    """Change something here, and continue in a branch of the run.
 
-    message.data = 3.0                what the event that follows receives
+    message.data = 3.0                the message that the next event receives
     topic("/odom").x += 1             the next message on a topic
     node("/ekf").P[0][0] = 1e-3       an attribute
     parameters("/ekf")["rate"] = 20   a parameter
-    drop()  delay("5ms")  defer()     the event that follows: not, later, after the others
+    drop()  delay("5ms")  defer()     the next event: leave out, delay, run after the others
     812: drop()                       the same at event 812, or at a time (2.5s: ...)
     """
     position = shell.session.edit(rest)
@@ -390,10 +388,10 @@ def _edit(shell: Prompt, rest: str) -> None:
 
 
 @_add("keep", usage="FILE", topic="what if")
-def _keep(shell: Prompt, rest: str) -> None:
-    """Write the trace of the branch in which the session is since an edit."""
+def _keep(shell: PromptContext, rest: str) -> None:
+    """Write the trace of the current branch to FILE."""
     if not rest:
-        raise DebugError("where to? keep FILE, as branch.mcap")
+        raise DebugError("give a file: keep branch.mcap")
     shell.show([f"wrote {shell.session.branch(rest)}"])
 
 
@@ -401,12 +399,12 @@ def _keep(shell: Prompt, rest: str) -> None:
 
 
 @_add("help", "h", "?", usage="[COMMAND]", topic="the rest")
-def _help(shell: Prompt, rest: str) -> None:
-    """Show this, or more of a command."""
+def _help(shell: PromptContext, rest: str) -> None:
+    """Show this list, or the help of COMMAND."""
     shell.show(COMMANDS.help(rest))
 
 
 @_add("quit", "q", "exit", topic="the rest")
-def _quit(shell: Prompt, rest: str) -> None:
+def _quit(shell: PromptContext, rest: str) -> None:
     """End the session."""
     shell.is_over = True

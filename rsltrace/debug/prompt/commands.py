@@ -1,4 +1,4 @@
-"""What can be said at the prompt: names, abbreviations, help."""
+"""The command registry of the prompt: names, abbreviations, help."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rsltrace.debug.client import DebugSession
 
 
-class Prompt(Protocol):
+class PromptContext(Protocol):
     """What commands need of the prompt. A command that ends the session sets ``is_over``."""
 
     session: DebugSession
@@ -28,7 +28,7 @@ class Prompt(Protocol):
         """Print where and why the run has stopped."""
 
     def read(self, prompt: str) -> str | None:
-        """Return the next line, for somebody else; None if there are no more."""
+        """Return the next line for pdb; None at the end."""
 
     def node_here(self) -> str | None:
         """Return the node whose event is about to run, or has just ended."""
@@ -42,7 +42,7 @@ Run = Callable[[Any, str], object]
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class PromptCommand:
     """A command: its names (the first is its own), what follows them, and what it does.
 
     An empty line ``repeats`` it. ``topic`` is the group that help lists it in.
@@ -57,24 +57,21 @@ class Command:
 
     @property
     def name(self) -> str:
-        """Its own name."""
         return self.names[0]
 
 
-class Commands:
-    """The commands there are."""
-
+class PromptCommands:
     def __init__(self) -> None:
-        self.all: list[Command] = []
-        self._by_name: dict[str, Command] = {}
+        self.all: list[PromptCommand] = []
+        self._by_name: dict[str, PromptCommand] = {}
 
     def add(
         self, *names: str, topic: str, usage: str = "", repeats: bool = False
     ) -> Callable[[Run], Run]:
-        """Make a function a command, whose help is the function's docstring."""
+        """Make a function a command; its docstring is the help."""
 
         def added(run: Run) -> Run:
-            command = Command(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
+            command = PromptCommand(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
             assert not self._by_name.keys() & names, "one name, one command"
             self.all.append(command)
             self._by_name.update(dict.fromkeys(names, command))
@@ -82,10 +79,10 @@ class Commands:
 
         return added
 
-    def find(self, word: str) -> Command:
-        """Return the command that is meant: by a name, or by the beginning of one.
+    def find(self, word: str) -> PromptCommand:
+        """Return the command of a name, or of the unique beginning of one.
 
-        :raises DebugError: it could be several, or none.
+        :raises DebugError: none or several match.
         """
         found = self._by_name.get(word)
         if found is not None:
@@ -118,4 +115,4 @@ class Commands:
                     short = next((n for n in command.names[1:] if len(n) < 4), "")
                     first = command.help.splitlines()[0]
                     yield f"  {short:<4} {said:<{width}}  {first}"
-        yield "The beginning of a name will do; 'help COMMAND' says more. An empty line steps on."
+        yield "Commands can be abbreviated; 'help COMMAND' says more. An empty line repeats a step."

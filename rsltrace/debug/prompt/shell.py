@@ -1,6 +1,6 @@
-"""The prompt: reads commands, has the session carry them out, prints what came of it.
+"""The prompt: reads commands, sends them to the session, and prints the answers.
 
-It knows nothing of the run but what the session says, as any client of it.
+It uses nothing but the session's public API.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.conditions.names import Names, short_name
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
-from rsltrace.debug.prompt.commands import Prompt
+from rsltrace.debug.prompt.commands import PromptContext
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import Source
@@ -24,14 +24,12 @@ if TYPE_CHECKING:
     from rsltrace.debug.checkpoints import Stopped
     from rsltrace.debug.client import DebugSession
 
-# Lines of a debugging session: typed at a terminal, or out of a pipe or file.
-
 Completer = Callable[[str], Sequence[str]]
 """By a line up to where the cursor is: what its last word could become."""
 
 
 class LineReader:
-    """Gives ``first`` lines, then those of stdin. ``is_script``: nobody sits at a terminal."""
+    """Reads ``first``, then stdin. ``is_script``: stdin is not a terminal."""
 
     def __init__(self, first: Sequence[str], complete: Completer) -> None:
         self._first = list(first)
@@ -41,7 +39,6 @@ class LineReader:
 
     @property
     def from_terminal(self) -> bool:
-        """Whether the last line was typed."""
         return self._from_terminal
 
     def read(self, prompt: str) -> str | None:
@@ -70,7 +67,7 @@ class LineReader:
 
 @contextmanager
 def _readline(complete: Completer) -> Iterator[None]:
-    """Let lines be edited, found again and completed, where Python has readline."""
+    """Enable editing, history and completion, where Python has readline."""
     try:
         import readline
     except ImportError:
@@ -95,13 +92,11 @@ def _readline(complete: Completer) -> Iterator[None]:
         readline.set_completer_delims(before[1])
 
 
-# What a line at the prompt could become.
-
 _HEADS = "node topic entity output exception log finding watch when t=".split()
 
 
-def completions(text: str, shell: Prompt) -> list[str]:
-    """Return what the last word of ``text`` could become."""
+def completions(text: str, shell: PromptContext) -> list[str]:
+    """Return the completions of the last word of ``text``."""
     words = text.lstrip().split(" ")
     last = words[-1]
     if len(words) == 1:
@@ -114,7 +109,7 @@ def completions(text: str, shell: Prompt) -> list[str]:
     return _begin(_arguments(name, words[1:-1], shell), last)
 
 
-def _arguments(command: str, before: list[str], shell: Prompt) -> Iterable[str]:
+def _arguments(command: str, before: list[str], shell: PromptContext) -> Iterable[str]:
     names = shell.names()
     if command in ("break", "when") and not before:
         messages = (f"{topic}:" for topic in names.topics)
@@ -145,7 +140,7 @@ def _arguments(command: str, before: list[str], shell: Prompt) -> Iterable[str]:
     return ()
 
 
-def _nodes_as_names(shell: Prompt) -> tuple[str, ...]:
+def _nodes_as_names(shell: PromptContext) -> tuple[str, ...]:
     return tuple(f"{short_name(node)}." for node in shell.names().nodes)
 
 
@@ -158,15 +153,12 @@ EXIT_DIVERGED = 1
 
 
 class Shell:
-    """A conversation about one session.
-
-    ``diverged`` says whether the run has once done something else than its trace says.
-    """
+    """The prompt of one session. ``diverged``: the run once differed from its trace."""
 
     def __init__(
         self, session: DebugSession, first: Sequence[str] = (), names: Names | None = None
     ) -> None:
-        """``first`` are commands before those of stdin, ``names`` those of the trace, if any."""
+        """``first`` are commands to run before those of stdin; ``names`` are the trace's."""
         self.session = session
         self.diverged = False
         self.is_over = False
@@ -175,10 +167,8 @@ class Shell:
         self._last = ""
 
     def run(self) -> int:
-        """Carry out commands until there are no more; return the exit status.
-
-        In a script, a command that cannot be carried out ends it: the next ones count on it.
-        """
+        """Run commands until the end of input; return the exit status. A script ends at the first
+        command that fails."""
         self.show([show.position_line(self.session.position)])
         while not self.is_over:
             try:
@@ -197,9 +187,9 @@ class Shell:
         return EXIT_DIVERGED if self.diverged else 0
 
     def carry_out(self, line: str) -> None:
-        """Do what a line says.
+        """Run one command line.
 
-        :raises RsltraceError: it cannot be done.
+        :raises RsltraceError: it failed.
         """
         text = line.strip()
         if not text and self._lines.from_terminal:
@@ -209,38 +199,31 @@ class Shell:
             return
         word, _, rest = text.partition(" ")
         if "/" in word and not word.startswith("/"):  # print/x of gdb
-            raise DebugError(f"{word!r}: there are no formats; say it in Python: hex(…)")
+            raise DebugError(f"{word!r}: there are no formats; use Python: hex(…)")
         command = COMMANDS.find(word)
         with self._interruptible():
             command.run(self, rest.strip())
         if command.repeats:
             self._last = text
 
-    # -- for commands ------------------------------------------------------------------------------
-
     def show(self, lines: Iterable[str]) -> None:
-        """Print lines."""
         for line in lines:
             say(line)
 
     def stopped(self, stopped: Stopped) -> None:
-        """Print where and why the run has stopped."""
         self.diverged = self.diverged or stopped.reason == "diverged"
         self.show(show.stopped_lines(stopped))
 
     def read(self, prompt: str) -> str | None:
-        """Return the next line, for somebody else; None if there are no more."""
         return self._lines.read(prompt)
 
     def node_here(self) -> str | None:
-        """Return the node whose event is about to run, or has just ended."""
         position = self.session.position
         event = position.next if position.is_next else position.event
         name = (event or {}).get("node")
         return str(name) if name else None
 
     def names(self) -> Names:
-        """Return the names there are, as far as they are known."""
         if self._names is not None:
             return self._names
         graph: dict[str, Any] = self.session.inspect("graph")
@@ -249,11 +232,9 @@ class Shell:
         topics = tuple(link["name"] for link in links if link["kind"] in ("topic", "service"))
         return Names(nodes=nodes, topics=topics, entities=(*nodes, *topics))
 
-    # -- Ctrl-C ------------------------------------------------------------------------------------
-
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Let Ctrl-C stop the run under way, after its present event, and not the session."""
+        """Let Ctrl-C pause the run, after its current event, instead of ending the session."""
 
         def interrupt(number: int, frame: object) -> None:
             self.session.pause()

@@ -1,4 +1,4 @@
-"""What the prompt prints: where the run stands, what is in it, and source lines."""
+"""Format what the prompt prints: positions, values and source lines."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rsltrace.trace.model.texts import format_duration, format_seconds, printabl
 from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:
-    from rsltrace.debug.checkpoints import Breakpoint, Position, Stopped
+    from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped
 
 _CELL_MAX = 60
 _DID_MAX = 160
@@ -25,7 +25,6 @@ _WHY = {
 
 
 def stopped_lines(stopped: Stopped) -> Iterator[str]:
-    """Yield why and where a run has stopped."""
     if stopped.breakpoint is not None:
         number, text = stopped.breakpoint.number, stopped.breakpoint.text
         more = f": {stopped.text}" if stopped.text and stopped.text != text else ""
@@ -38,8 +37,8 @@ def stopped_lines(stopped: Stopped) -> Iterator[str]:
     yield position_line(stopped.position)
 
 
-def position_line(position: Position) -> str:
-    """Return the event that has ended last, or (with an arrow) the one that is about to run."""
+def position_line(position: RunPosition) -> str:
+    """Return the last event, or (with an arrow) the one that is about to run."""
     if position.is_next:
         what = _event(position.next or {})
         return printable(f"-> event {position.index}  {position.seconds}  {what}")
@@ -48,8 +47,7 @@ def position_line(position: Position) -> str:
     return _ended(position.event)
 
 
-def where_lines(position: Position) -> Iterator[str]:
-    """Yield all that is known of where the run stands."""
+def where_lines(position: RunPosition) -> Iterator[str]:
     yield position_line(position)
     event = position.event
     if event is None:
@@ -64,15 +62,14 @@ def where_lines(position: Position) -> Iterator[str]:
     yield printable(f"   {', '.join(known)}")
 
 
-def found_lines(position: Position) -> Iterator[str]:
-    """Yield an event that was looked for, and how to get there."""
+def found_lines(position: RunPosition) -> Iterator[str]:
+    """Yield an event that was searched for, and how to go there."""
     yield position_line(position)
     before = f"goto {position.index - 1} before it" if position.index else "step runs it"
     yield f"   goto {position.index} stands after it, {before}"
 
 
 def _ended(event: Mapping[str, Any]) -> str:
-    """Return an event that has ended, with what it did."""
     did = list(event.get("did", ()))
     outputs = f"  -> {shortened(', '.join(map(str, did)), _DID_MAX)}" if did else ""
     flags = "".join(f"  [{flag}]" for flag in flag_names(int(event.get("flags", 0))))
@@ -81,7 +78,7 @@ def _ended(event: Mapping[str, Any]) -> str:
 
 
 def _event(event: Mapping[str, Any]) -> str:
-    """Return whose event it is and what runs: ``/ekf: subscription /scan``."""
+    """Name the node and the callback: ``/ekf: subscription /scan``."""
     kind = str(event.get("kind", "")).replace("_", " ")
     entity = str(event.get("entity") or "")
     of = str(event.get("entity_kind") or "")
@@ -91,18 +88,13 @@ def _event(event: Mapping[str, Any]) -> str:
 
 
 def breakpoint_lines(breakpoints: Sequence[Breakpoint]) -> Iterator[str]:
-    """Yield the breakpoints."""
     if not breakpoints:
         yield "no breakpoints"
     for one in breakpoints:
         yield printable(f"{one.number:>3}  {one.text}")
 
 
-# -- what is in a run ------------------------------------------------------------------------------
-
-
 def value_lines(value: Any) -> Iterator[str]:
-    """Yield an answer of a session: a table of a list of objects, lines of an object."""
     if isinstance(value, Mapping):
         yield from _mapping(value, "")
     elif isinstance(value, (list, tuple)):
@@ -112,7 +104,7 @@ def value_lines(value: Any) -> Iterator[str]:
 
 
 def queue_lines(queues: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield the queues in which something waits, and how many are empty."""
+    """Yield the queues that hold something, and how many are empty."""
     full = [one for one in queues if one.get("waiting")]
     if full:
         yield from _table(full)
@@ -122,7 +114,6 @@ def queue_lines(queues: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def graph_lines(graph: Mapping[str, Any]) -> Iterator[str]:
-    """Yield nodes, who talks to whom, and what is wrong with that."""
     for node in graph.get("nodes", ()):
         timers = "".join(f", {name} every {format_duration(ns)}" for name, ns in node["timers"])
         yield printable(f"node {node['name']}  {node['type']}{timers}")
@@ -134,7 +125,6 @@ def graph_lines(graph: Mapping[str, Any]) -> Iterator[str]:
 
 
 def checkpoint_lines(found: Mapping[str, Any]) -> Iterator[str]:
-    """Yield where copies of the run are, what they cost, and why there are none."""
     if found.get("why_not"):
         yield printable(f"no copy can be made: {found['why_not']}")
     if found["indices"]:
@@ -168,7 +158,6 @@ def _listed(value: Sequence[Any], indent: str) -> Iterator[str]:
 
 
 def _table(rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield rows below the names of their columns, aligned."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     titles = [name.removesuffix("_ns").replace("_", " ") for name in names]
     cells = [[printable(_cell(name, row.get(name, ""))) for name in names] for row in rows]
@@ -193,20 +182,16 @@ def _cell(name: str, value: Any) -> str:
     return str(value)
 
 
-# -- source lines ----------------------------------------------------------------------------------
-
-
 def source_lines(source: Mapping[str, Any] | None) -> Iterator[str]:
-    """Yield the lines of a callback, with their numbers."""
     if source is None:
-        yield "there is no Python source for what runs here"
+        yield "there is no Python source for this event"
         return
     file = Path(source["file"])
     near = file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
     yield printable(f"{source['name']}, {near}:{source['line']}")
     lines = source.get("lines") or []
     if not lines:
-        yield "(its source is not here)"
+        yield "(its source is not available)"
     first = int(source["line"])
     width = len(str(first + len(lines)))
     at = source.get("at")

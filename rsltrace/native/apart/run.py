@@ -25,8 +25,8 @@ from rsltrace.native.executors import EXECUTORS
 from rsltrace.native.ledger import Sent, Span, now_ns
 from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording, Spent
 from rsltrace.native.support import check_loopback, domain
+from rsltrace.run.plans.entries import missed_starts
 from rsltrace.run.plans.scheduling import has_stop
-from rsltrace.run.plans.starts import missed_starts
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 

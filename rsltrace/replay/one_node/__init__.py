@@ -1,1 +1,1 @@
-"""One node of a recording alone: fed with what it got, and what it then does compared."""
+"""Replay one node alone with its recorded inputs, and compare its outputs."""

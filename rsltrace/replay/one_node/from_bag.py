@@ -1,9 +1,8 @@
-"""One node fed from a recording of the real robot: the topics that it subscribes to play to it.
+"""Run one node with the inputs from a recording of the real robot.
 
-The run is one of a job with one entry and the bag, so its trace is an ordinary one. What the node
-puts out is compared with what the robot recorded on the same topics. A robot takes time for what
-takes none here, so messages are matched by the stamp in their header; those without one by their
-order.
+The run is that of a job with one entry and the bag, so its trace is an ordinary one. Its outputs
+are compared with what the robot recorded on the same topics. A robot takes time where a simulation
+takes none, so messages are matched by their header stamps, or else by their order.
 """
 
 from __future__ import annotations
@@ -15,14 +14,19 @@ from pathlib import Path
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError, did_you_mean
 from rsltrace.job import BagSpec, Job, StopSpec
-from rsltrace.replay.one_node.outputs import Key, Put, Side, changes, outputs_of_node
+from rsltrace.replay.one_node.output_comparison import (
+    Key,
+    NodeOutput,
+    NodeOutputs,
+    output_changes,
+    outputs_of_node,
+)
 from rsltrace.replay.one_node.result import NodeReplayResult
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
-from rsltrace.run import Observer
+from rsltrace.run import Observer, run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.process import kept_process
-from rsltrace.run.recording import run
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64
@@ -31,13 +35,10 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings import open_bag
 from rsltrace.trace.recordings.playback import header_stamp_ns
 
-# What a node subscribes to and publishes: seen by constructing it, in a run that ends at once.
-
 
 @dataclass(frozen=True, slots=True)
-class Ends:
-    """The entry of a job (its place in ``nodes:``) that makes a node, and the node's topics with
-    their types."""
+class NodeTopics:
+    """The topics of a node with their types, and its entry in ``nodes:``."""
 
     node: str
     entry: int
@@ -45,13 +46,13 @@ class Ends:
     published: dict[str, str]
 
 
-class _Probe(Session):
-    """Constructs the entries of a job one by one, until one has made the node."""
+class _NodeProbe(Session):
+    """Constructs the entries of a job one by one until one has made the node."""
 
-    def find(self, node: str) -> Ends:
-        """Return what there is to know of the node.
+    def find(self, node: str) -> NodeTopics:
+        """Return the node's topics.
 
-        :raises RunError: what went wrong in a constructor.
+        :raises RunError: a constructor failed.
         """
         world, graph = self.world, self.world.domain.graph
         hooks = int(self.job.hooks.before is not None)
@@ -68,7 +69,7 @@ class _Probe(Session):
             names = [one.fully_qualified_name for one in graph.nodes]
             hint = did_you_mean(node, names, f"its nodes are {', '.join(names)}")
             raise ReplayError(f"the job makes no node {node}: {hint}")
-        return Ends(
+        return NodeTopics(
             node,
             place - hooks,
             {one.topic: one.type_name for one in graph.subscriptions_of(found)},
@@ -76,13 +77,13 @@ class _Probe(Session):
         )
 
 
-def ends_of(job: Job, node: str) -> Ends:
-    """Construct the nodes of a job until ``node`` is there; return its topics.
+def node_topics(job: Job, node: str) -> NodeTopics:
+    """Construct the nodes of a job until ``node`` exists; return its topics.
 
     :raises ReplayError: no entry of the job makes it.
     :raises JobError, SetupError, RunError: its code cannot be loaded, or fails.
     """
-    probe = _Probe(job, None)
+    probe = _NodeProbe(job, None)
     with kept_process(), probe:
         try:
             return probe.find(node if node.startswith("/") else f"/{node}")
@@ -98,18 +99,18 @@ _NOT_OF_ROBOTS: dict[str, object] = {
     "bags": (),
     "stop": StopSpec(),
 }
-"""What a job says of a simulated robot; a recording of a real one has the effects of all that."""
+"""Settings of a simulated robot; a recording of a real one already has their effects."""
 
 
-class BagSide(Side):
-    """What a bag has on the topics of a node, decoded by what a trace says of their types."""
+class BagOutputs(NodeOutputs):
+    """The messages of a bag on a node's topics, decoded with the types of a trace."""
 
     def __init__(self, trace: Trace) -> None:
         super().__init__(trace, [])
-        self.puts: list[Put] = []
+        self.puts: list[NodeOutput] = []
         self.data: list[bytes] = []
 
-    def decoded(self, put: Put) -> object | None:
+    def decoded(self, put: NodeOutput) -> object | None:
         channel = put.key[1]
         if not any(one.topic == channel for one in self.trace.channels.values()):
             return None
@@ -127,14 +128,14 @@ def replay_from_bag(
     echo: bool = False,
     observer: Observer | None = None,
 ) -> NodeReplayResult:
-    """Run one node of a job with what bags have of its topics; compare what it puts out.
+    """Run one node of a job with inputs from bags; compare its outputs.
 
-    :raises ReplayError: the job makes no such node, or the bags have nothing for it.
+    :raises ReplayError: the job makes no such node, or the bags have no input for it.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
-    :raises RunError: what went wrong in the node.
+    :raises RunError: the node failed.
     """
     alone = job.model_copy(update=_NOT_OF_ROBOTS)
-    ends = ends_of(alone, node)
+    ends = node_topics(alone, node)
     specs = tuple(_specs(bags, ends))
     nodes = (job.nodes[ends.entry],)
     with place_for(output) as path:
@@ -152,7 +153,7 @@ def replay_from_bag(
             here, there = _sides(trace, ends, bags)
             if interruption(done):
                 there.puts = [put for put in there.puts if put.stamp_ns < done.end_ns]
-            found = tuple(changes(there, here, options or DiffOptions()))
+            found = tuple(output_changes(there, here, options or DiffOptions()))
             inputs = sum(int((r["kind"] == EventKind.BAG).sum()) for r in trace.events())
     return NodeReplayResult(
         trace=", ".join(map(str, bags)),
@@ -169,11 +170,8 @@ def replay_from_bag(
     )
 
 
-def _specs(bags: Sequence[Path], ends: Ends) -> Iterator[BagSpec]:
-    """Yield the bags with the topics of which the node hears.
-
-    :raises ReplayError: there are none, or of another type.
-    """
+def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
+    """Yield the bags with the topics that the node subscribes to."""
     names: list[str] = []
     met = False
     for path in bags:
@@ -198,14 +196,14 @@ def _specs(bags: Sequence[Path], ends: Ends) -> Iterator[BagSpec]:
         )
 
 
-def _compared(ends: Ends) -> list[str]:
-    """Return the topics that only the node itself can have filled, as far as one can tell."""
+def _compared(ends: NodeTopics) -> list[str]:
+    """Return the topics that probably only the node itself publishes."""
     return [t for t in ends.published if t not in (*_OF_ALL_NODES, *ends.subscribed)]
 
 
-def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSide]:
-    """Return what the node has put out, and what was recorded on these topics."""
-    recorded = BagSide(trace)
+def _sides(trace: Trace, ends: NodeTopics, bags: Sequence[Path]) -> tuple[NodeOutputs, BagOutputs]:
+    """Return the node's outputs, and the recorded ones on these topics."""
+    recorded = BagOutputs(trace)
     headers: dict[str, bool] = {}
     for path in bags:
         with open_bag(path, recover=True, skip=never_plays) as bag:
@@ -220,11 +218,11 @@ def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSid
             payload = trace.payload(put.output)
             data = b"" if payload is None else payload[2]
             at = _at(put.key, data, headers, counts)
-            puts.append(Put(put.stamp_ns, put.key, put.place, put.output, at))
-    return Side(trace, puts), recorded
+            puts.append(NodeOutput(put.stamp_ns, put.key, put.place, put.output, at))
+    return NodeOutputs(trace, puts), recorded
 
 
-def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]) -> None:
+def _read(path: Path, topics: list[str], side: BagOutputs, headers: dict[str, bool]) -> None:
     from rsltrace.adapters.rclpy.wire.codec import codec_for
 
     counts: dict[Key, int] = {}
@@ -238,19 +236,19 @@ def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]
             key: Key = (OutputKind.MESSAGE, bag.topics[index].name)
             output = Output(NO_EVENT, 0, OutputKind.MESSAGE, hash64(data), NO_SEQUENCE)
             at = _at(key, data, headers, counts)
-            side.puts.append(Put(stamp_ns, key, len(side.data), output, at))
+            side.puts.append(NodeOutput(stamp_ns, key, len(side.data), output, at))
             side.data.append(data)
 
 
 def _at(key: Key, data: bytes, headers: dict[str, bool], counts: dict[Key, int]) -> int:
-    """Return the stamp of a message's header, or its number where it has none."""
+    """Return the stamp of a message's header, or else its number."""
     if headers[key[1]]:
         return header_stamp_ns(data)
     counts[key] = counts.get(key, -1) + 1
     return counts[key]
 
 
-def _notes(ends: Ends, there: Side) -> Iterator[str]:
+def _notes(ends: NodeTopics, there: NodeOutputs) -> Iterator[str]:
     both = [t for t in ends.published if t in ends.subscribed and t not in _OF_ALL_NODES]
     if both:
         yield (

@@ -1,4 +1,4 @@
-"""Replaying one node of a trace."""
+"""Replay one node of a trace."""
 
 from __future__ import annotations
 
@@ -13,21 +13,29 @@ import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
-from rsltrace.replay.one_node.outputs import Side, Watch, changes, outputs_of_node
-from rsltrace.replay.one_node.result import Column, Columns, NodeReplayResult
-from rsltrace.replay.one_node.script import RecordedScript, check_payloads
-from rsltrace.replay.one_node.unit import Unit
+from rsltrace.replay.one_node.output_comparison import (
+    NodeOutputs,
+    OutputWatch,
+    output_changes,
+    outputs_of_node,
+)
+from rsltrace.replay.one_node.result import Column, NodeReplayResult, RecordingColumns
+from rsltrace.replay.one_node.script import RecordedScript, ReplayedEntry, check_payloads
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
-from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
-from rsltrace.simulation.loop.fed import FedLoop, FedOrderedLoop, end_of
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.policy import Fifo
+from rsltrace.simulation.loop.recorded_input_loop import (
+    OrderedRecordedInputLoop,
+    RecordedInputLoop,
+    stop_at_recorded_end,
+)
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
@@ -37,21 +45,17 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
-# A run of one entry of a recorded job, fed with what its nodes got then.
-
-# Which request a recorded response answers. A trace says who got it, and who asked what.
-
 _BEGIN = (EventKind.SERVICE, EventKind.ACTION)
 
 
-class Answers:
-    """The requests of the unit's clients that others have taken, until they are answered."""
+class ServiceAnswers:
+    """The requests of the node's clients until they are answered."""
 
-    def __init__(self, columns: Columns, is_own: Callable[[Column], Column]) -> None:
+    def __init__(self, columns: RecordingColumns, is_own: Callable[[Column], Column]) -> None:
         events, outputs = columns.events, columns.outputs
         self._columns = columns
         self._asked: dict[tuple[int, int], tuple[int, int]] = {}
-        """By event and output that asked: the client, and which of its requests it was."""
+        """By requesting event and output: (client, number of the request)."""
         counts: dict[int, int] = {}
         places = np.flatnonzero((outputs["kind"] == OutputKind.REQUEST) & is_own(outputs["entity"]))
         for place in places.tolist():
@@ -60,11 +64,11 @@ class Answers:
             position = place - int(columns.first_output[event])
             self._asked[event, position] = client, counts[client]
         self._got: dict[tuple[int, int], int] = {}
-        """By event and output that answered: the client."""
+        """By answering event and output: the client."""
         self._open: dict[int, list[tuple[int, int, int]]] = {}
-        """By service: (event that took it, client, number) of requests, oldest first."""
+        """By service: (event that took it, client, number) of open requests, oldest first."""
         self._untaken: dict[int, list[int]] = {}
-        """By client, the numbers of the requests that nobody seems to have taken."""
+        """By client, the numbers of requests that no recorded event took."""
         if not self._asked:
             return
         own = is_own(events["entity"])
@@ -83,8 +87,8 @@ class Answers:
                 self._untaken.setdefault(client, []).append(number)
 
     def of(self, event: int, position: int, service: int) -> tuple[int, int] | None:
-        """Return the client (of the recording) that a response goes to, and which of its requests
-        it answers; None if it goes to somebody else. Responses are asked for in their order."""
+        """Return (recorded client, number of its request) that a response answers; None if it is
+        for another node. Responses must be asked for in order."""
         waiting = self._open.get(service, [])
         for place, (begun, client, number) in enumerate(waiting):
             if begun == event:
@@ -97,28 +101,28 @@ class Answers:
             if begun < event and client == asked_by:
                 del waiting[place]
                 return client, number
-        # In the trace of one node alone nobody has taken the requests: they are answered in order.
+        # In the trace of one node alone no event takes the requests: they are answered in order.
         numbers = self._untaken.get(asked_by)
         return (asked_by, numbers.pop(0)) if numbers else None
 
     def _drawn_for(self, event: int, position: int) -> int:
-        """Return for whom chance decided when a response arrives, or that it does not."""
+        """Return the client of the draw that follows a response, or -1."""
         rows = self._columns.outputs_of(event)[position + 1 : position + 2]
         drawn = len(rows) and rows["kind"][0] == OutputKind.DRAW
         return int(rows["entity"][0]) if drawn else -1
 
 
-class FedSession(Session):
-    """Runs ``unit`` alone. The stages are those of ``Session``; bags, stop conditions, policy and
-    executors of the job are none of its business: the recording has what came of them."""
+class NodeReplaySession(Session):
+    """A session that runs one entry. The recording replaces the job's bags, stop conditions, policy
+    and executors."""
 
-    loop: FedLoop
+    loop: RecordedInputLoop
 
     def __init__(
         self,
         plan: Preparation,
-        columns: Columns,
-        unit: Unit,
+        columns: RecordingColumns,
+        unit: ReplayedEntry,
         output: Path,
         *,
         force: bool = False,
@@ -133,9 +137,7 @@ class FedSession(Session):
         self._unit = unit
         self._trace = plan.trace
         self.script = RecordedScript(columns, unit, self._perform)
-        self._answers = Answers(columns, unit.is_own)
-
-    # -- what is different from a run of the whole job --------------------------------------------
+        self._answers = ServiceAnswers(columns, unit.is_own)
 
     def _open_bags(self, stack: ExitStack, notes: object) -> None:
         self._bags = []
@@ -147,28 +149,28 @@ class FedSession(Session):
             self.start_ns = int(jumps[0])
         self.end_ns = self.script.end_ns
 
-    def _kind_of_loop(self) -> type[EventLoop]:
+    def _loop_class(self) -> type[EventLoop]:
         ordered = is_ordered(self.job) or self.job.timer_ties != "creation"
-        return FedOrderedLoop if ordered else FedLoop
+        return OrderedRecordedInputLoop if ordered else RecordedInputLoop
 
     def _order_events(self, stack: ExitStack) -> None:
         loop = self.loop
         self._recorded = None
         loop.script = self.script
         loop.by_steps, loop.min_step_ns = bool(loop.min_step_ns), 0
-        if isinstance(loop, FedOrderedLoop):
+        if isinstance(loop, OrderedRecordedInputLoop):
             plan = scheduling_plan(self.job, self.start_ns, Fifo())
             self.world.use_scheduling(loop, replace(plan, occupies=False))
             loop.has_workers = plan.occupies
             policy = self.job.policy
             loop.by_policy = policy is not None and policy.order != "fifo"
 
-    def _import_what_is_named(self) -> None:
+    def _import_targets(self) -> None:
         from rsltrace.adapters.stand_ins import StandIns
 
         job, world = self.job, self.world
         self._stand_ins = StandIns(world.domain, self._definition)
-        self.loop.stop_conditions = (end_of(self.script, self.loop),)  # type: ignore[assignment]
+        self.loop.stop_conditions = (stop_at_recorded_end(self.script, self.loop),)  # type: ignore[assignment]
         hooks = int(job.hooks.before is not None)
         nodes = range(hooks, hooks + len(job.nodes))
         with world.importing():
@@ -186,25 +188,24 @@ class FedSession(Session):
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
         super()._open_trace(stack, path)
         assert self._writer is not None
-        told = {
+        values = {
             "node": self._unit.node.name,
             "entries": ",".join(map(str, self._unit.entries)),
         }
-        self._writer.add_metadata(METADATA_FED, told)
+        self._writer.add_metadata(METADATA_FED, values)
         dispatcher = self.world.domain.dispatcher
         dispatcher.add_observer(_Progress(dispatcher, self.script))
 
     @property
     def fed(self) -> int:
-        """How many messages, requests and responses of others there have been."""
+        """How many recorded messages, requests and responses the node has received."""
         return self._stand_ins.fed
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
-        """Return nothing: rules for other nodes have nothing to do here."""
         return ()
 
     def begin(self) -> None:
-        """Construct the unit among the others, and jump to the start."""
+        """Construct the entry at its recorded place, and jump to the start."""
         world, unit = self.world, self._unit
         entries = dict(zip(unit.entries, self._entries, strict=True))
         last = 0
@@ -222,7 +223,7 @@ class FedSession(Session):
                     continue
                 self.script.perform_until(event)
                 if not world.construct(entry):
-                    say_where(self.job, entry, world.error)
+                    add_job_location(self.job, entry, world.error)
                     break
             if not self.ended:
                 self.script.perform_until(last)
@@ -230,12 +231,10 @@ class FedSession(Session):
                 self._has_begun = not self.ended
 
     def _starts_later(self, place: int) -> bool:
-        """Whether an entry (its place among hooks and nodes) has started after the run had."""
+        """Whether an entry (its place among hooks and nodes) starts after the run does."""
         index = place - int(self.job.hooks.before is not None)
         nodes = self.job.nodes
         return 0 <= index < len(nodes) and nodes[index].start_after is not None
-
-    # -- what others did --------------------------------------------------------------------------
 
     def _perform(
         self,
@@ -274,7 +273,7 @@ class FedSession(Session):
         return read
 
     def _client(self, recorded: int) -> Client | None:
-        """Return the client of the unit that stands for a recorded one, if it is there."""
+        """Return the client that corresponds to a recorded one, if it exists."""
         present = self.script.present(recorded)
         clients = self.world.domain.graph.clients(self._trace.entity(recorded).name)
         return next((one for one in clients if one.entity_id == present), None)
@@ -287,7 +286,7 @@ class FedSession(Session):
 
 
 class _Progress(EventObserver):
-    """Tells a script of the unit's entities and events."""
+    """Reports the node's entities and events to the script."""
 
     order = ObserverOrder.SCRIPT
 
@@ -297,20 +296,17 @@ class _Progress(EventObserver):
         self._names: dict[int, str] = {0: ""}
 
     def entity_created(self, entity: Entity) -> None:
-        """Tell of an entity and the name of its node."""
         if entity.node == entity.id:
             self._names[entity.id] = entity.name
-        self._script.met(entity, self._names.get(entity.node, ""))
+        self._script.match_entity(entity, self._names.get(entity.node, ""))
 
     def after_event(self) -> None:
-        """Tell of an event that is not done for others."""
         event = self._dispatcher.event
         if event.kind != EventKind.BAG:
             self._script.happened(event.kind, event.entity, self._dispatcher.loop.now_ns)
 
 
-def run_fed(session: FedSession, watch: Watch | None = None) -> RunResult:
-    """Run a session to its end."""
+def run_node(session: NodeReplaySession, watch: OutputWatch | None = None) -> RunResult:
     with session:
         if watch is not None:
             watch.attach(session)
@@ -334,9 +330,9 @@ def replay_node(
     echo: bool = False,
     observer: Observer | None = None,
 ) -> NodeReplayResult:
-    """Run one node of a trace alone, fed with what it got; compare what it puts out.
+    """Run one node of a trace alone with its recorded inputs; compare its outputs.
 
-    :raises ReplayError: there is no such node, or the trace does not hold what it got.
+    :raises ReplayError: there is no such node, or the trace lacks its inputs.
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
     trace = plan.trace
@@ -347,15 +343,21 @@ def replay_node(
             f"{trace.name} was made with threads: {{switch: every_line}}: where a callback gives "
             "way depends on all of its process, so it replays as a whole only; leave out --node"
         )
-    columns = Columns(trace)
-    unit = Unit(columns, plan.job, node, entries_of(trace, columns))
+    columns = RecordingColumns(trace)
+    unit = ReplayedEntry(columns, plan.job, node, entries_of(trace, columns))
     check_payloads(columns, unit)
     recorded = outputs_of_node(trace, unit.node.name)
     with place_for(output) as path:
-        session = FedSession(plan, columns, unit, path, force=force, echo=echo, observer=observer)
-        watch = Watch(recorded, unit.node.name, CHANGED) if until_diverged and not options else None
+        session = NodeReplaySession(
+            plan, columns, unit, path, force=force, echo=echo, observer=observer
+        )
+        watch = (
+            OutputWatch(recorded, unit.node.name, CHANGED)
+            if until_diverged and not options
+            else None
+        )
         with kept_process():
-            run = run_fed(session, watch)
+            run = run_node(session, watch)
         place = run.path or path
         with Trace.open(place) as present:
             puts = outputs_of_node(present, unit.node.name)
@@ -366,7 +368,11 @@ def replay_node(
                 compared = [put for put in recorded if put.stamp_ns < run.end_ns]
                 puts = [put for put in puts if put.stamp_ns < run.end_ns]
             found = tuple(
-                changes(Side(trace, compared), Side(present, puts), options or DiffOptions())
+                output_changes(
+                    NodeOutputs(trace, compared),
+                    NodeOutputs(present, puts),
+                    options or DiffOptions(),
+                )
             )
     return NodeReplayResult(
         trace=trace.name,
@@ -384,25 +390,27 @@ def replay_node(
     )
 
 
-def entries_of(trace: Trace, columns: Columns) -> list[int]:
-    """Return, for each construction in a trace, which entry of the job it was that of."""
+def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
+    """Return the job entry of each construction in a trace."""
     told = trace.metadata(METADATA_FED).get("entries") or trace.result.get("entries", "")
     some = [int(one) for one in told.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))
 
 
-def _notes(unit: Unit, columns: Columns, run: RunResult, differs: bool) -> Iterator[str]:
+def _notes(
+    unit: ReplayedEntry, columns: RecordingColumns, run: RunResult, differs: bool
+) -> Iterator[str]:
     if unit.others:
         yield f"{', '.join(unit.others)} ran with it: the same entry of the job makes them"
     if differs:
         yield (
-            "its inputs are those of the recording, also where others would have answered its "
-            "changed outputs in another way"
+            "its inputs are the recorded ones, even where other nodes would have reacted to its "
+            "changed outputs"
         )
     elsewhere = unit.done_by_others()
     if elsewhere:
         yield (
-            f"{elsewhere} of its outputs came about in events of other nodes or of whoever drove "
-            "the run, which are not replayed"
+            f"{elsewhere} of its outputs were made in events of other nodes or of the driver, "
+            "which are not replayed"
         )
     yield from run.notes

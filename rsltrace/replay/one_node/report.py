@@ -1,4 +1,4 @@
-"""What ``replay --node`` says: the outputs that are not as recorded, as a table or as JSON."""
+"""Format the result of ``replay --node``, as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _WIDTH = 40
 
 
 def as_text(result: NodeReplayResult, *, everything: bool) -> Iterator[str]:
-    """Yield the lines of the report: the first changes, or all of them."""
+    """Yield the lines of the report: the first changes, or (``everything``) all."""
     yield printable(result.sentence)
     if result.same:
         return
@@ -51,7 +51,6 @@ def _rows(change: OutputChange) -> Iterator[tuple[str, ...]]:
 
 
 def as_json(result: NodeReplayResult) -> str:
-    """Return the result as one JSON object."""
     return json.dumps(
         {
             "trace": result.trace,

@@ -1,4 +1,4 @@
-"""What replaying one node found: the outputs that are not as recorded."""
+"""The result of replaying one node, and the columns of a recording that it needs."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ if TYPE_CHECKING:
     from rsltrace.diff.facts.evidence import FieldDifference
     from rsltrace.errors import RunError
 
-# What replaying a node has to know of a whole recording, in columns: who did what, and why.
-
 Column = npt.NDArray[Any]
 SENT = (OutputKind.MESSAGE, OutputKind.LOG, OutputKind.REQUEST, OutputKind.RESPONSE)
 _COLUMNS = ("stamp", "kind", "flags", "entity", "cause_event", "cause_output")
 
 
-class Columns:
+class RecordingColumns:
     """The events of a trace, ``events[i]`` by index, and its outputs in order.
 
     ``first_output[i]`` is where the outputs of event ``i`` begin (one more at the end).
@@ -46,28 +44,27 @@ class Columns:
 
     @cached_property
     def created_in(self) -> dict[int, int]:
-        """By entity, the event that created it."""
+        """The event that created each entity."""
         rows = self.outputs[self.outputs["kind"] == OutputKind.ENTITY]
         return dict(zip(rows["entity"].tolist(), rows["event"].tolist(), strict=True))
 
     @cached_property
     def constructions(self) -> list[int]:
-        """The events that constructed the entries of the job, and the player of its bags."""
+        """The construction events of the job's entries and of its bag player."""
         found: list[int] = np.flatnonzero(self.events["kind"] == EventKind.CONSTRUCT).tolist()
         return found
 
     def outputs_of(self, event: int) -> Column:
-        """Return the outputs of an event."""
         rows: Column = self.outputs[self.first_output[event] : self.first_output[event + 1]]
         return rows
 
     def payload(self, event: int, position: int) -> bytes | None:
-        """Return what an output has sent, None if it was not kept."""
+        """Return the message of an output, None if it was not kept."""
         found = self.trace.payload(self.trace.outputs_of(event)[position])
         return None if found is None else found[2]
 
 
-class Change(Enum):
+class OutputChangeKind(Enum):
     """What has become of an output."""
 
     CHANGED = "changed"
@@ -85,7 +82,7 @@ class OutputChange:
     and ``event`` are the indices of the events in the recording and in the replay, or None.
     """
 
-    change: Change
+    change: OutputChangeKind
     time_ns: int
     kind: str
     name: str
@@ -96,14 +93,13 @@ class OutputChange:
 
 @dataclass(frozen=True, slots=True)
 class NodeReplayResult:
-    """How a node did, alone, with the inputs of a recording.
+    """The outputs of a node that was replayed alone.
 
-    ``trace`` (a path) is the recording, ``node`` the node's full name; ``inputs`` is how many
-    messages, requests and responses of others were fed. ``compared`` is how many outputs the
-    recording has of it (until ``end_ns``, if the replay ended before); ``changes`` are those that
-    are not the same now, in the order of time, the first one first. ``ended`` says why the replay
-    ended. ``path`` is the replay's own trace, None if none was asked for. ``error`` is what went
-    wrong in the node. ``notes`` are texts for people.
+    ``trace`` (a path) is the recording, ``node`` the full name; ``inputs`` is how many recorded
+    messages, requests and responses it received. ``compared`` is how many recorded outputs were
+    compared (until ``end_ns``); ``changes`` are those that differ, by time. ``ended`` says why the
+    replay ended. ``path`` is the replay's own trace or None. ``error`` is the node's failure,
+    ``notes`` are texts for people.
     """
 
     trace: str
@@ -144,14 +140,14 @@ class NodeReplayResult:
     def sentence(self) -> str:
         """The result in one sentence."""
         inputs = "1 input" if self.inputs == 1 else f"{self.inputs} inputs"
-        fed = f"fed with {inputs} over {format_seconds(self.end_ns - self.start_ns)} s"
+        run = f"{inputs} over {format_seconds(self.end_ns - self.start_ns)} s"
         first = self.first
         if first is None and not self.compared:
-            return f"{self.node} ran, and there is nothing to compare it with ({fed})"
+            return f"{self.node} ran, but there is nothing to compare its outputs with ({run})"
         if first is None:
-            return f"{self.node} does the same: {self.compared} outputs ({fed})"
+            return f"{self.node} is unchanged: {self.compared} outputs as recorded ({run})"
         when = format_seconds(first.time_ns)
         at = f"{first.kind} {first.name} at {when} s is {first.change.value}"
         more = len(self.changes) - 1
         later = f", and {more} later" if more else ""
-        return f"{self.node} does something else: {at}{later}, of {self.compared} outputs ({fed})"
+        return f"{self.node} diverges: {at}{later}, of {self.compared} outputs ({run})"

@@ -1,4 +1,4 @@
-"""The ways to replay one node: from a trace, from a trace with a bag, from a job with a bag."""
+"""The sources of a one-node replay: a trace, a trace with a bag, a job with a bag."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from rsltrace.replay.preparation import prepared, without_bags
 
 
 def is_job(path: Path) -> bool:
-    """Whether a file is a job rather than a trace, by its name."""
     return path.suffix in (".yaml", ".yml", ".json")
 
 
 def load_without_bags(path: Path) -> Job:
-    """Return the job of a file, for other bags than its own.
+    """Load a job file without its bags.
 
-    :raises JobError: if it cannot be used.
+    :raises JobError: it cannot be used.
     """
     return without_bags(lambda to: load_job(path, overrides=to))
 
@@ -41,9 +40,9 @@ def replay_one(
     trust: bool,
     echo: bool,
 ) -> NodeReplayResult:
-    """Do what ``rsltrace.replay`` does with a node.
+    """Replay one node: of a trace, of a trace with bags, or of a job with bags.
 
-    :raises RsltraceError: as there.
+    :raises RsltraceError: as ``rsltrace.replay``.
     """
     if bags and is_job(source):
         return replay_from_bag(

@@ -1,1 +1,1 @@
-"""From a job to what a run needs: entries, bags, network, scheduling, guard."""
+"""Prepare the parts of a run from its job: entries, bags, network, scheduling, guard."""

@@ -1,4 +1,4 @@
-"""The bags of a job: opened, checked and merged into the graph."""
+"""Open, check and merge the bags of a job."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.job.values.names import check_topic
+from rsltrace.run.plans.faults import BagFaults, check_changes
 from rsltrace.run.plans.scheduling import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
@@ -23,7 +24,6 @@ from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 if TYPE_CHECKING:
     from rsltrace.adapters.rclpy.handles.node import NodeHandle
     from rsltrace.adapters.rclpy.world import World
-    from rsltrace.run.plans.bag_faults import BagFaults
     from rsltrace.trace.recordings import Bag
     from rsltrace.trace.recordings.playback import Playback
     from rsltrace.trace.recordings.topic import BagTopic, StoredTopic
@@ -45,7 +45,7 @@ class BagInput:
     playback: Playback
 
     def name_of(self, topic: BagTopic) -> str:
-        """Return the name under which a recorded topic plays."""
+        """Return the topic name under which a recorded topic plays."""
         return self.spec.remappings.get(topic.name, topic.name)
 
 
@@ -88,16 +88,13 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
 
 
 def never_plays(topic: StoredTopic) -> bool:
-    """Services and actions are recorded as topics that only their own middleware may fill.
-
-    And a trace, which may be played like any bag, has topics of its own.
-    """
+    """Whether a topic is never played: of a service, an action, or rsltrace's own."""
     own = topic.name.startswith(PREFIX_OWN)
     return own or _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
 
 
 def _check_names(job: Job, index: int, bag: Bag) -> None:
-    """Raise BagError if a name in the job fits no topic that plays."""
+    """Raise BagError if a name in the job matches no topic that plays."""
     spec, names = job.bags[index], sorted({topic.name for topic in bag.topics})
     for key, globs in (("remappings", spec.remappings), ("qos", spec.qos)):
         for glob in globs:
@@ -116,8 +113,8 @@ def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
     )
 
 
-def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
-    """Yield what somebody should know about the bags: what is missing, what does not play."""
+def bag_notes(job: Job, bags: list[BagInput]) -> Iterator[str]:
+    """Yield notes on the bags: what is missing or does not play."""
     for index, entry in enumerate(bags):
         yield from entry.bag.notes
         for number, glob in enumerate(entry.spec.exclude):
@@ -142,11 +139,11 @@ def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
                     f"{entry.spec.path}: recorded {what} are not played: {', '.join(names)} (only "
                     "topics play; what a server answers, its node must answer again)"
                 )
-    yield from _apart(job, bags)
+    yield from _time_gaps(job, bags)
 
 
-def _apart(job: Job, bags: list[BagInput]) -> Iterator[str]:
-    """Yield the bags that were recorded at another time than what plays before them."""
+def _time_gaps(job: Job, bags: list[BagInput]) -> Iterator[str]:
+    """Yield the bags that start long after all bags before them have ended."""
     start_ns = start_ns_of(job, bags)
     run_ends_ns = end_ns_of(job, start_ns)
     until_ns: int | None = start_ns
@@ -165,15 +162,15 @@ def _apart(job: Job, bags: list[BagInput]) -> Iterator[str]:
 
 
 def start_ns_of(job: Job, bags: list[BagInput]) -> int:
-    """Return when the run starts: what the job says, else the first message of the bags, else 0."""
+    """Return the start of the run: the job's, else the first message of the bags, else 0."""
     if job.start_ns is not None:
         return job.start_ns
     return min((entry.playback.start_ns for entry in bags), default=0)
 
 
 def check_bag_types(job: Job, bags: list[BagInput]) -> None:
-    """Raise BagError if a recorded topic has a type that is not installed, or no name for ROS, or
-    if a fault cannot change it so."""
+    """Raise BagError if a recorded topic's type is not installed, its name is invalid in ROS, or a
+    fault's change does not fit."""
     changes = any(fault.change is not None for fault in job.faults)
     for index, entry in enumerate(bags):
         where = f"{locate(job, ('bags', index, 'path'))}: {entry.spec.path}"
@@ -189,8 +186,6 @@ def check_bag_types(job: Job, bags: list[BagInput]) -> None:
                 ) from None
             cls = check_type(where, topic)
             if changes:
-                from rsltrace.run.plans.bag_faults import check_changes
-
                 check_changes(job, name, cls)
 
 
@@ -211,7 +206,6 @@ def check_type(bag: str, topic: BagTopic) -> type:
 
 
 def begins_with_header(message_class: Any) -> bool:
-    """Return whether the first field of a message is a ``std_msgs/Header``."""
     fields = message_class.get_fields_and_field_types()
     return next(iter(fields.values()), "") == "std_msgs/Header"
 
@@ -219,10 +213,9 @@ def begins_with_header(message_class: Any) -> bool:
 def start_players(
     world: World, job: Job, bags: list[BagInput], *, is_open: bool = False
 ) -> BagFaults | None:
-    """Make a publisher for every recorded topic and merge the bags by time, then by order.
+    """Make a publisher for each recorded topic, and merge the bags by time.
 
-    Return the faults of what they play, of which there may be more later if they are ``is_open``;
-    None without bags.
+    Return the faults of what they play (``is_open``: more may be added), or None without bags.
     """
     if not bags:
         return None
@@ -231,12 +224,11 @@ def start_players(
     from rsltrace.adapters.player import Player, make_publisher
     from rsltrace.adapters.rclpy.wire.codec import codec_for
     from rsltrace.adapters.rclpy.wire.interfaces import get_message_class, message_type
-    from rsltrace.run.plans.bag_faults import BagFaults
 
     domain = world.domain
     faults = BagFaults(job, is_open=is_open)
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
-    told: list[Any] = []
+    progress_publishers: list[Any] = []
 
     def publisher(node: NodeHandle, topic: str, cls: type, qos: dict[str, Any]) -> Any:
         name = node.resolve(topic, service=False)
@@ -261,7 +253,7 @@ def start_players(
             streams.append(_messages(entry.playback, ends))
         if job.progress is not None:
             progress = get_message_class("std_msgs/msg/Float32")
-            told.append(publisher(player.handle, job.progress, progress, {}))
+            progress_publishers.append(publisher(player.handle, job.progress, progress, {}))
         world.keep(player)
 
     world.run_outside("the bag player", EventKind.CONSTRUCT, build)
@@ -277,8 +269,8 @@ def start_players(
     if len(streams) > 1:
         merged = heapq.merge(*streams, key=lambda message: message[0])
     merged = faults.played(merged)
-    if told:
-        merged = with_progress(merged, told[0], bags)
+    if progress_publishers:
+        merged = with_progress(merged, progress_publishers[0], bags)
     paths = " and ".join(entry.spec.path for entry in bags)
     name = f"the {'bag' if len(bags) == 1 else 'bags'} {paths}"
     Player(domain, merged, name, on_end).start()
@@ -291,7 +283,7 @@ def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, 
 
 
 def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
-    """Return when the first bag begins to play, and when the last one ends."""
+    """Return when the first bag begins and the last one ends."""
     ends = [entry.playback.end_ns for entry in bags]
     assert all(end is not None for end in ends), "a bag that plays forever has no progress"
     return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
@@ -300,15 +292,15 @@ def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
 def with_progress(
     messages: Iterator[tuple[int, Any, bytes]], publisher: Any, bags: list[BagInput]
 ) -> Iterator[tuple[int, Any, bytes]]:
-    """Put progress from 0 to 1 among the messages, each hundredth once, when it is reached."""
+    """Insert progress messages from 0 to 1, at each full percent."""
     start_ns, end_ns = _span_ns(bags)
-    told, stamp_ns = -1, start_ns
+    last_percent, stamp_ns = -1, start_ns
     for message in messages:
         yield message
         stamp_ns = message[0]
         percent = min((stamp_ns - start_ns) * 100 // max(end_ns - start_ns, 1), 99)
-        if percent > told:
-            told = percent
+        if percent > last_percent:
+            last_percent = percent
             yield stamp_ns, publisher, _float32(percent)
     yield stamp_ns, publisher, _float32(100)
 
@@ -318,7 +310,6 @@ def _float32(percent: int) -> bytes:
 
 
 def qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
-    """Return the QoS that a job gives to a recorded topic."""
     for glob, qos in spec.qos.items():
         if fnmatchcase(topic, glob):
             return qos.values()
@@ -326,7 +317,7 @@ def qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
 
 
 def qos_values(qos: Any) -> dict[str, Any]:
-    """Return what is known of a recorded QoS."""
+    """Return the known policies of a recorded QoS."""
     if qos is None:
         return {}
     return {

@@ -1,11 +1,11 @@
-"""From the nodes and hooks of a job to the entries of a world: imported, arguments parsed."""
+"""Import the nodes and hooks of a job, and parse their arguments."""
 
 from __future__ import annotations
 
 import inspect
 import re
 from collections import Counter
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from inspect import Parameter
@@ -20,12 +20,78 @@ from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
 from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
-from rsltrace.run.plans.executables import Mains
+from rsltrace.run.plans.executables import MainFinder
 from rsltrace.run.plans.processes import Processes
 from rsltrace.run.plans.scheduling import load_target
+from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.trace.model.regular_file import not_regular
+from rsltrace.trace.model.texts import format_duration
 
-# From an entry's ``stdin:`` to what is typed at its terminal.
+
+def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None) -> Iterator[str]:
+    """Yield the entries that can never start, judging by the complete graph.
+
+    ``end_ns`` is when the run ends, if time ends it.
+    """
+    topics = [name for name, _ in graph.topic_names_and_types() if graph.publishers(name)]
+    services = [name for name, _ in graph.service_names_and_types() if graph.services(name)]
+    nodes = [node.fully_qualified_name for node in graph.nodes]
+    for index, spec in enumerate(job.nodes):
+        if spec.container is not None and load_service(spec.container) not in services:
+            near = did_you_mean(spec.container, nodes)
+            yield (
+                f"{_where(job, index, 'container')}: {spec.target} is never loaded: there is no "
+                f"container {spec.container}{near}"
+            )
+        after = spec.start_after
+        if after is None:
+            continue
+        for key, names, missing in (
+            ("topic", topics, "{} has no publisher"),
+            ("service", services, "{} has no server"),
+            ("node", nodes, "no entry makes a node {}"),
+        ):
+            name = getattr(after, key)
+            if name is not None and name not in names:
+                why = missing.format(name) + did_you_mean(name, names)
+                yield f"{_where(job, index, key)}: {spec.target} never starts: {why}"
+        if end_ns is not None and start_ns + after.delay_ns > end_ns:
+            yield (
+                f"{_where(job, index, 'delay')}: {spec.target} never starts: that is "
+                f"{format_duration(after.delay_ns)} after the start, and the run ends "
+                f"{format_duration(end_ns - start_ns)} after it"
+            )
+
+
+def missed_starts(job: Job, missed: Iterable[tuple[str, list[str]]]) -> Iterator[str]:
+    """Yield the entries (keys) that have not started, and what they waited for."""
+    keys = entry_keys(job.nodes)
+    for key, unmet in missed:
+        index = keys.index(key)
+        spec = job.nodes[index]
+        after = spec.start_after
+        waited = [
+            f"{name} {getattr(after, name, None) or _of_container(spec, name)}" for name in unmet
+        ]
+        if not waited:
+            waited = [f"{format_duration(0 if after is None else after.delay_ns)} to pass"]
+        place = _where(job, index, unmet[0] if unmet else "delay")
+        yield f"{place}: {spec.target} has not started: it waited for {' and '.join(waited)}"
+
+
+def _of_container(spec: NodeSpec, name: str) -> str:
+    """Return what a component implicitly waits for."""
+    assert spec.container is not None
+    return load_service(spec.container) if name == "service" else "the component before it"
+
+
+def _where(job: Job, index: int, key: str) -> str:
+    spec = job.nodes[index]
+    place: Loc = ("nodes", index, "start_after", key)
+    if spec.container is not None and spec.start_after is None:
+        place = ("nodes", index, "container")
+    return spec.origin or locate(job, place)
+
 
 _ENTER = b"\r"
 _KEY = re.compile(r"\x1b(?:\[[0-9;]*[ -/]*[@-~]|O[A-Za-z]|[^\x1b])?|.", re.DOTALL)
@@ -33,10 +99,10 @@ _KEY = re.compile(r"\x1b(?:\[[0-9;]*[ -/]*[@-~]|O[A-Za-z]|[^\x1b])?|.", re.DOTAL
 _LINE_MAX = 4000
 
 
-def typed_at(job: Job, index: int) -> list[Typed] | None:
-    """Return what is typed at the terminal of an entry, None if it has none.
+def terminal_input(job: Job, index: int) -> list[Typed] | None:
+    """Return the input for the terminal of an entry, None if it has none.
 
-    :raises JobError: if a file cannot be read or has lines that no terminal takes.
+    :raises JobError: a file cannot be read, or a line is too long.
     """
     stdin = job.nodes[index].stdin
     if stdin is None:
@@ -84,13 +150,13 @@ def node_entries(
     only: Container[int] | None = None,
     told: Callable[[str], None] = lambda text: None,
 ) -> list[Entry]:
-    """Import what the job names and let rcl parse the arguments, before anything is constructed.
+    """Import what the job names and let rcl parse the arguments; nothing is constructed.
 
-    ``only`` are the places in ``nodes:`` of those that are wanted (None: all); ``told`` is given
-    a line if something takes long.
+    ``only`` are the wanted places in ``nodes:`` (None: all); ``told`` is called with a line when
+    something takes long.
     """
     entries = []
-    mains = Mains(job)
+    mains = MainFinder(job)
     processes = Processes(job, told)
     for_all = arguments_for_all(job)
     keys = entry_keys(job.nodes)
@@ -127,7 +193,7 @@ def node_entries(
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
                 start_after=start_rule(job, index, keys),
-                stdin=typed_at(job, index),
+                stdin=terminal_input(job, index),
                 program=program,
                 is_component=spec.component is not None,
                 respawn=None
@@ -144,10 +210,7 @@ def _never() -> object:
 
 
 def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) -> Component:
-    """Return what a container is asked to load.
-
-    :raises JobError: if the service by which that is done is not known here.
-    """
+    """Return the component that a container loads."""
     check_loadable(where)
     assert spec.component is not None
     assert spec.container is not None
@@ -165,7 +228,7 @@ def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) ->
 
 
 def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
-    """Return when an entry starts, None if it does so with the run."""
+    """Return when an entry starts, None if it starts with the run."""
     spec = job.nodes[index]
     after = spec.start_after
 
@@ -178,7 +241,7 @@ def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
         rule = StartRule(after.delay_ns, after.topic, after.service, after.node, started, ended)
     if spec.container is None:
         return rule
-    # A component waits for its container, which loads one after the other.
+    # A component waits for its container, which loads components one by one.
     rule = rule or StartRule()
     before = previous_component(job.nodes, index)
     return replace(
@@ -189,8 +252,7 @@ def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
 
 
 def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
-    """Return the place of the component that the same container loads before, None if there is
-    none that is to start when this one is."""
+    """Return the place of the component that the same container loads before this one, or None."""
     spec = nodes[index]
     for place in range(index - 1, -1, -1):
         other = nodes[place]
@@ -202,7 +264,7 @@ def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
 def arguments_of(job: Job, index: int, for_all: list[str], *, where: str) -> list[RosArguments]:
     """Return the ROS arguments of an entry; ``for_all`` are those of all nodes.
 
-    :raises JobError: if rcl refuses them, or cannot read a parameter file.
+    :raises JobError: rcl refuses them, or cannot read a parameter file.
     """
     _check_parameter_files(job, index)
     spec = job.nodes[index]
@@ -218,7 +280,7 @@ def arguments_of(job: Job, index: int, for_all: list[str], *, where: str) -> lis
 
 
 def _check_parameter_files(job: Job, index: int) -> None:
-    """Raise ``JobError`` at the line of a parameter file that rcl cannot read."""
+    """Raise ``JobError`` at a parameter file that rcl cannot read."""
     spec = job.nodes[index]
     for number, path in enumerate(spec.parameter_files):
         try:
@@ -232,13 +294,13 @@ def _check_parameter_files(job: Job, index: int) -> None:
 
 
 def _check_arguments(job: Job, index: int, target: Any) -> None:
-    """Raise ``JobError`` if a class or function does not take the ``arguments`` of its entry."""
+    """Raise ``JobError`` if a class or function does not accept its ``arguments``."""
     spec = job.nodes[index]
     assert isinstance(spec.arguments, dict)
     try:
         signature = inspect.signature(target, follow_wrapped=False)
     except (TypeError, ValueError):
-        return  # nobody knows
+        return  # unknown
     names = [name for name, one in signature.parameters.items() if one.kind in _BY_NAME]
     takes_any = any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
     for name in spec.arguments:
@@ -246,7 +308,7 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
             takes = f"it takes {', '.join(names)}" if names else "it takes none"
             hint = did_you_mean(name, names, takes)
             wrong = f"{spec.target} takes no argument {name!r}: {hint}"
-            raise _shown(job, ("nodes", index, "arguments", name), wrong)
+            raise _error_with_line(job, ("nodes", index, "arguments", name), wrong)
     try:
         signature.bind(**spec.arguments)
     except TypeError as error:
@@ -254,7 +316,7 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
         raise JobError(f"{spec.target}: {error}; give it in 'arguments:'", where=where) from error
 
 
-def _shown(job: Job, loc: Loc, message: str) -> JobError:
+def _error_with_line(job: Job, loc: Loc, message: str) -> JobError:
     try:
         with showing_line(job, loc):
             raise JobError(message, where=locate(job, loc))
@@ -263,7 +325,7 @@ def _shown(job: Job, loc: Loc, message: str) -> JobError:
 
 
 def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
-    """Return a name for each entry that other entries (of other classes) do not change."""
+    """Return a key for each entry, stable when other entries are added."""
     met: Counter[tuple[str, str | None, str | None]] = Counter()
     keys = []
     for spec in nodes:
@@ -274,9 +336,9 @@ def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
     return keys
 
 
-def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
-    """Add to the error of a constructor the line of the job at which the parameter stands that it
-    refused, or the node, if there are several that are made in the same way."""
+def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
+    """Add to a constructor's error the line of the job: that of the refused parameter, or of the
+    entry if several are made the same way."""
     if error is None:
         return
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
@@ -294,7 +356,7 @@ def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
 def hook_entries(
     job: Job, name: str, target: Target | None, argument: Callable[[], object]
 ) -> list[Entry]:
-    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
+    """Return a hook of the job, if it has it, as an entry. A hook may return more nodes."""
     if target is None:
         return []
     where = locate(job, ("hooks", name))
@@ -304,9 +366,9 @@ def hook_entries(
 
 
 def arguments_for_all(job: Job) -> list[str]:
-    """Return the ROS arguments of all nodes, the paths in them absolute.
+    """Return the ROS arguments of all nodes, with absolute paths.
 
-    :raises JobError: if rcl refuses them.
+    :raises JobError: rcl refuses them.
     """
     words = list(job.ros_arguments)
     for index, word in enumerate(words[:-1]):

@@ -1,8 +1,8 @@
-"""Finding what ``main:``, ``executable:``, ``script:`` and ``module:`` name: what runs it.
+"""Find what ``main:``, ``executable:``, ``script:`` and ``module:`` run.
 
-An executable is a console script of a Python distribution, or a Python script that a ROS package
-has installed (``lib/<package>/<executable>`` below a prefix of the ament index); or what a package
-that nobody has built would install as such. All run as they are, in this process.
+An executable is a console script of a Python distribution, a Python script that a ROS package
+installs (``lib/<package>/<executable>`` below a prefix of the ament index), or what an unbuilt
+package would install as such. All run unchanged in this process.
 """
 
 from __future__ import annotations
@@ -13,13 +13,16 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
+from importlib.machinery import ModuleSpec, SourceFileLoader
 from operator import attrgetter
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 from rsltrace.adapters.processes.build import is_compiled, is_python, why_not_run
 from rsltrace.adapters.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
 from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.adapters.workspace.imports import (
     unbuilt_executables,
     unbuilt_fault,
@@ -27,23 +30,102 @@ from rsltrace.adapters.workspace.imports import (
     unbuilt_programs,
 )
 from rsltrace.errors import JobError, nearest
+from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.job import Job, NodeSpec
-from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.scheduling import load_target
-from rsltrace.run.process import user_modules
+from rsltrace.run.process import run_as_main, user_modules
+from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.trace.model.regular_file import read_regular
+
+# Scripts and modules run as ``__main__``, in a module of that name of their own. So
+# ``unittest.main()``, ``pickle`` and ``dataclasses`` find what the program defines.
 
 
-class Mains:
-    """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
+@dataclass(frozen=True)
+class MainProgram:
+    """Code to run as ``__main__``. Python looks for its modules in ``folder`` first; ``spec`` is
+    None for a script."""
+
+    path: Path
+    code: CodeType
+    folder: str
+    spec: ModuleSpec | None = None
+
+    def __call__(self) -> None:
+        """Run the program as ``__main__``."""
+        names = vars(sys.modules["__main__"])
+        spec = self.spec
+        names.update(
+            __file__=str(self.path),
+            __cached__=None if spec is None else spec.cached,
+            __loader__=SourceFileLoader("__main__", str(self.path))
+            if spec is None
+            else spec.loader,
+            __package__=None if spec is None else spec.parent,
+            __spec__=spec,
+        )
+        sys.path.insert(0, self.folder)
+        exec(self.code, names)
+
+
+def script_program(path: Path, *, what: str = "", where: str) -> MainProgram:
+    """Return a script to run as ``python script.py`` does; ``what`` is its name for messages.
+
+    :raises JobError: if it cannot be read, or is not Python.
+    """
+    what = what or str(path)
+    try:
+        code = code_of_script(read_regular(path), str(path))
+    except OSError as error:
+        raise JobError(f"{what} cannot be read: {error.strerror}", where=where) from None
+    except (SyntaxError, ValueError) as error:
+        raise JobError(f"{what} is not a Python program ({error})", where=where) from None
+    return MainProgram(path, code, str(path.resolve().parent))
+
+
+def module_program(name: str, folder: Path, *, where: str) -> MainProgram:
+    """Return a module to run as ``python -m name`` does in ``folder``; imports its packages.
+
+    :raises JobError: there is no such module, or it is not Python source.
+    """
+    try:
+        spec = run_as_main(name)
+    except ModuleNotFoundError as error:
+        parent = name.rpartition(".")[0]
+        if not f"{parent}.".startswith(f"{error.name}."):
+            raise JobError(cannot_import(parent, error), where=where) from error
+        spec = None
+    except (Exception, SystemExit) as error:
+        raised = import_raised(name.rpartition(".")[0], error, text_of(error))
+        raise JobError(raised, where=where) from error
+    if spec is None:
+        raise JobError(
+            f"there is no module {name!r} to run (looked in search_path and in Python's own path; "
+            "of a package its module __main__ runs); check the name, or add its folder to "
+            "search_path",
+            where=where,
+        )
+    get_code = getattr(spec.loader, "get_code", None)
+    try:
+        code = None if get_code is None else get_code(spec.name)
+    except (ImportError, SyntaxError, ValueError) as error:
+        raise JobError(f"module {name!r} cannot be compiled: {error}", where=where) from error
+    if code is None or spec.origin is None:
+        raise JobError(f"module {name!r} is no Python source: it cannot be run", where=where)
+    return MainProgram(Path(spec.origin), code, str(folder), spec)
+
+
+class MainFinder:
+    """Finds the mains of a job. Each has its package's globals to itself, as a process has."""
 
     def __init__(self, job: Job) -> None:
         self._job = job
         self._packages: set[str] = set()
 
     def find(self, spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
-        """Return what ``sys.argv[0]`` shall be, and the function to call.
+        """Return ``sys.argv[0]`` and the function to call.
 
-        :raises JobError: if there is no such thing, or it is not Python.
+        :raises JobError: it does not exist, or is not Python.
         """
         if spec.executable is not None:
             found = find_executable(spec.executable, where=where)
@@ -67,7 +149,7 @@ class Mains:
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
-        """Import a main's module, or leave that to its program if it uses rclpy's contexts."""
+        """Import a main's module now, or when its program starts if it uses rclpy's contexts."""
         package = re.split("[.:]", target)[0]
         again = package in self._packages
         before = set(sys.modules)
@@ -78,42 +160,40 @@ class Mains:
             folders = [str(self._job.resolve(folder)) for folder in self._job.search_path]
             for name in user_modules(folders).keys() - before:
                 del sys.modules[name]
-            return ImportedMain(target, again=again)
+            return DeferredMain(target, again=again)
         return function
 
     def _without_process(self) -> AbstractContextManager[None]:
-        """Let rclpy be that of no process while a module is imported. In a native run it is the
-        process of the main already."""
+        """Import without a process of rclpy; in a native run it is the main's process."""
         return nullcontext() if boundary().is_free else before_its_process()
 
     def _copied(self, package: str) -> AbstractContextManager[None]:
-        """Let a package be imported once more if somebody else has it already."""
+        """Import a package again if another main has imported it."""
         again = package in self._packages
         self._packages.add(package)
-        return _own_copy(package) if again else nullcontext()
+        return _imported_again(package) if again else nullcontext()
 
 
-class ImportedMain:
+class DeferredMain:
     """A main whose module is imported when it starts, in its own program."""
 
     def __init__(self, target: str, *, again: bool) -> None:
-        """``again``: another one has the module, too."""
+        """``again``: another main has imported the module, too."""
         self._target = target
         self._again = again
 
     def __call__(self) -> object:
-        """Import the module and call the function, as a console script does."""
         module, _, name = self._target.partition(":")
         package = module.partition(".")[0]
         again, self._again = self._again, True  # a program that is restarted imports it once more
-        with _own_copy(package) if again else nullcontext():
+        with _imported_again(package) if again else nullcontext():
             function = attrgetter(name)(importlib.import_module(module))
         return function()
 
 
 @contextmanager
 def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
-    """Let a module see its own arguments when it is imported: ``def main(args=sys.argv):``."""
+    """Set ``sys.argv`` during an import: ``def main(args=sys.argv):``."""
     before = sys.argv
     sys.argv = [name, *spec.arguments]
     try:
@@ -123,8 +203,8 @@ def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
 
 
 @contextmanager
-def _own_copy(package: str) -> Iterator[None]:
-    """Import a package once more than it is: who has it already keeps what it has."""
+def _imported_again(package: str) -> Iterator[None]:
+    """Import a package a second time; those that have it keep their copy."""
 
     def modules() -> dict[str, ModuleType]:
         return {
@@ -145,7 +225,7 @@ def _own_copy(package: str) -> Iterator[None]:
 
 
 def why_not(package: str, name: str) -> str | None:
-    """Return why an executable cannot run here, or None if it can; nothing is imported."""
+    """Return why an executable cannot run here, or None. Nothing is imported."""
     compiled = compiled_file(f"{package}/{name}")
     if compiled is not None:
         reason = why_not_run(compiled)
@@ -158,7 +238,7 @@ def why_not(package: str, name: str) -> str | None:
 
 
 def source_of(target: str, *, where: str) -> str | Path:
-    """Return where an executable's code is: ``module:function``, or a script.
+    """Return the code of an executable: ``module:function``, or a script.
 
     :raises JobError: as ``find_executable``.
     """
@@ -189,16 +269,16 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     known = _packages() | unbuilt_names()
     if not scripts and not files and package not in known:
         raise JobError(
-            f"there is no package {package!r}{_near(package, known, 'install')} it for this Python "
-            "(pip install), add its sources to search_path, source the workspace it is built in, "
-            "or name its function with 'main:'",
+            f"there is no package {package!r}{_did_you_mean_or(package, known, 'install')} it for "
+            "this Python (pip install), add its sources to search_path, or source the workspace "
+            "it is built in",
             where=where,
         )
     available = sorted({*scripts, *files, *sources})
     compiled = unbuilt_programs(package)
     if name in compiled:
         raise JobError(
-            f"{target} is a program that nobody has built (CMakeLists.txt of {package}): build it "
+            f"{target} is a program that is not built (CMakeLists.txt of {package}): build it "
             "(colcon build) and source its workspace (install/setup.bash)",
             where=where,
         )
@@ -208,22 +288,22 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         has += f"; once it is built (colcon build): {listed}"
     if fault := unbuilt_fault(package):
         has += f"; {fault}"
-    it = _near(name, {*available, *compiled}, "it")
+    it = _did_you_mean_or(name, {*available, *compiled}, "it")
     raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 
 
 def compiled_file(target: str) -> Path | None:
-    """Return the file of ``package/name`` if that is a compiled program, else None."""
+    """Return the file of ``package/name`` if it is a compiled program, else None."""
     package, _, name = target.partition("/")
     path = None if name in _console_scripts(package) else _installed_files(package).get(name)
     return path if path is not None and is_compiled(path) else None
 
 
 def process_command(target: str, *, where: str) -> list[str]:
-    """Return what starts ``package/name`` as a process: a ROS package's file, or that of a console
-    script; where none is installed, the code that it would run.
+    """Return the command that starts ``package/name`` as a process: the installed file, or else the
+    code that it would run.
 
-    :raises JobError: if there is no such executable.
+    :raises JobError: there is no such executable.
     """
     package, _, name = target.partition("/")
     found: str | Path | None = _installed_files(package).get(name)
@@ -241,30 +321,30 @@ def process_command(target: str, *, where: str) -> list[str]:
     return [sys.executable, str(found)] if is_python(found) else [str(found)]
 
 
-def _same(name: str) -> str:
-    """Return a distribution's name as package indexes compare it."""
+def _normalized(name: str) -> str:
+    """Return a distribution's name in the normalized form of package indexes."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _console_scripts(package: str) -> dict[str, str]:
-    """Return ``module:function`` by name of a distribution's console scripts."""
+    """Return ``module:function`` of a distribution's console scripts, by name."""
     found: dict[str, str] = {}
     from importlib import metadata
 
     for entry in metadata.entry_points(group="console_scripts"):
-        if entry.dist is not None and _same(entry.dist.name) == _same(package):
+        if entry.dist is not None and _normalized(entry.dist.name) == _normalized(package):
             found.setdefault(entry.name, f"{entry.module}:{entry.attr}")
     return found
 
 
 def _prefixes() -> list[Path]:
-    """Return where ROS packages are installed, as the ament index has it."""
+    """Return the prefixes in which ROS packages are installed."""
     listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     return [Path(folder) for folder in [*listed, sys.prefix] if folder]
 
 
 def _installed_files(package: str) -> dict[str, Path]:
-    """Return what a ROS package has in its ``lib`` folder to be run."""
+    """Return the executable files of a ROS package, by name."""
     found: dict[str, Path] = {}
     for prefix in _prefixes():
         folder = prefix / "lib" / package
@@ -277,7 +357,7 @@ def _installed_files(package: str) -> dict[str, Path]:
 
 
 def _packages() -> set[str]:
-    """Return the names of the packages there are."""
+    """Return the names of all installed packages."""
     from importlib import metadata
 
     names = {dist.name for dist in metadata.distributions() if dist.name}
@@ -288,8 +368,8 @@ def _packages() -> set[str]:
     return names
 
 
-def _near(name: str, names: Iterable[str], word: str) -> str:
-    """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near, to go on from."""
+def _did_you_mean_or(name: str, names: Iterable[str], word: str) -> str:
+    """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near."""
     near = nearest(name, sorted(names))
     if near in (None, name):
         return f": {word}"
@@ -297,10 +377,7 @@ def _near(name: str, names: Iterable[str], word: str) -> str:
 
 
 def _python_script(path: Path, target: str, where: str) -> MainProgram:
-    """Return a Python script to run.
-
-    :raises JobError: if it is something else.
-    """
+    """Return a Python script to run."""
     with path.open("rb") as file:
         first = file.readline(256)
     if is_compiled(path):
@@ -314,6 +391,3 @@ def _python_script(path: Path, target: str, where: str) -> MainProgram:
         "the graph what it publishes from a bag",
         where=where,
     )
-
-
-__all__ = ["Mains", "compiled_file", "find_executable", "process_command", "source_of"]

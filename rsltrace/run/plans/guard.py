@@ -1,4 +1,4 @@
-"""The guard of a run, as its job wants it."""
+"""The guard of a run."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ _ONE_PROCESSOR = "'taskset --cpu-list 0' before 'rsltrace record' gives it one p
 
 
 class _TorchGenerators(EventObserver):
-    """Gives each node's code the state of torch's generator that is the node's own."""
+    """Gives each node its own state of torch's random generator."""
 
     order = ObserverOrder.GENERATORS
 
@@ -61,13 +61,12 @@ class _TorchGenerators(EventObserver):
         self._name_of = name_of
 
     def before_event(self, call: EventCall) -> bool:
-        """Enter the node whose code is going to run."""
         self._event.handle, self._event.node = call.handle, call.node
         self._streams.enter(self._name_of())
         return True
 
     def node_entered(self, node: object, *, is_made: bool) -> None:
-        """Enter a node, or give the state of who makes one its name."""
+        """Enter a node, or rename its maker's state to it."""
         (self._streams.rename if is_made else self._streams.enter)(self._name_of())
 
 
@@ -84,7 +83,7 @@ class RunGuard:
         self._has_torch = False
 
     def begin(self, world: World, replay: Path | None = None) -> None:
-        """Make the guard of a world: from here on ``engaged`` puts it in charge."""
+        """Make the guard of a world; ``engaged`` activates it."""
         from rsltrace.adapters.rclpy.guard_context import GuardContext
 
         loop, dispatcher = world.domain.loop, world.domain.dispatcher
@@ -104,7 +103,7 @@ class RunGuard:
                 GuardContext(world.stacks, world.clocks),
                 policy=policy_of(job.guard),
                 seed=job.seed,
-                packages=packages_of(job.nodes),
+                packages=node_packages(job.nodes),
                 on_finding=on_finding,
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
@@ -123,14 +122,14 @@ class RunGuard:
             self.torch_loaded()
 
     def _begin_log_time(self, now_ns: int) -> None:
-        """Let ``logging`` count the time of a record from the begin of the run."""
+        """Let ``logging`` count time from the start of the run."""
         module: Any = logging
         self._stack.callback(setattr, module, "_startTime", module._startTime)
         whole = isinstance(module._startTime, int)  # nanoseconds, from Python 3.13 on
         module._startTime = now_ns if whole else now_ns / 1e9
 
     def torch_loaded(self) -> None:
-        """Give each node a state of torch's generator from now on."""
+        """Give each node its own state of torch's generator from now on."""
         world, guard = self._world, self.guard
         if world is None or guard is None or self._has_torch:
             return
@@ -141,8 +140,8 @@ class RunGuard:
         )
         streams.enter(guard.context.node())
 
-    def stays_threaded(self, library: str, why: str) -> None:
-        """Report a library that computes in threads of its own, which cannot be pinned."""
+    def report_unpinned_library(self, library: str, why: str) -> None:
+        """Report a library whose threads cannot be pinned."""
         if self.guard is None:
             self._unpinned.append((library, why))  # met before the run
             return
@@ -158,19 +157,18 @@ class RunGuard:
             guard.report(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
-        """Write down what was found before there was a trace: when modules were imported."""
+        """Record the findings of imports, from before the trace was open."""
         for finding in self._early:
             recorder.finding(finding, now_ns)
         self._early.clear()
 
     @property
     def counts(self) -> tuple[GuardCount, ...]:
-        """How often each call was met so far."""
         counts = self.guard.counts if self.guard is not None else {}
         return tuple(GuardCount(*key, count) for key, count in sorted(counts.items()))
 
     def write(self, writer: TraceWriter) -> None:
-        """Put the summary into the trace, if there is anything to say."""
+        """Write the summary into the trace."""
         summary = {}
         if self.counts:
             summary["calls"] = counts_text(self.counts)
@@ -182,17 +180,17 @@ class RunGuard:
             writer.add_metadata(METADATA_GUARD, summary)
 
     def engaged(self) -> AbstractContextManager[None]:
-        """Put the guard in charge of what this thread does now."""
+        """Let the guard apply to this thread."""
         return nullcontext() if self.guard is None else engage(self.guard)
 
 
 def install_guard(stack: ExitStack, job: Job) -> RunGuard:
-    """Put the replacements in place until ``stack`` ends."""
+    """Install the replacements until ``stack`` ends."""
     made = RunGuard(job, stack)
     if job.guard.enabled:
         if job.guard.pins:
             stack.enter_context(pinned_place())
-            stack.enter_context(one_tbb_thread(made.stays_threaded))
+            stack.enter_context(one_tbb_thread(made.report_unpinned_library))
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
@@ -208,18 +206,18 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
             if name in sys.modules:
                 begin()
         on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(user_modules(packages_of(job.nodes), on_loaded, rewrites=orders))
+        stack.enter_context(user_modules(node_packages(job.nodes), on_loaded, rewrites=orders))
     return made
 
 
 def _orders_sets(job: Job) -> bool:
-    """Return whether sets are to be looked at anywhere: else all code is compiled as it is."""
+    """Whether the guard rewrites uses of sets; otherwise code is compiled unchanged."""
     policies = [policy_of(job.guard)]
     policies += [policy_of(job.guard, spec.guard) for spec in job.nodes if spec.guard is not None]
     modes = (policy.modes.get(Source.ORDER, Mode.VIRTUAL) for policy in policies)
     return any(mode is not Mode.ALLOW for mode in modes)
 
 
-def packages_of(nodes: Sequence[NodeSpec]) -> frozenset[str]:
-    """Return the packages that nodes are in: the user's, wherever they are."""
+def node_packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+    """Return the packages of the nodes: user code, wherever it is installed."""
     return frozenset(spec.package for spec in nodes) - {"", "rsltrace", "rclpy"}

@@ -1,4 +1,4 @@
-"""From a job's ``delay:`` to the plan of a network: models, files read, times made absolute."""
+"""Make the delay and clock models of a job: files are read, times made absolute."""
 
 from __future__ import annotations
 
@@ -33,11 +33,9 @@ from rsltrace.simulation.chance.distribution import (
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.trace.model.texts import format_duration
 
-# From a job's ``clocks:`` to the clocks of its nodes.
-
 
 def clocks_of(job: Job) -> tuple[ClockRule, ...]:
-    """Return what is different about clocks, the first that fits first."""
+    """Return the rules for the nodes' clocks; the first match counts."""
     found = []
     for spec in job.clocks:
         random = spec.random_jumps
@@ -53,7 +51,7 @@ def clocks_of(job: Job) -> tuple[ClockRule, ...]:
 
 
 def clock_notes(job: Job, start_ns: int) -> Iterator[str]:
-    """Yield the clocks that would show times before 0 when they are set."""
+    """Yield the clocks that would show times before 0."""
     for index, spec in enumerate(job.clocks):
         wrong_ns = spec.offset_ns
         settings: list[tuple[Loc, int]] = [(("clocks", index, "offset"), start_ns + wrong_ns)]
@@ -72,22 +70,22 @@ def clock_notes(job: Job, start_ns: int) -> Iterator[str]:
 
 
 def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
-    """Return the plan of a job's delays, or None if it has none.
+    """Return the plan of a job's delays, or None.
 
-    :raises JobError: if a file of delays is wrong.
+    :raises JobError: a file of delays is wrong.
     """
     delay = job.delay
     if delay is None:
         return None
     return NetworkPlan(
         links=tuple(
-            LinkRule(spec.topic, spec.sender, spec.receiver, model_of(job, spec))
+            LinkRule(spec.topic, spec.sender, spec.receiver, link_model(job, spec))
             for spec in delay.links
         ),
-        topics=tuple(NameRule(name, model_of(job, s)) for name, s in delay.topics.items()),
+        topics=tuple(NameRule(name, link_model(job, s)) for name, s in delay.topics.items()),
         table=_table(job, delay.file),
-        services=tuple(NameRule(name, model_of(job, s)) for name, s in delay.services.items()),
-        default=None if delay.default is None else model_of(job, delay.default),
+        services=tuple(NameRule(name, link_model(job, s)) for name, s in delay.services.items()),
+        default=None if delay.default is None else link_model(job, delay.default),
         outages=tuple(
             OutageRule(*spec.what, Outage(start_ns + spec.from_ns, start_ns + spec.to_ns))
             for spec in delay.outages
@@ -103,13 +101,12 @@ def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
     name = job.shown(file)
     rows = read_rslcpp(job.resolve(file), name)
     return tuple(
-        NameRule(topic, model_of(job, spec), f"{name}:{line}")
+        NameRule(topic, link_model(job, spec), f"{name}:{line}")
         for topic, (line, spec) in rows.items()
     )
 
 
-def model_of(job: Job, spec: DelaySpec) -> Model:
-    """Return the model that a job describes."""
+def link_model(job: Job, spec: DelaySpec) -> Model:
     burst = spec.burst
     return Model(
         delay=distribution_of(job, spec) if spec.kinds() else None,
@@ -124,7 +121,7 @@ def model_of(job: Job, spec: DelaySpec) -> Model:
 
 
 def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
-    """Return the distribution that a job describes; files are read."""
+    """Return the distribution of a job's spec; reads files."""
     if spec.constant_ns is not None:
         return Constant(spec.constant_ns)
     if spec.uniform is not None:

@@ -1,4 +1,4 @@
-"""Entries that run as processes of their own: what to start, with which words and surroundings."""
+"""Entries that run as separate processes: their command lines and environments."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from rsltrace.trace.model.texts import printable
 
 
 class Processes:
-    """Makes the command lines of a job's processes; the first needs the library to be built."""
+    """Makes the command lines of a job's processes; the first one builds the library."""
 
     def __init__(self, job: Job, told: Callable[[str], None]) -> None:
         self._job = job
@@ -54,10 +54,10 @@ class Processes:
     def find(
         self, spec: NodeSpec, arguments: Sequence[RosArguments], *, where: str
     ) -> Program | None:
-        """Return what an entry starts as a process, None if it runs in the process of the run.
+        """Return the process that an entry starts, None if it runs in this process.
 
-        :raises JobError: if there is no such file, or it cannot be executed.
-        :raises SetupError: if the library cannot be built.
+        :raises JobError: the file does not exist or is not executable.
+        :raises SetupError: the library cannot be built.
         """
         command = self.command(spec, where)
         if command is None:
@@ -81,8 +81,8 @@ class Processes:
 
     @cached_property
     def search_path(self) -> list[str]:
-        """Where modules are: those of packages that nobody has built come first, since folders
-        with sources (``src/my_robot/my_robot``) look like packages themselves."""
+        """The module folders; unbuilt packages first, since source folders
+        (``src/my_robot/my_robot``) look like packages themselves."""
         from rsltrace.adapters.workspace.installs import (
             module_folders,  # which loads a parser of XML
         )
@@ -92,15 +92,15 @@ class Processes:
 
     @cached_property
     def prefixes(self) -> list[str]:
-        """Where the shares of those packages are, and of wheels, as in the process of the run."""
+        """The install prefixes of these packages and of wheels, as in this process."""
         found = [str(path) for name in sorted(unbuilt_names()) if (path := unbuilt_prefix(name))]
         has_wheels = Path(sys.prefix, "share", "ament_index").is_dir()
         return [*found, sys.prefix] if has_wheels else found
 
     def folder(self, spec: NodeSpec, where: str) -> Path | None:
-        """Return where an entry runs, None if that is the present folder.
+        """Return the working directory of an entry, None for the current one.
 
-        :raises JobError: if there is no such folder.
+        :raises JobError: it does not exist.
         """
         if spec.working_directory is None:
             return None
@@ -110,9 +110,9 @@ class Processes:
         return folder
 
     def command(self, spec: NodeSpec, where: str) -> list[str] | None:
-        """Return the words that start an entry, but for its own; None if it is no process.
+        """Return the command of an entry without its arguments; None if it is not a process.
 
-        :raises JobError: if there is no such file, or it cannot be executed.
+        :raises JobError: the file does not exist or is not executable.
         """
         if spec.program is not None:
             return _executable(self._job.resolve(spec.program), spec.program, where)
@@ -167,10 +167,7 @@ def _executable(path: Path, given: str, where: str) -> list[str]:
 
 
 def _message_type(name: str) -> MessageType:
-    """Return a type as the trace has it: by name only if Python cannot say what is in it.
-
-    :raises RunError: if rosidl did not generate the class of that name.
-    """
+    """Return a message type; by name only if Python has no class for it."""
     try:
         found = get_message_class(name)
     except SetupError:  # its package has nothing for Python
@@ -199,15 +196,15 @@ def _service_type(name: str) -> ServiceType:
 
 
 def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
-    """Return what a clock of a process shows, and whether it does so throughout the event."""
+    """Return what a process's clock shows, and whether that is constant during the event."""
     clocks, now_ns = world.clocks, world.domain.loop.now_ns
     assert clocks is not None, "the job has some"
     shown_ns = clocks.look(node, now_ns) if looks else clocks.shows(node, now_ns)
     return shown_ns, not clocks.advances(node)
 
 
-def process_door(job: Job, world: World) -> ProcessDoor:
-    """Return the door through which a job's processes take part in its world."""
+def make_process_adapter(job: Job, world: World) -> ProcessDoor:
+    """Return the adapter through which a job's processes take part in its world."""
     interfaces = Interfaces(_message_type, _service_type)
     door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
     programs = world.stacks.programs

@@ -1,4 +1,4 @@
-"""From ``policy: {recorded: …}`` to the order that a run follows, and what a run writes for it."""
+"""Follow the order of a recording (``policy: {recorded: …}``), and record what that needs."""
 
 from __future__ import annotations
 
@@ -10,32 +10,32 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
-from rsltrace.run.plans.scheduling import of_order, own_policy
+from rsltrace.run.plans.scheduling import policy_named, user_policy
 from rsltrace.simulation.chance.stream import Stream
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.policy import (
-    After,
     Candidate,
-    Choices,
     Departure,
     Departures,
     Fifo,
+    FifoUntil,
     Moment,
     Pct,
     Policy,
+    PolicyChoices,
     Priority,
     PriorityRule,
     decoded,
 )
-from rsltrace.simulation.loop.recorded import (
+from rsltrace.simulation.loop.recorded_order import (
     CALLBACKS,
     THE_RUN,
-    ObservedCallback,
-    ObservedOrder,
-    Recorded,
+    NativeCallback,
+    NativeOrder,
     RecordedEvent,
-    described,
+    RecordedOrder,
+    entity_text,
 )
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from rsltrace.trace.model.event import EventKind
@@ -45,7 +45,10 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import (
+        NativeOrderObserver,
+        RecordedOrderObserver,
+    )
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.simulation.loop.policy``."""
@@ -53,13 +56,18 @@ ATTACHMENT_POLLS = "rsltrace/polls"
 """From when on executors had polling points, see ``OrderedLoop.polls``."""
 
 
-def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | ObservedRun | None:
-    """Have a run follow the order of a recording, if the job says so; it stays open as long as
-    ``stack``. That of a native run is followed where it can be.
+def follow_recording(
+    job: Job, domain: Domain, stack: ExitStack
+) -> RecordedOrderObserver | NativeOrderObserver | None:
+    """Let a run follow the order of a recording, if the job says so; the recording stays open as
+    long as ``stack``. The order of a native run is followed where possible.
 
-    :raises JobError: if the recording cannot be read, or has nothing to follow.
+    :raises JobError: the recording cannot be read, or has no events.
     """
-    from rsltrace.simulation.middleware.events.recorded_run import ObservedRun, RecordedRun
+    from rsltrace.simulation.middleware.events.recorded_order_observer import (
+        NativeOrderObserver,
+        RecordedOrderObserver,
+    )
 
     if job.policy is None or job.policy.recorded is None:
         return None
@@ -69,13 +77,15 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
     file = Path(job.policy.recorded).name
     if is_native(trace):
         events = enumerate(_events(trace))
-        observed = [ObservedCallback(index, one) for index, one in events if one.kind in CALLBACKS]
-        return ObservedRun(domain.dispatcher, ObservedOrder(file, observed, census.describe_all()))
-    order = Recorded(file, _Events(trace).event, _chosen(trace), census.describe_all())
+        observed = [NativeCallback(index, one) for index, one in events if one.kind in CALLBACKS]
+        return NativeOrderObserver(
+            domain.dispatcher, NativeOrder(file, observed, census.describe_all())
+        )
+    order = RecordedOrder(file, _EventCursor(trace).event, _chosen(trace), census.describe_all())
     from_ns = _polls_from_ns(trace)
     if from_ns is not None:
-        order.poll_as(RclpyWaitSet() if from_ns < 0 else After(from_ns, RclpyWaitSet()))
-    return RecordedRun(domain.dispatcher, order, is_whole=trace.complete)
+        order.poll_as(RclpyWaitSet() if from_ns < 0 else FifoUntil(from_ns, RclpyWaitSet()))
+    return RecordedOrderObserver(domain.dispatcher, order, is_whole=trace.complete)
 
 
 def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
@@ -94,14 +104,14 @@ def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
     return trace
 
 
-def note_choices(loop: EventLoop) -> None:
-    """Have a loop remember what its policy chooses; what comes first needs no remembering."""
+def remember_choices(loop: EventLoop) -> None:
+    """Let a loop remember its policy's choices; FIFO needs none."""
     if isinstance(loop, OrderedLoop) and not isinstance(loop.policy, Fifo):
-        loop.choices = Choices()
+        loop.choices = PolicyChoices()
 
 
-def keep_choices(writer: TraceWriter, loop: EventLoop) -> None:
-    """Write down what a policy has chosen, if it had a choice."""
+def write_choices(writer: TraceWriter, loop: EventLoop) -> None:
+    """Write a policy's choices into the trace."""
     if isinstance(loop, OrderedLoop) and loop.choices:
         data = loop.choices.encoded()
         writer.add_attachment(ATTACHMENT_CHOICES, "application/octet-stream", data)
@@ -112,19 +122,19 @@ def keep_choices(writer: TraceWriter, loop: EventLoop) -> None:
 
 
 def _polls_from_ns(trace: Trace) -> int | None:
-    """Return from when on the recording's executors polled, None if they did not."""
+    """Return from when on the recorded executors polled, or None."""
     data = trace.attachment(ATTACHMENT_POLLS)
     if data is not None:
         return int(data)
     policy = (json.loads(trace.job.get("resolved") or "null") or {}).get("policy") or {}
-    made = None if policy.get("after_ns") else of_order(str(policy.get("order")), 0)
+    made = None if policy.get("after_ns") else policy_named(str(policy.get("order")), 0)
     return getattr(made, "polls_from_ns", None)  # it was cut off
 
 
 def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:
-    """Return what chooses as the recording's policy did, None if nobody knows.
+    """Return the function that repeats the choices of the recording's policy, or None.
 
-    A recording that was cut off has no choices; its policy, made again, makes the same ones.
+    An incomplete recording has no choices; its policy, made again, makes the same ones.
     """
     data = trace.attachment(ATTACHMENT_CHOICES)
     if data is not None:
@@ -150,12 +160,12 @@ def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
         return Pct(Stream(seed, "pct"), **spec["pct"])
     if spec.get("function") is not None:
         with suppress(JobError):
-            return own_policy(spec["function"], "")
-    return of_order(str(spec.get("order")), seed)
+            return user_policy(spec["function"], "")
+    return policy_named(str(spec.get("order")), seed)
 
 
-class _Events:
-    """The events of a recording up to its end, read once, from the first to the last."""
+class _EventCursor:
+    """Reads the events of a recording once, in order."""
 
     def __init__(self, trace: Trace) -> None:
         self._following = _events(trace)
@@ -163,7 +173,7 @@ class _Events:
         self._present: RecordedEvent | None = None
 
     def event(self, index: int) -> RecordedEvent | None:
-        """Return the event of an index, which is no less than that of the call before."""
+        """Return the event of an index, which must not decrease from call to call."""
         while self._next <= index:
             self._present = next(self._following, None)
             self._next += 1
@@ -174,7 +184,7 @@ def _events(trace: Trace) -> Iterator[RecordedEvent]:
     names = {}
     for entity in trace.entities.values():
         node = trace.node_of(entity).name if entity.node else ""
-        names[entity.id] = described(entity, node)
+        names[entity.id] = entity_text(entity, node)
     left = trace.event_count if trace.ended_after is None else trace.ended_after
     for rows in trace.events():
         for stamp, kind, entity_id in zip(

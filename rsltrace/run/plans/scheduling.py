@@ -15,10 +15,10 @@ from rsltrace.job.values.times import format_size
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.simulation.chance.stream import Stream
 from rsltrace.simulation.loop.policy import (
-    After,
     Departure,
     Departures,
     Fifo,
+    FifoUntil,
     Pct,
     Permutation,
     Policy,
@@ -131,10 +131,10 @@ def policy_of_job(job: Job, start_ns: int) -> Policy:
     if spec is None:
         return Fifo()
     policy = _policy(job, spec)
-    return policy if spec.after_ns is None else After(start_ns + spec.after_ns, policy)
+    return policy if spec.after_ns is None else FifoUntil(start_ns + spec.after_ns, policy)
 
 
-def going_on(policy: Policy, before: Policy) -> Policy:
+def continued_policy(policy: Policy, before: Policy) -> Policy:
     """Return a policy that goes on in the middle of a run, in the place of another one."""
     if isinstance(policy, Departures) and isinstance(before, Departures):
         policy.choices = before.choices
@@ -144,7 +144,7 @@ def going_on(policy: Policy, before: Policy) -> Policy:
 def _policy(job: Job, spec: PolicySpec) -> Policy:
     seed = job.seed if spec.seed is None else spec.seed
     if spec.order is not None:
-        policy = of_order(spec.order, seed)
+        policy = policy_named(spec.order, seed)
         assert policy is not None, "the job has been checked"
         return policy
     if spec.priority is not None:
@@ -154,7 +154,7 @@ def _policy(job: Job, spec: PolicySpec) -> Policy:
         return Departures(Departure(one.choice, one.run, one.of) for one in spec.departures)
     if spec.pct is not None:
         return Pct(Stream(seed, "pct"), spec.pct.depth, spec.pct.choices)
-    return own_policy(spec.function, locate(job, ("policy", "function")))
+    return user_policy(spec.function, locate(job, ("policy", "function")))
 
 
 def unmet_departures(job: Job, policy: Policy) -> Iterator[str]:
@@ -170,7 +170,7 @@ def unmet_departures(job: Job, policy: Policy) -> Iterator[str]:
             )
 
 
-def of_order(order: str, seed: int) -> Policy | None:
+def policy_named(order: str, seed: int) -> Policy | None:
     """Return the policy that a job calls by a word alone, None if there is none of that name."""
     if order == "permutation":
         return Permutation(Stream(seed, "permutation"))
@@ -183,7 +183,7 @@ def of_order(order: str, seed: int) -> Policy | None:
     return makers[order]() if order in makers else None
 
 
-def own_policy(function: Any, where: str) -> Policy:
+def user_policy(function: Any, where: str) -> Policy:
     """Make a policy of the user's own.
 
     :raises JobError: beginning with ``where``, if there is no such class, or it is no policy.

@@ -1,8 +1,8 @@
-"""One way from a sender to a receiver: how long a message takes, whether it arrives, in what order.
+"""The delay, loss and order of messages on one link.
 
-``Model`` describes, ``Channel`` is one link's state in a run. Each purpose (delay, drop, burst,
-duplicate, the delay of the copy) has a stream of its own, so that switching one on does not change
-what others draw.
+``Model`` describes a link, ``LinkChannel`` is its state in a run. Each purpose (delay,
+drop, burst, duplicate, the delay of the copy) has a random stream of its own, so
+enabling one does not change what others draw.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ _ATTEMPTS_MAX = 1000
 
 @dataclass(frozen=True, slots=True)
 class Burst:
-    """Loss in bursts, after Gilbert and Elliott: a chain of a good and a bad state.
+    """Loss in bursts (Gilbert and Elliott): a Markov chain of a good and a bad state.
 
-    Probabilities per message: of going from good to bad and back, and of a loss in each state.
+    Probabilities per message: of changing state in each direction, and of a loss in each state.
     """
 
     good_to_bad: float
@@ -37,7 +37,7 @@ class Burst:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """What happens to the messages of a link. ``None`` for a delay of nothing.
+    """What happens to the messages of a link. No ``delay``: they arrive at once.
 
     ``retransmit_ns`` is what each loss costs on a reliable link. ``keep_order``: a message never
     overtakes an earlier one of its link.
@@ -59,16 +59,16 @@ class Outage:
     to_ns: int
 
 
-NO_MODEL = Model()
+PERFECT_LINK = Model()
 
 
-class Channel:
+class LinkChannel:
     """The messages of one link, in the order in which they are sent.
 
-    ``transmit`` returns the delay in ns, or one of the ``LOST_…`` codes. After it ``duplicate_ns``
-    is the delay of a second copy, or -1; ``held_until_ns`` is the end of the outage through which
-    a reliable link held the message back, or -1. ``plain`` is the sampler of a link that does
-    nothing but delay, for callers in a hurry; ``keep_order`` is then theirs to see to.
+    ``transmit`` returns the delay in ns, or one of the ``LOST_…`` codes. It sets ``duplicate_ns``,
+    the delay of a second copy (or -1), and ``held_until_ns``, the end of the outage that held the
+    message back on a reliable link (or -1). ``plain`` is the sampler of a link that only delays;
+    who uses it directly has to keep the order.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Channel:
         self.held_until_ns = -1
         self._model = model
         self._reliable = reliable
-        self.outages = _joined(outages)
+        self.outages = _merge_outages(outages)
         self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
         self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
         self._drop = Stream(seed, f"{name}\0drop").uniform
@@ -104,7 +104,7 @@ class Channel:
         if self.plain is not None:
             delay_ns = self.plain(now_ns)
         else:
-            delay_ns = self._troubled(now_ns)
+            delay_ns = self._transmit_unreliably(now_ns)
             if delay_ns < 0:
                 return delay_ns
         if self.keep_order:
@@ -117,13 +117,13 @@ class Channel:
         return delay_ns
 
     def hold_back(self, until_ns: int) -> None:
-        """Let nothing arrive before ``until_ns`` where the order is kept: something was late."""
+        """Let nothing arrive before ``until_ns`` where the order is kept."""
         self._last_ns = max(self._last_ns, until_ns)
 
-    def _troubled(self, now_ns: int) -> int:
-        """Return the delay over a link that may lose, duplicate or be cut off.
+    def _transmit_unreliably(self, now_ns: int) -> int:
+        """Return the delay over a link with losses, duplicates or outages.
 
-        What is lost has its delay drawn, too, so that losses leave the delays of others alone.
+        A lost message's delay is drawn, too, so losses do not change the delays of others.
         """
         self.duplicate_ns = self.held_until_ns = -1
         waited_ns = 0
@@ -153,7 +153,7 @@ class Channel:
         return waited_ns + self._delay(sent_ns)
 
     def _lost(self) -> int:
-        """Draw whether an attempt is lost; return the code of the loss, or 0."""
+        """Draw whether an attempt is lost; return its code, or 0."""
         model = self._model
         burst = model.burst
         if burst is not None:
@@ -170,15 +170,14 @@ class Channel:
         return 0
 
     def cut_off_until(self, now_ns: int) -> int | None:
-        """Return the end of the outage at ``now_ns``, or None."""
         for outage in self.outages:
             if outage.from_ns <= now_ns < outage.to_ns:
                 return outage.to_ns
         return None
 
 
-def _joined(outages: Sequence[Outage]) -> tuple[Outage, ...]:
-    """Return outages in order, those that overlap or touch as one."""
+def _merge_outages(outages: Sequence[Outage]) -> tuple[Outage, ...]:
+    """Return outages in order; those that overlap or touch are merged."""
     found: list[Outage] = []
     for outage in sorted(outages, key=lambda outage: outage.from_ns):
         if found and outage.from_ns <= found[-1].to_ns:
@@ -188,10 +187,8 @@ def _joined(outages: Sequence[Outage]) -> tuple[Outage, ...]:
     return tuple(found)
 
 
-# Which model each link of a graph has: the rules of a job, by the names of topics and nodes.
-
 QUIET_TOPICS = frozenset(("/rosout", "/parameter_events"))
-"""Topics that the default delay leaves alone: nobody's behaviour is meant when it is set."""
+"""Topics without the default delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,8 +222,8 @@ class OutageRule:
 
 @dataclass(frozen=True, slots=True)
 class NetworkPlan:
-    """The rules of a job. Of links the first that matches counts, then an exact name, then globs
-    in order, then ``table`` (from a file of delays), then the default."""
+    """The rules of a job. The first matching rule of ``links`` counts, then an exact name in
+    ``topics``, then globs in order, then ``table`` (a file of delays), then the default."""
 
     links: tuple[LinkRule, ...] = ()
     topics: tuple[NameRule, ...] = ()
@@ -239,8 +236,8 @@ class NetworkPlan:
 
     def topic_channel(
         self, topic: str, sender: tuple[str, int], receiver: tuple[str, int], *, reliable: bool
-    ) -> Channel | None:
-        """Return the channel of a link, or None if nothing is ever the matter with it.
+    ) -> LinkChannel | None:
+        """Return the channel of a link, or None if it is perfect.
 
         Ends are (node, which of its endpoints of that topic, from 0).
         """
@@ -250,25 +247,20 @@ class NetworkPlan:
         return self._channel(model, outages, name, reliable=reliable)
 
     def topic_model(self, topic: str, sender: str, receiver: str) -> Model | None:
-        """Return the model of a link from node to node, None if it has none."""
+        """Return the model of a link between two nodes, or None."""
         model = self._link_model(topic, sender, receiver)
-        if model is None:
-            model = _by_name(self.topics, topic)
-        if model is None:
-            model = _by_name(self.table, topic)
-        if model is None and topic not in QUIET_TOPICS:
-            model = self.default
-        return model
+        model = model or _by_name(self.topics, topic) or _by_name(self.table, topic)
+        return self.default if model is None and topic not in QUIET_TOPICS else model
 
     def service_model(self, service: str) -> Model | None:
-        """Return the model of a service's requests and responses, None if they have none."""
+        """Return the model of a service's requests and responses, or None."""
         model = _by_name(self.services, service)
         return self.default if model is None else model
 
     def service_channel(
         self, service: str, client: tuple[str, int], server: tuple[str, int], direction: str
-    ) -> Channel | None:
-        """Return the channel of requests or responses (``direction``) of a client to a server."""
+    ) -> LinkChannel | None:
+        """Return the channel of requests or responses (``direction``) between client and server."""
         model = self.service_model(service)
         if model is not None and model.duplicate > 0.0:
             model = replace(model, duplicate=0.0)  # a request is answered once
@@ -278,11 +270,11 @@ class NetworkPlan:
 
     def _channel(
         self, model: Model | None, outages: tuple[Outage, ...], name: str, *, reliable: bool
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         if model is None and not outages:
             return None
-        return Channel(
-            model or NO_MODEL,
+        return LinkChannel(
+            model or PERFECT_LINK,
             seed=self.seed,
             name=name,
             start_ns=self.start_ns,

@@ -1,8 +1,7 @@
-"""What a delay or an execution time may be: frozen values that describe, and samplers that draw.
+"""Distributions of delays and execution times: frozen descriptions, and samplers that draw.
 
-All parameters are nanoseconds unless said otherwise. ``sampler`` binds a description to a stream
-and to the start of the run; what it returns is called with the present time and gives nanoseconds,
-never negative.
+Parameters are nanoseconds unless stated. ``sampler`` binds a description to a random stream and the
+start of the run; it is called with the current time and returns nanoseconds, never negative.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from functools import partial
 from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
-from rsltrace.simulation.chance.exact import exp, log
+from rsltrace.simulation.chance.stream import exp, log
 
 if TYPE_CHECKING:
     from rsltrace.simulation.chance.stream import Stream
@@ -99,7 +98,7 @@ def _ratio(pair: tuple[tuple[float, ...], tuple[float, ...]], r: float) -> float
     return above / below
 
 
-def quantile(p: float) -> float:
+def normal_quantile(p: float) -> float:
     """Return x with P(X <= x) = p for a standard normal X; 0 < p < 1."""
     q = p - 0.5
     if -0.425 <= q <= 0.425:
@@ -160,7 +159,7 @@ class Normal:
 
         def draw(now_ns: int) -> int:
             while True:
-                value = mean + sd * quantile(uniform())
+                value = mean + sd * normal_quantile(uniform())
                 if value >= 0.0:
                     return int(min(value, LONGEST_NS) + 0.5)
 
@@ -176,7 +175,6 @@ class Lognormal:
 
     @classmethod
     def of_moments(cls, mean_ns: float, sd_ns: float) -> Lognormal:
-        """Return the one with this mean and standard deviation."""
         square = (sd_ns / mean_ns) * (sd_ns / mean_ns)
         spread = 1.0 + square
         if square < 1e-12:  # of which the sum keeps too little: log(1 + x) is x there
@@ -185,7 +183,9 @@ class Lognormal:
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:
         uniform, median, sigma = stream.uniform, self.median_ns, self.sigma
-        return lambda now_ns: int(min(median * exp(sigma * quantile(uniform())), LONGEST_NS) + 0.5)
+        return lambda now_ns: int(
+            min(median * exp(sigma * normal_quantile(uniform())), LONGEST_NS) + 0.5
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +201,6 @@ class Gamma:
 
     @classmethod
     def of_moments(cls, mean_ns: float, sd_ns: float) -> Gamma:
-        """Return the one with this mean and standard deviation."""
         ratio = mean_ns / sd_ns
         return cls(ratio * ratio, sd_ns / ratio)
 
@@ -213,7 +212,7 @@ class Gamma:
 
         def draw(now_ns: int) -> int:
             while True:
-                x = quantile(uniform())
+                x = normal_quantile(uniform())
                 v = 1.0 + c * x
                 if v <= 0.0:
                     continue

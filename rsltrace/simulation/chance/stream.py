@@ -1,22 +1,56 @@
-"""Named streams of random numbers: one per link, so that no link disturbs another.
+"""Named streams of random numbers: one per link, so that links do not disturb each other.
 
-A stream is a function of (seed, name, counter) and of nothing else. Adding, removing or renaming
-one leaves all others as they were, which a generator shared by all cannot promise.
+A stream is a function of (seed, name, counter) only. Adding, removing or renaming one leaves all
+others unchanged, which a shared generator cannot promise.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from hashlib import blake2b, shake_128
-from itertools import chain
+from itertools import accumulate, chain
+from math import frexp, ldexp
 
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.simulation.chance.exact import log
+# C libraries differ in the last bit of ``log`` and ``exp``. These use only operations that IEEE 754
+# rounds correctly, in a fixed order, and are good to about 1e-15.
+
+_SQRT_HALF = 0.7071067811865476
+_LN2_HIGH = 0.693147180369123816490
+_LN2_LOW = 1.90821492927058770002e-10
+_LOG2_E = 1.4426950408889634
+_LOG_TERMS = tuple(1.0 / k for k in range(25, 0, -2))
+_EXP_TERMS = tuple(1.0 / k for k in range(16, 0, -1))
+
+
+def log(x: float) -> float:
+    """Return the natural logarithm of ``x > 0``, by the series of atanh."""
+    fraction, exponent = frexp(x)
+    if fraction < _SQRT_HALF:
+        fraction *= 2.0
+        exponent -= 1
+    s = (fraction - 1.0) / (fraction + 1.0)
+    square = s * s
+    total = 0.0
+    for coefficient in _LOG_TERMS:
+        total = total * square + coefficient
+    return exponent * _LN2_HIGH + (2.0 * s * total + exponent * _LN2_LOW)
+
+
+def exp(x: float) -> float:
+    """Return e to the power of ``x`` (|x| up to 700), by range reduction and Taylor's series."""
+    exponent = int(x * _LOG2_E + (0.5 if x >= 0.0 else -0.5))
+    rest = (x - exponent * _LN2_HIGH) - exponent * _LN2_LOW
+    total = 1.0
+    for reciprocal in _EXP_TERMS:
+        total = 1.0 + rest * reciprocal * total
+    return ldexp(total, exponent)
+
 
 _BLOCK_BYTES = 8 * 64
 _BLOCKS_MAX = 8
@@ -38,23 +72,19 @@ class Stream:
     def __init__(self, seed: int, name: str) -> None:
         self.name = name
         self._key = blake2b(f"{seed}\0{name}".encode(), digest_size=32, person=b"rsltrace").digest()
-        self.uniform = chain.from_iterable(self._uniforms()).__next__
+        blocks = (numbers.tolist() for numbers in self._numbers())
+        self.uniform = chain.from_iterable(blocks).__next__
 
     def below(self, count: int) -> int:
         """Return an integer from 0 to ``count`` - 1."""
         return int(self.uniform() * count)
 
     def whole_numbers(self, low: int, count: int) -> Iterator[int]:
-        """Return ``low + below(count)`` forever, from the stream's beginning, in half the time."""
-        return chain.from_iterable(self._whole_numbers(low, float(count)))
-
-    def _uniforms(self) -> Iterator[list[float]]:
-        for numbers in self._numbers():
-            yield numbers.tolist()
-
-    def _whole_numbers(self, low: int, count: float) -> Iterator[list[int]]:
-        for numbers in self._numbers():
-            yield (np.floor(numbers * count).astype(np.int64) + low).tolist()
+        """Yield ``low + below(count)`` forever, from the stream's beginning, twice as fast."""
+        return chain.from_iterable(
+            (np.floor(numbers * float(count)).astype(np.int64) + low).tolist()
+            for numbers in self._numbers()
+        )
 
     def _numbers(self) -> Iterator[npt.NDArray[np.float64]]:
         """Yield many numbers at a time, and more the more are asked for.
@@ -74,9 +104,6 @@ class Stream:
             yield (bits >> np.uint64(12) | _ONE).view(np.float64) - _LESS
 
 
-# A clock that is wrong: offset, drift, and jumps that are given or drawn.
-
-
 @dataclass(frozen=True, slots=True)
 class ClockModel:
     """What is wrong with a clock. Times are nanoseconds; those of jumps count from the start.
@@ -93,21 +120,20 @@ class ClockModel:
 
 
 class WrongClock:
-    """What one node's clock shows. Exact: no floats take part after the draws."""
+    """The time that one node's clock shows. Exact: no floats after the draws."""
 
     def __init__(self, model: ClockModel, stream: Stream, start_ns: int) -> None:
         self._model = model
         self._start_ns = start_ns
         self._given_at = [at_ns for at_ns, _ in model.jumps]
-        self._given_sum = _sums([by_ns for _, by_ns in model.jumps])
+        self._given_sum = list(accumulate((by_ns for _, by_ns in model.jumps), initial=0))
         self._uniform = stream.uniform
         self._drawn_at: list[int] = []
         self._drawn_sum = [0]
         self._drawn_until_ns = 0
-        self._told = 0
+        self._reported = 0
 
     def shows(self, now_ns: int) -> int:
-        """Return what the clock shows at simulated time ``now_ns``."""
         model = self._model
         since_ns = now_ns - self._start_ns
         drift_ns = since_ns * model.drift.numerator // model.drift.denominator
@@ -119,13 +145,13 @@ class WrongClock:
         return max(now_ns + wrong_ns, 0)
 
     def set_since(self, now_ns: int) -> int:
-        """Return by how much random jumps have set the clock since this was last asked."""
+        """Return the sum of random jumps since the last call."""
         if not self._model.random_every_ns:
             return 0
         since_ns = now_ns - self._start_ns
         self._draw_until(since_ns)
-        count = max(bisect_right(self._drawn_at, since_ns), self._told)
-        before, self._told = self._told, count
+        count = max(bisect_right(self._drawn_at, since_ns), self._reported)
+        before, self._reported = self._reported, count
         return self._drawn_sum[count] - self._drawn_sum[before]
 
     def _draw_until(self, since_ns: int) -> None:
@@ -137,10 +163,3 @@ class WrongClock:
             self._drawn_until_ns += gap_ns
             self._drawn_at.append(self._drawn_until_ns)
             self._drawn_sum.append(self._drawn_sum[-1] + size_ns)
-
-
-def _sums(values: Sequence[int]) -> list[int]:
-    sums = [0]
-    for value in values:
-        sums.append(sums[-1] + value)
-    return sums

@@ -27,17 +27,13 @@ from rsltrace.trace.model.texts import format_seconds
 
 
 class Dispatchable(Protocol):
-    """Something the loop can run. ``dispatch`` must not raise for user errors: see ``stop``."""
+    """Something the loop can run. ``dispatch`` must not raise user errors: see ``stop``."""
 
     def dispatch(self) -> None:
         """Run one event, or none if there is nothing to do any more."""
 
     def describe(self) -> str:
         """Name it for an error message: ``/listener: subscription /chatter``."""
-
-
-class TimerOwner(Dispatchable, Protocol):
-    """What a due timer dispatches."""
 
 
 NOTHING_LEFT = "nothing left to do"
@@ -47,10 +43,9 @@ ORDER_BAG = 0
 ORDER_RELEASE = 1
 
 Release = tuple[Any, ...]
-"""What is scheduled: when (ns), its order (``ORDER_…``), its place in the order of scheduling, what
-is called with this very tuple, and whatever that needs. The call returns who is ready now, or None
-if it has seen to that itself. A message's is also what waits in the queue of its subscription:
-nearly every event of a run with delays is one, and makes one tuple."""
+"""Time (ns), order (``ORDER_…``), place in the order of scheduling, the function called with this
+tuple, and its arguments. The function returns what is ready now, or None. A message's release also
+waits in the queue of its subscription: nearly every event of a run with delays makes one tuple."""
 
 
 def _act(release: Release) -> None:
@@ -63,7 +58,7 @@ class EventLoop:
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
     (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases. As long as there are
     fewer events than ``looks_at``, the loop would do nothing now but dispatch the next task or the
-    first of ``ready``: whoever it has given the stack to may do so in its place.
+    first of ``ready``: the code that now has the stack may do so instead.
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -109,28 +104,28 @@ class EventLoop:
     def schedule(
         self, time_ns: int, action: Callable[[], None], *, order: int = ORDER_RELEASE
     ) -> None:
-        """Run ``action`` when simulated time reaches ``time_ns`` (at once if that is past)."""
+        """Run ``action`` at simulated time ``time_ns`` (at once if that is past)."""
         heappush(self.scheduled, (time_ns, order, self.next_place(), _act, action))
 
     def schedule_release(
         self, time_ns: int, release: Callable[[Release], Dispatchable | None], *what: object
     ) -> None:
-        """Call ``release`` when simulated time reaches ``time_ns``; from [4] on is ``what``."""
+        """Call ``release`` at simulated time ``time_ns``; ``what`` is its tuple from [4] on."""
         heappush(self.scheduled, (time_ns, ORDER_RELEASE, self.next_place(), release, *what))
 
     def stop(self, stop: Stop) -> None:
-        """End the run after the present event. The first call wins."""
+        """End the run after the current event. The first call counts."""
         if self.stopped is None:
             self.stopped = stop
         self.halt()
 
     def halt(self) -> None:
-        """Dispatch nothing more: the run is over, stacks that are left only unwind."""
+        """Dispatch nothing more: the run is over, remaining stacks only unwind."""
         self._interrupt = True
         self._until_events = self.looks_at = -1
 
     def stop_after_step(self, stop: Stop) -> None:
-        """End the run once the present time step has run fully. The first call wins."""
+        """End the run after the current time step. The first call counts."""
         if self.stopped is None:
             self.stopped = stop
         self._until_events = -1
@@ -142,7 +137,7 @@ class EventLoop:
         self.activity_ns = max(self.activity_ns, time_ns)
 
     def run(self) -> Stop:
-        """Run until something stops the run, and say what."""
+        """Run until the run ends; return why."""
         quiet_ns = self._quiet_ns = quiet_until_ns(self.stop_conditions)
         while True:
             self._until_events = self._pause_events
@@ -173,16 +168,15 @@ class EventLoop:
                 self.now_ns = next_ns
 
     def stepped(self, next_ns: int, end_ns: int) -> int:
-        """Return the next time if time moves on by no less than ``min_step_ns``."""
+        """Return the next time, at least ``min_step_ns`` from now."""
         at_least_ns = self.now_ns + self.min_step_ns
         return max(next_ns, min(at_least_ns, end_ns) if end_ns > next_ns else at_least_ns)
 
     def next_timer(self) -> TimerState | None:
-        """Return the timer that is due next."""
         return self.timers.head
 
     def next_ns(self) -> int | None:
-        """Return when the next timer or release is due, or None if there is neither."""
+        """Return when the next timer or release is due, or None."""
         timer = self.next_timer()
         release_ns: int | None = self.scheduled[0][0] if self.scheduled else None
         if timer is None or (release_ns is not None and release_ns < timer.deadline_ns):
@@ -190,7 +184,7 @@ class EventLoop:
         return timer.deadline_ns
 
     def later_ns(self) -> int | None:
-        """Return when the first timer or release is due that is not due yet, None if none is."""
+        """Return when the first timer or release is due after now, or None."""
         next_ns = self.next_ns()
         if next_ns is None or next_ns > self.now_ns:
             return next_ns
@@ -201,10 +195,10 @@ class EventLoop:
         return min(times, default=None)
 
     def run_step(self) -> None:
-        """Run everything that is due at the present time.
+        """Run everything that is due at the current time.
 
-        Where nobody has to be asked before time moves on, later time steps are run, too: with
-        delays on every link nearly every event is a time step of its own.
+        Also runs later time steps where no condition has to be checked between them: with delays on
+        every link nearly every event is a time step of its own.
         """
         now_ns = self.now_ns
         scheduled = self.scheduled
@@ -215,7 +209,7 @@ class EventLoop:
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
         timer_ns = horizon_ns = self.looks_at = -1
         while True:
-            # Time steps in which one thing arrives and nothing else is due. To compare two times
+            # Time steps with one arrival and nothing else due. To compare two times
             # takes Python longer than to see that they are the same object, and here it shows.
             while scheduled and not (ready or tasks or idle):
                 next_ns = scheduled[0][0]
@@ -254,7 +248,7 @@ class EventLoop:
                 else:
                     now_ns = self.now_ns  # a callback may have blocked, and time have passed
                     if timers.next_ns <= now_ns:
-                        owner: TimerOwner = timers.head.owner  # type: ignore[union-attr, assignment]
+                        owner: Dispatchable = timers.head.owner  # type: ignore[union-attr, assignment]
                         owner.dispatch()
                     elif not idle or not self._run_idle():
                         break
@@ -278,7 +272,7 @@ class EventLoop:
             self.now_ns = now_ns = next_ns
 
     def _run_idle(self) -> bool:
-        """Let those who poll have a look, now that nothing else is ready. True: go on."""
+        """Let those poll who wait for idle time; return whether one has work now."""
         woken = [poll() for poll in tuple(self.idle)]  # all of them, not just up to the first
         return any(woken)
 
@@ -293,7 +287,7 @@ class EventLoop:
         return None
 
     def _livelock(self, now_ns: int) -> None:
-        """Name those who keep each other going: watch who runs for a little longer."""
+        """Report the callbacks that keep each other going: run a little longer and count."""
         seen: dict[str, int] = {}
         for _ in range(1000):
             timer = self.timers.head

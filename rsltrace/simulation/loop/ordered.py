@@ -1,8 +1,8 @@
-"""The loop of jobs that say who runs next: policies, simulated executors, execution times.
+"""The loop of jobs with a policy, simulated executors or execution times.
 
-It keeps the rules of ``loop.py`` except for the order: timers that are due are candidates beside
-what is ready, a policy chooses, and an executor all of whose workers are busy waits. A loop of its
-own, so that the plain one does not pay for it.
+It keeps the rules of ``loop.py`` except for the order: due timers are candidates beside what is
+ready, a policy chooses, and callbacks wait while all workers of their executor are busy. It is a
+separate loop so that the plain one does not pay for it.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
-from rsltrace.simulation.loop.policy import Candidate, Choices, Fifo, Moment, Policy
+from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy, PolicyChoices
 from rsltrace.simulation.loop.timer_queue import TimerState
 
 
@@ -28,17 +28,16 @@ class Workers:
 
     @property
     def are_busy(self) -> bool:
-        """Whether each of them runs a callback."""
         return self.running >= self.count
 
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """What the loop has to know of something that may run.
+    """Something that may run, as the loop sees it.
 
     ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
-    exclusive callback group, or None. To dispatch what is ``told`` only tells an executor of the
-    user's own of it.
+    exclusive callback group, or None. ``told``: dispatching only hands it to one of the user's own
+    executors.
     """
 
     candidate: Candidate
@@ -47,17 +46,15 @@ class Place:
     told: bool = False
 
 
-class Charge:
-    """How long the callback under way will have taken; the middleware adds to it."""
+@dataclass(eq=False, slots=True)
+class ExecutionCharge:
+    """The execution time of the current callback; the middleware adds to it."""
 
-    __slots__ = ("duration_ns",)
-
-    def __init__(self) -> None:
-        self.duration_ns = 0
+    duration_ns: int = 0
 
 
-class _Waiting:
-    """Stands in for the plain loop's queues: what became ready, in order of arrival."""
+class _ReadyQueue:
+    """The ordered loop's queue of what is ready, in order of arrival."""
 
     def __init__(self, place: Callable[[Dispatchable], Place], runs: Callable[[Place], bool]):
         self.places: list[Place] = []
@@ -100,34 +97,32 @@ class _Waiting:
 
 
 class OrderedLoop(EventLoop):
-    """An event loop with a policy. ``place`` describes what may run; the middleware sets it."""
+    """An event loop with a policy. The middleware sets ``place``, which describes an item."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
         self.policy: Policy = Fifo()
         self.place: Callable[[Dispatchable], Place]
-        self.charge = Charge()
-        self.choices: Choices | None = None
-        """What the policy has chosen so far, where somebody wants to know."""
+        self.charge = ExecutionCharge()
+        self.choices: PolicyChoices | None = None
+        """The policy's choices so far, if they are recorded."""
         self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
-        """Told of every choice, of one alone, too, if somebody has to know."""
+        """Called at every choice, even of one candidate."""
         self.hold_until: Callable[[Sequence[Candidate], Moment], int | None] | None = None
-        """Says until when all that is ready has to wait, if somebody wants that; None: it need
-        not."""
+        """Returns until when all that is ready has to wait, or None."""
         self.on_lull: Callable[[], None] | None = None
-        """Told each time that nothing is left that could run, if somebody has to know."""
+        """Called each time that nothing is left to run."""
         self.has_begun = False
-        """Whether it has run anything yet."""
         self._forced: Place | None = None
         self._held_until_ns = -1
         self._held: dict[object, None] = {}
-        self._ready = _Waiting(lambda item: self.place(item), self._runs)
-        self._tasks = _Waiting(lambda item: self.place(item), self._runs)
+        self._ready = _ReadyQueue(lambda item: self.place(item), self._runs)
+        self._tasks = _ReadyQueue(lambda item: self.place(item), self._runs)
         self.ready = self._ready  # type: ignore[assignment]
         self.tasks = self._tasks  # type: ignore[assignment]
 
     def next_timer(self) -> TimerState | None:
-        """Return the timer that is due next; those that are overdue wait for a worker."""
+        """Return the next timer; overdue ones wait for a worker."""
         due, after = self.timers.due(self.now_ns)
         held = self._held_until_ns > self.now_ns
         if not held and any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
@@ -135,7 +130,7 @@ class OrderedLoop(EventLoop):
         return after
 
     def run_step(self) -> None:
-        """Run everything that is due at the present time and finds a worker."""
+        """Run everything that is due at the current time and has a worker."""
         self.has_begun = True
         now_ns = self.now_ns
         scheduled = self.scheduled
@@ -161,7 +156,7 @@ class OrderedLoop(EventLoop):
                 limit = self.events + self._livelock_limit
 
     def _next(self) -> Place | None:
-        """Take out what runs next: tasks first, as rclpy has it, then what the policy chooses."""
+        """Take what runs next: tasks first, as rclpy does, then the policy's choice."""
         forced, self._forced = self._forced, None
         if forced is not None:
             self._take_out(forced)
@@ -180,14 +175,14 @@ class OrderedLoop(EventLoop):
         if not places:
             return None
         candidates = [place.candidate for place in places]
-        if self.hold_until is not None and self._holds(candidates):
+        if self.hold_until is not None and self._must_wait(candidates):
             return None
         place = places[self.choose(candidates)]
         self._take_out(place)
         return place
 
-    def _holds(self, ready: list[Candidate]) -> bool:
-        """Whether what is ready is to wait, and then look again when it need not any more."""
+    def _must_wait(self, ready: list[Candidate]) -> bool:
+        """Whether what is ready has to wait; if so, look again when that is over."""
         assert self.hold_until is not None
         until_ns = self.hold_until(ready, Moment(self.now_ns, self.events))
         self._held_until_ns = -1 if until_ns is None else until_ns
@@ -197,29 +192,28 @@ class OrderedLoop(EventLoop):
         return True
 
     def runnable(self) -> list[Place]:
-        """Return all that could run now beside the event under way: tasks, what is ready, timers
-        that are due."""
+        """Return all that could run now: tasks, what is ready, and due timers."""
         return [*self._tasks.runnable(), *self._waiting()]
 
     def starved(self) -> list[Place]:
-        """Return what is ready and has no worker, since all of its executor's are busy."""
+        """Return what is ready but finds no free worker."""
         due, _ = self.timers.due(self.now_ns)
         timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
         every = [*self._tasks.places, *self._ready.places, *timers]
         return [place for place in every if place.workers is not None and place.workers.are_busy]
 
     def run_next(self, place: Place) -> None:
-        """Run one of ``runnable`` before anything else, once the event under way gives way."""
+        """Run one of ``runnable`` first, after the current event."""
         self._forced = place
 
     @property
     def polls(self) -> bool:  # type: ignore[override]
-        """Whether the policy is asked for what executors of the user's own run, and for tasks."""
+        """Whether the policy also orders tasks and the user's own executors."""
         from_ns: int | None = getattr(self.policy, "polls_from_ns", None)
         return from_ns is not None and self.now_ns > from_ns
 
     def hand_over(self) -> None:
-        """Tell executors of the user's own of all that is ready for them by now."""
+        """Hand what is ready to the user's own executors."""
         due, _ = self.timers.due(self.now_ns)
         timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
         for place in [*self._tasks.places, *self._ready.places, *timers]:
@@ -229,15 +223,15 @@ class OrderedLoop(EventLoop):
                 item.dispatch()
 
     def forget(self, executor: str) -> None:
-        """Tell the policy that an executor begins anew, if it wants to know."""
+        """Tell the policy that an executor starts anew."""
         forget = getattr(self.policy, "forget", None)
         if forget is not None:
             forget(executor)
 
     def choose(self, ready: list[Candidate]) -> int:
-        """Have the policy choose; return the index of what it has chosen.
+        """Return the index of the policy's choice.
 
-        :raises RunError: if it cannot.
+        :raises RunError: the policy fails.
         """
         moment = Moment(self.now_ns, self.events)
         choice = self._chosen(ready, moment)
@@ -283,13 +277,13 @@ class OrderedLoop(EventLoop):
         return place.exclusive is None or place.exclusive not in self._held
 
     def _dispatch(self, place: Place) -> None:
-        """Run an event; its worker is busy until it is over, and for as long as it takes."""
+        """Run an event and keep its worker busy for its execution time."""
         workers = place.workers
         item: Dispatchable = place.candidate.item
         if workers is None:
             item.dispatch()
             return
-        charge = self.charge = Charge()
+        charge = self.charge = ExecutionCharge()
         workers.running += 1
         item.dispatch()  # comes back later in time if the callback has waited for something
         if charge.duration_ns == 0:

@@ -1,8 +1,7 @@
-"""Which of the callbacks that are ready runs next: one small class per rule.
+"""Which of the ready callbacks runs next: one class per rule.
 
-A policy is asked whenever something may run. It sees everything that may run now, in the order in
-which it became ready, timers that are due last, and names one. ``docs/policies.md`` shows how to
-write one.
+A policy sees everything that may run now, in the order in which it became ready, due timers last,
+and chooses one. ``docs/policies.md`` shows how to write one.
 """
 
 from __future__ import annotations
@@ -16,17 +15,15 @@ from rsltrace.errors import RunError
 from rsltrace.simulation.chance.stream import Stream
 from rsltrace.trace.model.texts import format_seconds
 
-# What a policy has chosen, one byte for each choice it had: enough to choose the same again.
-#
-# The events of a trace do not say it all. What is told to an executor of the user's own, or wakes
-# somebody who looks and waits again, has no event, and yet it matters when it was its turn.
+# A policy's choices are recorded, one byte each. A trace's events are not enough to repeat them:
+# what is handed to one of the user's own executors, or wakes a polling call, has no event.
 
 _LARGE = 255
 """Stands for a choice that needs more than one byte, which follows in four."""
 
 
-class Choices:
-    """The choices of a run so far, in order. Where only one could run there was none."""
+class PolicyChoices:
+    """The choices of a run so far. Where only one callback could run there was none."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -35,7 +32,7 @@ class Choices:
         return bool(self._data)
 
     def add(self, index: int) -> None:
-        """Remember that the policy chose ``index`` of those that were ready."""
+        """Remember that the policy chose ``index``."""
         if index < _LARGE:
             self._data.append(index)
         else:
@@ -43,12 +40,10 @@ class Choices:
             self._data += index.to_bytes(4, "little")
 
     def encoded(self) -> bytes:
-        """Return the choices as a trace holds them."""
         return bytes(self._data)
 
 
 def decoded(data: bytes) -> Iterator[int]:
-    """Yield the choices that ``Choices.encoded`` wrote."""
     at = 0
     while at < len(data):
         index, at = data[at], at + 1
@@ -112,7 +107,6 @@ class PriorityRule:
     group_of: str | None = None
 
     def fits(self, candidate: Candidate) -> bool:
-        """Whether the rule is about ``candidate``."""
         if not fnmatchcase(candidate.node, self.node):
             return False
         if self.entity is not None:
@@ -133,7 +127,6 @@ class Priority:
         return max(range(len(ready)), key=lambda i: (self.priority(ready[i]), -i))
 
     def priority(self, candidate: Candidate) -> int:
-        """Return the priority of something that may run."""
         for rule in self._rules:
             if rule.fits(candidate):
                 return rule.priority
@@ -143,17 +136,15 @@ class Priority:
 class RateMonotonic:
     """The shortest period first; what has none comes last, in order of arrival.
 
-    A message has the period of the timer that it came of (``follows_chains``: the middleware sees
-    to that).
+    A message has the period of the timer that caused it (``follows_chains``).
     """
 
     follows_chains = True
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        return min(range(len(ready)), key=lambda i: (self._period(ready[i]), i))
-
-    def _period(self, candidate: Candidate) -> float:
-        return float("inf") if candidate.period_ns is None else candidate.period_ns
+        never = float("inf")
+        periods = [never if one.period_ns is None else one.period_ns for one in ready]
+        return periods.index(min(periods))
 
 
 class Permutation:
@@ -166,10 +157,7 @@ class Permutation:
         return self._below(len(ready)) if len(ready) > 1 else 0
 
 
-# Policies of a search for the order that fails: departures from the plain order, and PCT.
-#
-# Both count choices: the times at which more than one could run. Where only one can, there is
-# nothing to choose, and nothing is counted.
+# Search policies. Both count choices: the times at which more than one callback could run.
 
 _SHOWN = 5
 
@@ -178,7 +166,7 @@ _SHOWN = 5
 class Departure:
     """At choice number ``choice`` (from 0) the candidate number ``run`` runs, not the first.
 
-    ``of`` is its name as ``name_of`` gives it, where that is to be checked.
+    ``of`` is its name as ``candidate_name`` gives it, where that is to be checked.
     """
 
     choice: int
@@ -186,15 +174,15 @@ class Departure:
     of: str | None = None
 
 
-def name_of(candidate: Candidate) -> str:
-    """Name a candidate: node and entity, ``/planner /scan``; what has neither by its kind."""
+def candidate_name(candidate: Candidate) -> str:
+    """Name a candidate by node and entity (``/planner /scan``), or else by its kind."""
     return " ".join(filter(None, (candidate.node, candidate.entity))) or candidate.kind
 
 
 class Departures:
-    """First come, first served, timers last, but for the departures that are given.
+    """First come, first served, timers last, except for the given departures.
 
-    :raises RunError: from ``choose``, if a departure names what cannot run then.
+    :raises RunError: from ``choose``, if a departure's candidate cannot run then.
     """
 
     def __init__(self, departures: Iterable[Departure]) -> None:
@@ -210,18 +198,18 @@ class Departures:
         if departure is None:
             return 0
         fits = departure.run < len(ready)
-        if not fits or departure.of not in (None, name_of(ready[departure.run])):
+        if not fits or departure.of not in (None, candidate_name(ready[departure.run])):
             raise _cannot_depart(departure, ready, moment)
         return departure.run
 
     def unmet(self) -> list[int]:
-        """Return the choices of departures that the run has not come to."""
+        """Return the choice numbers that the run has not reached."""
         return sorted(choice for choice in self._departures if choice >= self.choices)
 
 
 def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Moment) -> RunError:
     what = f"candidate {departure.run}" + (f" ({departure.of})" if departure.of else "")
-    names = ", ".join(f"{i}: {name_of(one)}" for i, one in enumerate(ready[:_SHOWN]))
+    names = ", ".join(f"{i}: {candidate_name(one)}" for i, one in enumerate(ready[:_SHOWN]))
     more = ", …" if len(ready) > _SHOWN else ""
     return RunError(
         f"policy: departures: choice {departure.choice} cannot be {what}: at "
@@ -230,9 +218,8 @@ def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Mom
     )
 
 
-class After:
-    """First come, first served up to ``time_ns``; what comes later is for another policy, which is
-    not asked before."""
+class FifoUntil:
+    """First come, first served up to ``time_ns``, then another policy."""
 
     def __init__(self, time_ns: int, policy: Policy) -> None:
         self._time_ns = time_ns
@@ -285,5 +272,5 @@ class Pct:
 
 
 def pct_bound(entities: int, choices: int, depth: int) -> float:
-    """Return the least probability with which one run of ``Pct`` meets an order of that depth."""
+    """Return the minimum probability that one run of ``Pct`` finds an order of that depth."""
     return 1.0 / (max(entities, 1) * float(max(choices, 1)) ** (depth - 1))

@@ -8,7 +8,7 @@ heap; it exists to compare runs with RSLCPP, and is part of no other promise.
 from __future__ import annotations
 
 from heapq import heapify, heappop, heappush, heapreplace
-from typing import Any, Protocol
+from typing import Any
 
 # A timer's deadlines, with the arithmetic of rcl.
 #
@@ -39,7 +39,7 @@ class TimerState:
         self.ticket: object = None
 
     def call(self, now_ns: int) -> None:
-        """Account for a call at ``now_ns``: move the deadline to its next grid point."""
+        """Move the deadline to its next grid point after a call at ``now_ns``."""
         self.last_call_ns = now_ns
         deadline_ns = self.deadline_ns + self.period_ns
         if deadline_ns <= now_ns:
@@ -61,37 +61,10 @@ NEVER_NS = 1 << 64
 _ROOM = 256
 
 
-class TimerQueue(Protocol):
-    """The timers that run. A cancelled timer is not in the queue."""
-
-    @property
-    def head(self) -> TimerState | None:
-        """The timer that is due first, or None."""
-
-    @property
-    def next_ns(self) -> int:
-        """The deadline of ``head``, or ``NEVER_NS``."""
-
-    def add(self, timer: TimerState) -> None:
-        """Put a timer in, or back in after a cancel."""
-
-    def remove(self, timer: TimerState) -> None:
-        """Take a timer out; nothing happens if it is not in."""
-
-    def moved(self, timer: TimerState) -> None:
-        """Tell the queue that a timer's deadline has changed other than by having run."""
-
-    def ran(self, timer: TimerState) -> None:
-        """Tell the queue that ``timer``, which was ``head``, was called and has a new deadline."""
-
-    def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
-        """Return the timers that are due, in order, and the one that will be next."""
-
-
 class CreationOrderQueue:
-    """Smallest (deadline, creation order) first. O(log n) for every change.
+    """The running timers, smallest (deadline, creation order) first. O(log n) for every change.
 
-    The loop looks at the first timer far more often than timers change, so that is kept up to date.
+    The loop reads the first timer far more often than timers change, so it is kept up to date.
     """
 
     def __init__(self) -> None:
@@ -103,6 +76,7 @@ class CreationOrderQueue:
         self.next_ns = NEVER_NS
 
     def add(self, timer: TimerState) -> None:
+        """Add a timer, also after a cancel; or note that its deadline has changed (``moved``)."""
         before: Any = timer.ticket
         if before is not None and before[0] == timer.deadline_ns:
             return  # it is in its place
@@ -115,7 +89,7 @@ class CreationOrderQueue:
         self._find_head()
 
     def _tidy(self) -> None:
-        """Drop what changes have left behind: a watchdog is reset more often than it is due."""
+        """Remove outdated entries: a watchdog timer is reset more often than it is due."""
         self._heap = [entry for entry in self._heap if entry[2].ticket is entry]
         heapify(self._heap)
         self._room = _ROOM + 2 * len(self._heap)
@@ -123,6 +97,7 @@ class CreationOrderQueue:
     moved = add
 
     def ran(self, timer: TimerState) -> None:
+        """Note that ``timer``, which was ``head``, was called and has a new deadline."""
         heap = self._heap
         first = timer.ticket
         timer.ticket = entry = (timer.deadline_ns, timer.order, timer)
@@ -152,6 +127,7 @@ class CreationOrderQueue:
         self.next_ns, self.head = NEVER_NS, None
 
     def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
+        """Return the due timers in order, and the next one after them."""
         heap = self._heap
         due: list[tuple[int, int, TimerState]] = []
         after: tuple[int, int, TimerState] | None = None
@@ -251,7 +227,10 @@ class HeapOrderQueue:
             self._sift_down(parent, length, self._heap[parent])
 
 
-def timer_queue(ties: str) -> CreationOrderQueue | HeapOrderQueue:
+TimerQueue = CreationOrderQueue | HeapOrderQueue
+
+
+def timer_queue(ties: str) -> TimerQueue:
     """Return a queue for the tie rule ``creation`` or ``heap``.
 
     :raises ValueError: for any other rule.

@@ -1,9 +1,8 @@
-"""The orders of ROS's own executors, which look at what is ready only now and then.
+"""The orders of ROS's own executors, which find ready callbacks at polling points.
 
-An executor that waits on a wait set learns of messages at *polling points*. What was ready there is
-run, each entity once and in a fixed order; what arrives meanwhile is for the next polling point,
-whatever its priority (Casini, Blaß, Lütkebohle, Brandenburg: Response-time analysis of ROS 2
-processing chains under reservation-based scheduling, ECRTS 2019).
+What a polling point finds runs once per entity in a fixed order; what arrives meanwhile waits for
+the next polling point, whatever its priority (Casini, Blaß, Lütkebohle, Brandenburg: Response-time
+analysis of ROS 2 processing chains under reservation-based scheduling, ECRTS 2019).
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ class WaitSet:
         self._found: dict[str, set[_Key]] = {}
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        """Return what runs next on the executor of the first that is ready."""
         executor = ready[0].executor
         mine = [index for index, one in enumerate(ready) if one.executor == executor]
         at_once = [index for index in mine if ready[index].kind == "timer"]
@@ -44,23 +42,22 @@ class WaitSet:
         return chosen
 
     def place(self, candidate: Candidate) -> tuple[int, ...]:
-        """Return what those that a polling point has found are sorted by."""
+        """Return the sort key of what a polling point has found."""
         return _rank(_RCLCPP, candidate.kind, last=True), candidate.entity_id
 
 
 class RclpyWaitSet(WaitSet):
-    """rclpy's executors, those of the user's own, too. They work in rounds: tasks, the newest first
-    (in releases whose tasks say so, the oldest) and none that is made meanwhile; then what a
-    polling point finds, each entity once: actions and other waitables, then node by node timers,
-    subscriptions, guard conditions, clients, services. What cannot run at its place in that order
-    has to wait for the next round."""
+    """rclpy's executors, including the user's own. They work in rounds: first the tasks that exist,
+    the newest first (the oldest first in releases whose tasks say so); then what a polling point
+    finds, each entity once: actions and other waitables, then node by node timers, subscriptions,
+    guard conditions, clients, services. What cannot run at its place waits for the next round."""
 
     polls_from_ns = -1
     """From when on it is asked for all that ``OrderedLoop.polls`` is about."""
 
     def __init__(self) -> None:
         super().__init__()
-        self._rounds: dict[str, _Round] = {}
+        self._rounds: dict[str, _PollingRound] = {}
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         for index, one in enumerate(ready):
@@ -70,7 +67,7 @@ class RclpyWaitSet(WaitSet):
         mine = [index for index, one in enumerate(ready) if one.executor == executor]
         tasks = {ready[index].thread: index for index in mine if ready[index].kind == "task"}
         places = [(self.place(ready[i]), i) for i in mine if ready[i].kind != "task"]
-        present = self._rounds.setdefault(executor, _Round())
+        present = self._rounds.setdefault(executor, _PollingRound())
         left = present.left(places, ready)
         if left is not None:
             return left
@@ -86,7 +83,7 @@ class RclpyWaitSet(WaitSet):
         return chosen
 
     def forget(self, executor: str) -> None:
-        """Begin anew with an executor, which has given up what was left of a round."""
+        """Start a new round for an executor."""
         self._rounds.pop(executor, None)
 
     def place(self, candidate: Candidate) -> tuple[int, ...]:
@@ -97,8 +94,8 @@ class RclpyWaitSet(WaitSet):
         return min(rank, 0), node, rank, candidate.entity_id
 
 
-class _Round:
-    """How far an executor is, with the tasks or with what it has found."""
+class _PollingRound:
+    """The position of an executor in its round: tasks, or what it has found."""
 
     def __init__(self) -> None:
         self._found: dict[int, Any] = {}
@@ -106,12 +103,11 @@ class _Round:
         self.begin()
 
     def begin(self) -> None:
-        """Begin with the tasks that there are."""
         self._newest: int | None = None
         self._ran: int | None = None
 
     def task(self, tasks: Mapping[int, int], ready: Sequence[Candidate]) -> int | None:
-        """Take the next of the tasks, by number, that there were at the beginning."""
+        """Return the number of the next task of those that existed at the beginning."""
         if not tasks:
             return None
         oldest_first = any(getattr(ready[i].item, "oldest_first", False) for i in tasks.values())
@@ -127,7 +123,7 @@ class _Round:
         return None
 
     def poll(self, items: Iterable[Any]) -> None:
-        """Find what is ready; the tasks of the next round come after that."""
+        """Find what is ready."""
         self.begin()
         self._last = ()
         self._found = {id(item): item for item in items}
@@ -138,7 +134,7 @@ class _Round:
     def left(
         self, places: Sequence[tuple[tuple[int, ...], int]], ready: Sequence[Candidate]
     ) -> int | None:
-        """Take the next of what was found; None if there is nothing left."""
+        """Take the next of what was found, or None."""
         found = [
             (place, index)
             for place, index in places
@@ -157,7 +153,7 @@ def _key(candidate: Candidate) -> _Key:
 
 
 def _rank(kinds: tuple[str, ...], kind: str, *, last: bool) -> int:
-    """Return the place of a kind; others come before (-1) or after all."""
+    """Return the rank of a kind; unknown kinds come first (-1) or last."""
     if kind in kinds:
         return kinds.index(kind)
     return len(kinds) if last else -1

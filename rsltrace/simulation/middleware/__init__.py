@@ -1,1 +1,1 @@
-"""Who talks to whom, with which QoS, and how messages get there: what DDS is to a robot."""
+"""The simulated middleware: graph, QoS and transport, in place of DDS."""

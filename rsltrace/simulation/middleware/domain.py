@@ -1,7 +1,7 @@
-"""The domain of a run: all that its participants share, and how plain ones get their endpoints.
+"""The domain of a run: what its participants share.
 
-A participant needs no client library: it is given bytes and gives bytes. A door that has one makes
-endpoints of its own, derived from these, and has them join the graph.
+A participant needs no client library: it receives and sends bytes. An adapter with one derives its
+endpoints from these classes and adds them to the graph.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.event import Door
-from rsltrace.simulation.middleware.events.failure import FailuresEndTheRun
+from rsltrace.simulation.middleware.events.failure import RunEndingExceptionHandler
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
@@ -29,8 +29,8 @@ from rsltrace.simulation.middleware.timer import Timer
 
 
 class Domain:
-    """Who is there (``graph``), how they reach each other (``transport``), and how their callbacks
-    are run and recorded (``dispatcher``)."""
+    """The participants (``graph``), how messages reach them (``transport``), and how their
+    callbacks are run and recorded (``dispatcher``)."""
 
     def __init__(self, loop: EventLoop) -> None:
         self.loop = loop
@@ -40,7 +40,7 @@ class Domain:
         self.outcome = self.dispatcher.outcome
         self.transport = Transport(self.dispatcher)
         self.graph = Graph()
-        self._door = FailuresEndTheRun(self.dispatcher)
+        self._door = RunEndingExceptionHandler(self.dispatcher)
         self.dispatcher.door = self._door
 
     def watch(self, topic: str, watcher: Watcher) -> None:
@@ -48,7 +48,7 @@ class Domain:
         self._observers(topic).watchers.append(watcher)
 
     def filter(self, topic: str, function: MessageFilter | None) -> None:
-        """Let a function decide what is published on a topic, whoever publishes; None: none."""
+        """Let a function filter what is published on a topic; None removes it."""
         self._observers(topic).filter = function
 
     def _observers(self, topic: str) -> TopicObservers:
@@ -59,23 +59,21 @@ class Domain:
                 publisher.observers = found
         return found
 
-    # -- participants without a client library ---------------------------------------------------
-
     def join(self, name: str, namespace: str = "/", door: Door | None = None) -> Participant:
-        """Make a participant; without a door of its own, what it raises ends the run."""
+        """Make a participant. Without a ``door`` of its own, an exception ends the run."""
         participant = Participant(self.dispatcher, name, namespace, door or self._door)
         self.graph.add_node(participant)
         return participant
 
     def leave(self, participant: Participant) -> None:
-        """Take a participant out of the domain, with all that it has made."""
+        """Destroy a participant and all that it made."""
         for entity in [*participant.timers, *self.graph.endpoints_of(participant), participant]:
             entity.destroy()
 
     def publisher(
         self, node: Participant, topic: str, type: MessageType, qos: Qos = DEFAULT_QOS
     ) -> Publisher:
-        """Make a publisher of a fully qualified topic; ``send`` publishes."""
+        """Make a publisher of a fully qualified topic."""
         publisher = Publisher(self.transport, node, topic, type, qos)
         self.graph.add_publisher(publisher)
         return publisher
@@ -110,13 +108,11 @@ class Domain:
     def client(
         self, node: Participant, service: str, type: ServiceType, qos: Qos = DEFAULT_QOS
     ) -> Client:
-        """Make a client; ``call`` sends a request."""
         client = Client(self.transport, node, service, type, qos)
         self.graph.add_client(client)
         return client
 
     def timer(self, node: Participant, period_ns: int, callback: Callable[[], object]) -> Timer:
-        """Make a timer, which runs from now on."""
         timer = Timer(self.dispatcher, node, period_ns, callback)
         node.timers.append(timer)
         return timer

@@ -1,4 +1,4 @@
-"""What participants and all that they make have in common (DDS: a domain entity)."""
+"""The base classes of participants and their endpoints (DDS: domain entities)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,12 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 
 @dataclass(frozen=True, slots=True)
 class Runnable:
-    """What a policy, simulated executors and execution times know of something that may run.
+    """Something that may run, as policies, simulated executors and execution times see it.
 
-    ``kind`` and ``name`` are what a policy sees, ``group`` is what keeps others from running at the
-    same time (a mutually exclusive callback group) with the names of its members. What has no
-    ``executor`` runs on none of the simulated ones. ``thread`` tells apart callbacks of one entity
-    that are under way at the same time, where threads are switched at lines, and numbers tasks.
-    What is ``told`` is left to an executor of the user's own.
+    ``kind`` and ``name`` are for policies. ``group`` is its mutually exclusive callback group,
+    ``group_names`` the names of the group's members. ``executor``: it runs on a simulated executor.
+    ``thread`` distinguishes concurrent callbacks of one entity, and numbers tasks. ``told``: one of
+    the user's own executors runs it.
     """
 
     kind: str
@@ -37,12 +36,12 @@ class Runnable:
 
 
 def on_no_executor(node: Any, name: str, kind: str = "thread", *, told: bool = False) -> Runnable:
-    """Describe what runs on none of the simulated executors: a thread, say."""
+    """Describe an item that runs on none of the simulated executors, such as a thread."""
     period_ns = None if node is None else node.shortest_period_ns()
     return Runnable(kind, name, 0, node, period_ns=period_ns, executor=False, told=told)
 
 
-class Membership(Protocol):
+class GraphMembership(Protocol):
     """The graph, as a member sees it."""
 
     def remove(self, member: Any) -> None:
@@ -55,15 +54,15 @@ class Membership(Protocol):
 class DomainEntity:
     """Something with an id in the trace: a participant, an endpoint, a timer.
 
-    It is ``active`` while its participant is being run: only then does the loop hear of what comes
-    for it. ``node`` is its participant, None as long as that is not known.
+    It is ``active`` while its participant is run; only then does the loop learn of its arrivals.
+    ``node`` is its participant, None until it is known.
     """
 
     kind: EntityKind
     announced = True
-    """Whether the trace is told of the entity when it is created."""
+    """Whether the entity is recorded when it is created."""
     begins_active = True
-    graph: Membership | None = None
+    graph: GraphMembership | None = None
     """The graph it has joined."""
 
     def __init__(self, dispatcher: Dispatcher, node: Any) -> None:
@@ -76,24 +75,19 @@ class DomainEntity:
         dispatcher.entities.pending.append(self)
 
     def destroy(self) -> None:
-        """Leave the domain, unless that has been done."""
         if not self.destroyed:
             self.destroyed = True
             self._destroy()
 
     def _destroy(self) -> None:
-        """Give back what the entity holds; called once."""
+        """Release what the entity holds; called once."""
         if self.graph is not None:
             self.graph.remove(self)
 
     def settle(self) -> bool:
-        """Return whether the owner is known."""
         return self.node is not None
 
-    # -- the trace, and who decides what runs --------------------------------------------------
-
     def entity(self) -> Entity:
-        """Return the entity as the trace describes it."""
         detail = self.trace_detail()
         if source := source_of(self.user_callback()):
             detail["source"] = source
@@ -114,19 +108,18 @@ class DomainEntity:
         return ""
 
     def trace_type(self) -> str:
-        """Return the interface type, or an empty string."""
         return ""
 
     def trace_detail(self) -> dict[str, object]:
-        """Return what only this kind of entity has."""
+        """Return the details of this kind of entity."""
         return {}
 
     def trace_group(self) -> str:
-        """Return the callback group: ``exclusive 1``; "" for its node's default one, or none."""
+        """Return the callback group: ``exclusive 1``; "" for the default one, or none."""
         return ""
 
     def user_callback(self) -> object:
-        """Return the user's callable that its events run, None if there is none."""
+        """Return the user's callable, or None."""
         return getattr(self, "callback", None)
 
     def describe(self) -> str:
@@ -135,21 +128,20 @@ class DomainEntity:
         return f"{node}: {self.kind.label} {self.trace_name()}"
 
     def runnable(self) -> Runnable:
-        """Describe it to those who decide what runs next."""
         kind = self.kind.label.replace(" ", "_")
         return Runnable(kind, self.trace_name(), self.entity_id, self.node, period_ns=self.period())
 
     def period(self) -> int | None:
-        """Return its own period in nanoseconds, or that of its participant's fastest timer."""
+        """Return its period in ns, or that of its participant's fastest timer."""
         return None if self.node is None else self.node.shortest_period_ns()
 
     def execution_name(self) -> tuple[str, str]:
-        """Return (kind, name) by which execution times are given."""
+        """Return (kind, name) to which execution times refer."""
         return self.kind.label, self.trace_name()
 
 
 def callback_name(callback: Callable[..., Any] | Any) -> str:
-    """Name a callback as in ``Talker.on_timer``; never with an address in it."""
+    """Name a callback as in ``Talker.on_timer``; never with an address."""
     if callback is None:
         return ""
     if isinstance(callback, partial):
@@ -163,15 +155,11 @@ def callback_name(callback: Callable[..., Any] | Any) -> str:
     return type(callback).__qualname__
 
 
-# Entities for which something arrives: the queue between the loop and their callback.
-
-
 class Receiver(DomainEntity):
-    """An entity with a queue of what has arrived for its callback.
+    """An entity with a queue of arrivals for its callback.
 
-    One entry in the loop's ready queue stands for one arrival, so arrivals of all entities run in
-    the order in which they came. An arrival that the queue has dropped leaves an entry behind that
-    finds nothing to do.
+    Each entry in the loop's ready queue stands for one arrival, so arrivals of all entities run in
+    order. The entry of a dropped arrival finds nothing to do.
     """
 
     queue: deque[Any]
@@ -181,7 +169,7 @@ class Receiver(DomainEntity):
     """Where an arrival says what it is: publishing event, which of its outputs, content hash."""
 
     def deliver(self, arrival: Any) -> None:
-        """Queue an arrival; it is dispatched once its participant is being run."""
+        """Queue an arrival; it is dispatched once its participant runs."""
         if self.arrived(arrival) is not None:
             self.dispatcher.loop.ready.append(self)
 
@@ -196,20 +184,18 @@ class Receiver(DomainEntity):
         return None
 
     def drop(self, held: int = 0) -> None:
-        """Count what is dropped by the full queue, or by that of a publisher which holds so many
-        messages in an outage."""
+        """Count a dropped arrival; ``held`` is the queue size of a publisher in an outage."""
         drops = self.dispatcher.outcome.drops
         drops[self, held] = drops.get((self, held), 0) + 1
 
     def awaken(self) -> None:
-        """Become active if that is possible by now: something has arrived."""
+        """Become active if possible: something has arrived."""
 
     def activate(self) -> None:
-        """Let the loop hear of what has arrived so far."""
+        """Announce all arrivals so far to the loop."""
         self.dispatcher.loop.ready.extend([self] * len(self.queue))
 
     def may_run(self) -> bool:
-        """Return whether to take an arrival now."""
         return bool(self.queue) and self.active and not self.destroyed
 
     def settle(self) -> bool:

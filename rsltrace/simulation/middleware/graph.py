@@ -1,4 +1,4 @@
-"""Who is there and who is connected to whom.
+"""The nodes and endpoints of a run, and their connections.
 
 Everything is in creation order, so that fan-out is the same on every machine (in DDS it depends on
 hashes of addresses).
@@ -35,50 +35,39 @@ class Graph:
         self._services: dict[str, list[Service]] = {}
 
     def node_named(self, fully_qualified_name: str) -> Participant | None:
-        """Return the node of that name, or None."""
         return next(iter(self.nodes_named(fully_qualified_name)), None)
 
     def nodes_named(self, fully_qualified_name: str) -> list[Participant]:
-        """Return the nodes of that name, in creation order."""
         return self._named.get(fully_qualified_name, [])
 
     def publishers(self, topic: str) -> list[Publisher]:
-        """Return the publishers of a topic in creation order."""
         return self._publishers.get(topic, [])
 
     def subscriptions(self, topic: str) -> list[Subscription]:
-        """Return the subscriptions of a topic in creation order."""
         return self._subscriptions.get(topic, [])
 
     def clients(self, service: str) -> list[Client]:
-        """Return the clients of a service in creation order."""
         return self._clients.get(service, [])
 
     def all_clients(self) -> list[Client]:
-        """Return every client."""
         return [client for clients in self._clients.values() for client in clients]
 
     def services(self, service: str) -> list[Service]:
-        """Return the servers of a service in creation order."""
         return self._services.get(service, [])
 
-    # -- joining and leaving -------------------------------------------------------------------
-
     def add_node(self, node: Participant) -> None:
-        """Make a participant known."""
         self.nodes.append(node)
         self._named.setdefault(node.fully_qualified_name, []).append(node)
         node.graph = self
-        self._tell_of(node)
+        self._announce(node)
 
     def add_publisher(self, publisher: Publisher) -> None:
-        """Connect a new publisher with the subscriptions that are there."""
         self._check_type(publisher)
         self._publishers.setdefault(publisher.topic, []).append(publisher)
         publisher.graph = self
         for subscription in self.subscriptions(publisher.topic):
             self._connect(publisher, subscription)
-        self._has_changed()
+        self._notify_changed()
 
     def add_subscription(self, subscription: Subscription) -> None:
         """Connect a new subscription; it gets what transient-local publishers kept for it."""
@@ -87,31 +76,29 @@ class Graph:
         subscription.graph = self
         for publisher in self.publishers(subscription.topic):
             self._connect(publisher, subscription)
-        self._has_changed()
+        self._notify_changed()
 
     def add_client(self, client: Client) -> None:
-        """Make a client known."""
         self._clients.setdefault(client.service, []).append(client)
         client.graph = self
-        self._has_changed()
+        self._notify_changed()
 
     def add_service(self, service: Service) -> None:
-        """Make a server known."""
         self._services.setdefault(service.service, []).append(service)
         service.graph = self
-        self._tell_of(service)
+        self._announce(service)
 
-    def _tell_of(self, member: DomainEntity) -> None:
+    def _announce(self, member: DomainEntity) -> None:
         for listener in self.joined:
             listener(member)
-        self._has_changed()
+        self._notify_changed()
 
-    def _has_changed(self) -> None:
+    def _notify_changed(self) -> None:
         for listener in self.changed:
             listener()
 
     def remove(self, member: DomainEntity) -> None:
-        """Forget a member, and disconnect it from its peers."""
+        """Remove a member and disconnect its peers."""
         if isinstance(member, Publisher):
             self._publishers[member.topic].remove(member)
             for subscription in member.subscriptions:
@@ -132,10 +119,10 @@ class Graph:
         elif isinstance(member, Participant):
             self.nodes.remove(member)
             self._named[member.fully_qualified_name].remove(member)
-        self._has_changed()
+        self._notify_changed()
 
     def settled_request(self, topic: str, requested: Qos) -> Qos:
-        """Return what a new subscription's QoS comes to, given the publishers that are there."""
+        """Return the resolved QoS of a new subscription, given the current publishers."""
         peers = [publisher.qos for publisher in self.publishers(topic)]
         return requested.resolved(publisher=False, peers=peers)
 
@@ -161,10 +148,7 @@ class Graph:
                 "would never hear each other; rename or remap one of them"
             )
 
-    # -- queries ---------------------------------------------------------------------------------
-
     def endpoints_of(self, node: Participant) -> list[DomainEntity]:
-        """Return a node's publishers, subscriptions, services and clients."""
         return [
             *self.publishers_of(node),
             *self.subscriptions_of(node),
@@ -173,19 +157,15 @@ class Graph:
         ]
 
     def publishers_of(self, node: Participant) -> list[Publisher]:
-        """Return the publishers of a node, topic by topic."""
         return _of(node, self._publishers)
 
     def subscriptions_of(self, node: Participant) -> list[Subscription]:
-        """Return the subscriptions of a node, topic by topic."""
         return _of(node, self._subscriptions)
 
     def services_of(self, node: Participant) -> list[Service]:
-        """Return the servers of a node, service by service."""
         return _of(node, self._services)
 
     def clients_of(self, node: Participant) -> list[Client]:
-        """Return the clients of a node, service by service."""
         return _of(node, self._clients)
 
     def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
@@ -215,7 +195,7 @@ def _of(node: Participant, ends: dict[str, list[EndT]]) -> list[EndT]:
 def action_names_and_types(
     topics: list[tuple[str, list[str]]],
 ) -> list[tuple[str, list[str]]]:
-    """Return the actions among topics: each has one for feedback, by which rcl finds it, too."""
+    """Return the actions among topics: rcl finds them by their feedback topics, too."""
     name_end, type_end = "/_action/feedback", "_FeedbackMessage"
     return [
         (name.removesuffix(name_end), [t.removesuffix(type_end) for t in types])

@@ -1,4 +1,4 @@
-"""Types by name: all that the middleware knows of what it carries."""
+"""Message and service types by name, faults of single messages, and the source of callbacks."""
 
 from __future__ import annotations
 
@@ -9,14 +9,11 @@ from functools import partial
 from pathlib import PurePath
 from types import CodeType, CoroutineType, FunctionType, MethodType
 
-# Single messages that go wrong, by their number on a topic: lost, late, or twice.
-
 
 @dataclass(frozen=True, slots=True)
 class MessageFault:
-    """What becomes of message ``number`` (from 1) of a topic on its way to the nodes that the glob
-    ``to`` fits: it is lost if ``is_lost``, ``late_ns`` late, and comes again ``copy_ns`` after that
-    (-1: once)."""
+    """The fault of message ``number`` (from 1) of a topic for the nodes that glob ``to`` matches:
+    it is lost, ``late_ns`` late, or repeated after ``copy_ns`` (-1: not)."""
 
     number: int
     to: str = "*"
@@ -26,8 +23,7 @@ class MessageFault:
 
 
 class TopicFaults:
-    """The faults of one topic. Its publishers say when they send, its links what that means for
-    them. ``reached`` is how many messages there have been."""
+    """The faults of one topic. ``reached`` is the number of messages so far."""
 
     def __init__(self, faults: Sequence[MessageFault]) -> None:
         self._by_number: dict[int, list[MessageFault]] = {}
@@ -36,21 +32,20 @@ class TopicFaults:
         self.add(faults)
 
     def add(self, faults: Sequence[MessageFault]) -> None:
-        """Have more of them, of messages that are yet to come."""
         for fault in faults:
             self._by_number.setdefault(fault.number, []).append(fault)
 
     def begin(self) -> None:
-        """Take note that the next message is about to be sent to everybody."""
+        """Note that the next message is about to be sent to all receivers."""
         self.reached += 1
         self._present = self._by_number.get(self.reached, [])
 
     def end(self) -> None:
-        """Take note that it has been: what is sent to single ones is an older message."""
+        """Note that it was sent: a message to a single receiver is an older one."""
         self._present = []
 
     def for_node(self, name: str) -> MessageFault | None:
-        """Return what becomes of the present message on its way to a node, None if nothing."""
+        """Return the fault of the current message on its way to a node, or None."""
         fitting = [fault for fault in self._present if fnmatchcase(name, fault.to)]
         if not fitting:
             return None
@@ -64,15 +59,12 @@ class TopicFaults:
         )
 
 
-class FaultsOfAll(dict[str, TopicFaults]):
-    """Faults of every topic that somebody asks for: there may be some later."""
+class AllTopicFaults(dict[str, TopicFaults]):
+    """Faults for every topic: more may be added while the run goes on."""
 
     def get(self, topic: str, default: object = None) -> TopicFaults:
-        """Return those of a topic, which may be none so far."""
         return self.setdefault(topic, TopicFaults(()))
 
-
-# Where the code of a callback is: file and line, in words that hold on any machine.
 
 _WRAPPED_MAX = 50
 

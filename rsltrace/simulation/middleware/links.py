@@ -1,6 +1,6 @@
-"""Links with a model: messages, requests and responses that take time, get lost or come twice.
+"""Links with a model: messages, requests and responses are delayed, lost or duplicated.
 
-A graph without models has no links, and its publications go straight into the queues.
+A graph without models has no links; its publications go straight into the queues.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from rsltrace.simulation.chance.channel import (
     LOST_BURST,
     LOST_DROP,
     LOST_OUTAGE,
-    Channel,
+    LinkChannel,
     NetworkPlan,
 )
 from rsltrace.simulation.chance.distribution import Sampler
@@ -30,21 +30,19 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT
 from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
 
-# The usual links in a hurry: every message arrives, in the order of sending, at once or later.
-#
-# With a delay on every link, most events of a run are messages that come this way. What a link has
-# to look up is therefore bound once, in a closure, its arrivals go straight into the loop's queue,
-# and its draws to the recorder without a call.
+# Fast links: every message arrives, in order, at once or later. With a delay on every link, most
+# events of a run come this way, so lookups are bound once in a closure, arrivals go straight into
+# the loop's queue, and draws to the recorder without a call.
 
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
-_QUICK_LINK_DELAY = encode_draw(Draw.DELAY)
+_FAST_LINK_DELAY = encode_draw(Draw.DELAY)
 _DRAW = int(OutputKind.DRAW)
 _pack_output = OUTPUT_CONTENT.pack
 
 
-class OrderedLink(Protocol):
+class FastLink(Protocol):
     """A link that keeps the order; ``last_ns`` is when the last message arrives."""
 
     subscription: Subscription
@@ -54,8 +52,8 @@ class OrderedLink(Protocol):
         """Whether a message is due now that has not arrived yet."""
 
 
-def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Send:
-    """Return how ``link`` sends, if it does nothing but delay and keeps the order."""
+def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
+    """Return how ``link`` sends if it only delays and keeps the order."""
     loop = dispatcher.loop
     under_way = dispatcher.event
     subscription = link.subscription
@@ -88,7 +86,7 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
         link.last_ns = arrival_ns
         recorder = dispatcher.recorder
         if recorder is not None:  # what Recorder.draw does
-            packed = _pack_output(_QUICK_LINK_DELAY | delay_ns, entity, _DRAW)
+            packed = _pack_output(_FAST_LINK_DELAY | delay_ns, entity, _DRAW)
             recorder.output_hash = hash64(packed, recorder.output_hash)
             add_output = recorder.add_output
             add_output(packed)
@@ -105,10 +103,11 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
     return send
 
 
-def direct_send(dispatcher: Dispatcher, link: OrderedLink) -> Send:
-    """Return how ``link`` sends, if there is nothing the matter with it.
+def direct_send(dispatcher: Dispatcher, link: FastLink) -> Send:
+    """Return how ``link`` sends if it is perfect.
 
-    Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
+    Only messages that an execution time delays wait in the loop's queue, and what must not overtake
+    them.
     """
     loop = dispatcher.loop
     under_way = dispatcher.event
@@ -148,10 +147,12 @@ _LOST = {
 }
 
 
-class Exchanges:
+class ServiceLink:
     """The requests of one client to one server, or the responses."""
 
-    def __init__(self, dispatcher: Dispatcher, receiver: Receiver, channel: Channel | None) -> None:
+    def __init__(
+        self, dispatcher: Dispatcher, receiver: Receiver, channel: LinkChannel | None
+    ) -> None:
         self._dispatcher = dispatcher
         self._receiver = receiver
         self._entity = receiver.entity_id
@@ -160,7 +161,7 @@ class Exchanges:
         self._last_ns = 0
 
     def send(self, exchange: Any) -> None:
-        """Send a request or response on its way."""
+        """Send a request or response."""
         dispatcher = self._dispatcher
         loop = dispatcher.loop
         now_ns = loop.now_ns
@@ -194,12 +195,12 @@ class Exchanges:
             self._receiver.deliver(exchange)
 
 
-class Link:
-    """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
+class PublisherLink:
+    """The link from a publisher to a subscription; ``channel`` is None if messages arrive at once.
 
-    What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
-    messages as its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last
-    message in order arrives.
+    What a reliable publisher cannot send during an outage waits in ``_held``, as many messages as
+    its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last message in
+    order arrives.
     """
 
     def __init__(
@@ -207,7 +208,7 @@ class Link:
         dispatcher: Dispatcher,
         offered: Qos,
         subscription: Subscription,
-        channel: Channel | None,
+        channel: LinkChannel | None,
         faults: TopicFaults | None = None,
     ) -> None:
         self.subscription = subscription
@@ -239,7 +240,7 @@ class Link:
         if channel is None:
             self.send = direct_send(dispatcher, self)
         elif channel.plain and channel.keep_order:
-            self.send = quick_send(dispatcher, self, channel.plain)
+            self.send = fast_send(dispatcher, self, channel.plain)
 
     def _send(
         self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
@@ -253,7 +254,7 @@ class Link:
         if self._faults is not None:
             fault = self._faults.for_node(self.subscription.node.fully_qualified_name)
         if fault is not None:
-            self._suffer(fault, message, arrival_ns)
+            self._send_faulty(fault, message, arrival_ns)
             return
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
@@ -272,14 +273,14 @@ class Link:
                 self._hold(message, arrivals_ns, channel.held_until_ns)
                 return
             for arrival_ns in arrivals_ns:
-                self._bring(message, arrival_ns)
+                self._schedule_arrival(message, arrival_ns)
             return
-        self._bring(message, max(arrival_ns, self._behind_ns))
+        self._schedule_arrival(message, max(arrival_ns, self._behind_ns))
 
-    def _suffer(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
-        """Send a message to which something happens that the job says.
+    def _send_faulty(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
+        """Send a message with a fault.
 
-        The model of the link draws for it as for any other, so that those after it fare the same.
+        The link's model draws for it as for any other, so later messages are not affected.
         """
         draw, channel = self._dispatcher.draw, self._channel
         sent_ns += fault.late_ns
@@ -306,9 +307,9 @@ class Link:
             self._hold(message, arrivals_ns, channel.held_until_ns)
             return
         for arrival_ns in arrivals_ns:
-            self._bring(message, arrival_ns)
+            self._schedule_arrival(message, arrival_ns)
 
-    def _bring(self, message: Message, arrival_ns: int) -> None:
+    def _schedule_arrival(self, message: Message, arrival_ns: int) -> None:
         loop = self._loop
         now_ns = loop.now_ns
         if arrival_ns <= now_ns and not self.expects(self._arrive):
@@ -317,7 +318,7 @@ class Link:
             loop.schedule_release(arrival_ns, self._arrive, *message)
 
     def expects(self, arrive: Callable[[Release], Any]) -> bool:
-        """Whether a message is due now that has not arrived yet: none must overtake it."""
+        """Whether a due message has not arrived yet: none must overtake it."""
         scheduled, now_ns = self._loop.scheduled, self._loop.now_ns
         return bool(scheduled and scheduled[0][0] <= now_ns) and any(
             release[3] == arrive and release[0] <= now_ns for release in scheduled
@@ -345,7 +346,7 @@ class Link:
         subscription.deliver(arrived)
 
     def _expire(self, release: Release) -> None:
-        """Drop a message that nobody has taken within its lifespan."""
+        """Drop a message that was not taken within its lifespan."""
         queue = self.subscription.queue
         for place, waiting in enumerate(queue):
             if waiting is release[4]:
@@ -353,20 +354,20 @@ class Link:
                 return
 
     def sign_of_life(self) -> None:
-        """Tell the subscription that its publisher is alive; takes no time, outages hide it."""
+        """Tell the subscription that its publisher is alive; outages hide it."""
         channel, now_ns = self._channel, self._loop.now_ns
         hidden = channel is not None and channel.cut_off_until(now_ns) is not None
         if self._lease is not None and not hidden:
             self._lease.seen()
 
     def acked_ns(self) -> int:
-        """Return when all that was sent so far has arrived, where that is acknowledged."""
+        """Return when all acknowledged messages so far have arrived."""
         if self.subscription.qos.reliability is not Reliability.RELIABLE:
             return 0
         return self.last_ns
 
     def close(self) -> None:
-        """Forget the publisher, or the subscription: one of them goes."""
+        """Forget the publisher or subscription."""
         if self._lease is not None:
             self._lease.gone()
 
@@ -379,7 +380,7 @@ class Link:
         self._held.append((message, arrivals_ns))
 
     def _release(self) -> None:
-        """Let go of what has waited through an outage."""
+        """Send what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
         loop = self._loop
@@ -396,8 +397,8 @@ class Network:
         self._plan = plan
         self._counts: dict[tuple[str, str, str], int] = {}
         self._ends: dict[int, tuple[str, int]] = {}
-        self._requests: dict[tuple[int, int], Exchanges] = {}
-        self._responses: dict[tuple[int, int], Exchanges] = {}
+        self._requests: dict[tuple[int, int], ServiceLink] = {}
+        self._responses: dict[tuple[int, int], ServiceLink] = {}
 
     def link(
         self,
@@ -406,37 +407,35 @@ class Network:
         qos: Qos,
         subscription: Subscription,
         faults: TopicFaults | None,
-    ) -> Link:
-        """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
+    ) -> PublisherLink:
+        """Return the link of a publisher to a subscription."""
         channel = self._plan.topic_channel(
             topic,
             self._end("publisher", topic, publisher),
             self._end("subscription", topic, subscription),
             reliable=subscription.qos.reliability is Reliability.RELIABLE,
         )
-        return Link(self._dispatcher, qos, subscription, channel, faults)
+        return PublisherLink(self._dispatcher, qos, subscription, channel, faults)
 
     def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
-        """Bring a request to the server."""
         key = (client.entity_id, server.entity_id)
         way = self._requests.get(key)
         if way is None:
             channel = self._service_channel(service, client, server, "request")
-            way = self._requests[key] = Exchanges(self._dispatcher, server, channel)
+            way = self._requests[key] = ServiceLink(self._dispatcher, server, channel)
         way.send(exchange)
 
     def response(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
-        """Bring a response to the client."""
         key = (client.entity_id, server.entity_id)
         way = self._responses.get(key)
         if way is None:
             channel = self._service_channel(service, client, server, "response")
-            way = self._responses[key] = Exchanges(self._dispatcher, client, channel)
+            way = self._responses[key] = ServiceLink(self._dispatcher, client, channel)
         way.send(exchange)
 
     def _service_channel(
         self, service: str, client: Receiver, server: Receiver, what: str
-    ) -> Channel | None:
+    ) -> LinkChannel | None:
         return self._plan.service_channel(
             service,
             self._end("client", service, client),
@@ -445,7 +444,7 @@ class Network:
         )
 
     def _end(self, kind: str, name: str, endpoint: DomainEntity) -> tuple[str, int]:
-        """Return (node, how many such endpoints it has made before this one)."""
+        """Return (node, number of its earlier endpoints of this kind)."""
         end = self._ends.get(endpoint.entity_id)
         if end is None:
             node = endpoint.node.fully_qualified_name

@@ -1,4 +1,4 @@
-"""The graph of a world as plain values: who is there, who talks to whom, and who never will."""
+"""The graph of a run as plain values: nodes, connections, and problems."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.graph import Graph
-from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Liveliness, incompatible_policies
 from rsltrace.simulation.middleware.qos.timing import finite
@@ -24,7 +23,7 @@ _STATIC_TRANSFORMS = "/tf_static"
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """One end of a topic, service or action: the node, and (of a topic) its QoS in words."""
+    """One end of a topic, service or action: the node, and (of a topic) its QoS as text."""
 
     node: str
     qos: str = ""
@@ -32,9 +31,9 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A topic, service or action with its ends. ``senders`` publish or call, ``receivers``
-    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policies) of the
-    pairs that do not connect."""
+    """A topic, service or action with its ends in creation order. ``senders`` publish or call,
+    ``receivers`` subscribe or serve. ``apart`` has (sender, receiver, policies) of incompatible
+    pairs."""
 
     kind: str
     name: str
@@ -45,7 +44,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeView:
+class GraphNode:
     """A node, its class, and its timers as (callback, period in ns)."""
 
     name: str
@@ -55,31 +54,33 @@ class NodeView:
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
-    program that waits for work has)."""
+    """The graph after construction. ``waiting`` says what has not finished."""
 
-    nodes: tuple[NodeView, ...]
+    nodes: tuple[GraphNode, ...]
     links: tuple[Link, ...]
     waiting: tuple[str, ...] = ()
     problems: tuple[str, ...] = field(default=())
 
     def of_kind(self, kind: str) -> list[Link]:
-        """Return the links of one kind (``topic``, ``service``, ``action``), by name."""
+        """Return the links of one kind (``topic``, ``service``, ``action``)."""
         return [link for link in self.links if link.kind == kind]
 
 
-def overview(
+def graph_overview(
     graph: Graph,
     waiting: Iterable[str],
     *,
     everything: bool = False,
     follows: Callable[[str], bool] = lambda node: False,
 ) -> Overview:
-    """Return the present graph; ``everything`` with what every node has.
+    """Return the current graph; ``everything`` includes what every node has.
 
-    ``follows`` says whether ``/clock`` drives the time of a node; others listen to it in vain.
+    ``follows`` says whether ``/clock`` drives a node's time; other nodes subscribe to it in vain.
     """
-    nodes = tuple(_node(node) for node in graph.nodes)
+    nodes = tuple(
+        GraphNode(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
+        for node in graph.nodes
+    )
     links = [*_topics(graph), *_services(graph), *_actions(graph)]
     if not everything:
         links = [link for link in links if not _is_everywhere(link)]
@@ -97,18 +98,14 @@ def overview(
     )
 
 
-def _namesakes(nodes: Iterable[NodeView]) -> Iterator[str]:
-    """Yield the names that several nodes have: a mistake, most often."""
+def _namesakes(nodes: Iterable[GraphNode]) -> Iterator[str]:
+    """Yield the names that several nodes share."""
     for name, count in Counter(node.name for node in nodes).items():
         if count > 1:
             yield (
                 f"{count} nodes are named {name}: their parameters, services and logs go by that "
                 "name; unless that is meant, give each a name of its own (name: or namespace:)"
             )
-
-
-def _node(node: Participant) -> NodeView:
-    return NodeView(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
 
 
 def _topics(graph: Graph) -> Iterator[Link]:
@@ -173,7 +170,7 @@ def _name_of(endpoint: DomainEntity) -> str:
 
 
 def _is_everywhere(link: Link) -> bool:
-    """Say whether a link is one that rclpy makes for every node, or a part of an action."""
+    """Whether a link is one that rclpy makes for every node, or part of an action."""
     if _ACTION in link.name:
         return True
     if link.kind == "topic":
@@ -184,7 +181,7 @@ def _is_everywhere(link: Link) -> bool:
 
 
 def _is_unheard_static(link: Link) -> bool:
-    """Say whether a link is what every listener of tf2 subscribes to besides ``/tf``, in vain."""
+    """Whether a link is the ``/tf_static`` subscription of tf2 listeners, without publishers."""
     return link.name == _STATIC_TRANSFORMS and not link.senders
 
 
@@ -200,16 +197,15 @@ def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:
             waiting = [node for node in nodes if follows(node)]
             if waiting:
                 yield (
-                    f"topic {_CLOCK}: {_who(waiting, 'goes by it', 'go by it')} (clocks: source: "
-                    "topic), and nobody publishes: ROS time stands still at 0"
+                    f"topic {_CLOCK}: {_who(waiting, 'uses it', 'use it')} (clocks: source: "
+                    "topic), but it has no publisher: ROS time stands still at 0"
                 )
         elif link.name not in NODE_TOPICS:
-            yield (
-                f"topic {link.name}: {_who(nodes, 'subscribes', 'subscribe')}, and nobody publishes"
-            )
+            who = _who(nodes, "subscribes", "subscribe")
+            yield f"topic {link.name}: {who}, but it has no publisher"
     if link.senders and not link.receivers and link.kind != "topic":
         who = _who([end.node for end in link.senders], "calls", "call")
-        yield f"{link.kind} {link.name}: {who}, and nobody serves"
+        yield f"{link.kind} {link.name}: {who}, but it has no server"
 
 
 def _who(nodes: Iterable[str], one: str, several: str) -> str:

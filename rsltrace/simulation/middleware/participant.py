@@ -1,4 +1,4 @@
-"""Participants: those who publish, subscribe, call and serve; in ROS, nodes."""
+"""Participants, which are nodes in ROS, and their QoS events."""
 
 from __future__ import annotations
 
@@ -7,16 +7,14 @@ from typing import Any, Protocol
 
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import Door, State
+from rsltrace.simulation.middleware.events.event import Door, ParticipantState
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
 from rsltrace.simulation.middleware.timer import Timer
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT
 
-# QoS events: news of an endpoint's status, for whoever wants to hear of it.
 
-
-class Endpoint(Protocol):
+class QosEndpoint(Protocol):
     """A publisher or subscription, as its QoS events see it."""
 
     topic: str
@@ -24,15 +22,14 @@ class Endpoint(Protocol):
 
 
 class QosEvent(DomainEntity):
-    """Becomes ready when one status of an endpoint has news. ``cause`` is the event that made them.
+    """Becomes ready when a status of an endpoint changes. ``cause`` is the event that changed it.
 
-    Client libraries make one or two for every endpoint; the trace is told of those that fire.
+    Client libraries make one or two for every endpoint; the trace has those that fire.
     """
 
     kind = EntityKind.QOS_EVENT
 
-    def listen(self, endpoint: Endpoint, status: str) -> None:
-        """Hear of a status from now on, by its name."""
+    def listen(self, endpoint: QosEndpoint, status: str) -> None:
         self.announced = False
         self.endpoint = endpoint
         self.status = status
@@ -41,7 +38,6 @@ class QosEvent(DomainEntity):
         endpoint.events.listeners[status] = self
 
     def trigger(self) -> None:
-        """Make it ready, if there is news."""
         if self.is_queued or not self.active or not self.has_news():
             return
         self.is_queued = True
@@ -52,22 +48,20 @@ class QosEvent(DomainEntity):
         self.dispatcher.loop.ready.append(self)
 
     def dispatch(self) -> None:
-        """Hand the status over."""
         raise AssertionError("every QoS event says how")
 
     def has_news(self) -> bool:
-        """Return whether there is a status to take."""
         return self.endpoint.events.news(self.status)
 
     def take_event(self) -> Any:
-        """Return the status; its changes are those since the last time."""
+        """Return the status with the changes since the last call."""
         return self.endpoint.events.take(self.status)
 
     def trace_name(self) -> str:
         return f"{self.endpoint.topic} {self.status}"
 
 
-class ActionEnd(Protocol):
+class ActionEndpoint(Protocol):
     """A client or a server of an action, which is made of other endpoints."""
 
     name: str
@@ -78,20 +72,20 @@ class ActionEnd(Protocol):
         """The name of the action's type."""
 
 
-_THINGS_PER_NODE = 1 << 20
+_ENTITIES_PER_NODE_MAX = 1 << 20
 
 
 class Participant(DomainEntity):
-    """Somebody in the domain, with a name; in the trace, a node.
+    """A node.
 
-    ``door`` speaks for it. ``process`` is where it lives, if that may end before the run does.
-    ``number`` tells those of one name apart, in the order of creation.
+    ``door`` handles its exceptions. ``process`` is set if its process may end before the run.
+    ``number`` distinguishes nodes of the same name, in order of creation.
     """
 
     kind = EntityKind.NODE
     process: object = None
     held: list[Any] | None = None
-    """What would run of it, besides its callbacks, if it did not hang."""
+    """What waits to run, besides its callbacks, while it hangs."""
     number = 1
 
     def __init__(self, dispatcher: Dispatcher, name: str, namespace: str, door: Door) -> None:
@@ -101,26 +95,24 @@ class Participant(DomainEntity):
         self.namespace = namespace
         self.fully_qualified_name = full_name(namespace, name)
         self.door = door
-        self.state: State | None = None
-        self.actions: list[ActionEnd] = []
+        self.state: ParticipantState | None = None
+        self.actions: list[ActionEndpoint] = []
         self.timers: list[Timer] = []
 
     @property
     def key(self) -> str:
-        """The full name, with the number of a second one of that name: ``/n #2``."""
+        """The full name, with the number of a namesake: ``/n #2``."""
         name = self.fully_qualified_name
         return name if self.number == 1 else f"{name} #{self.number}"
 
     def ordinal(self, count: int) -> int:
-        """Return a number for one of its things that no other node of its name gives."""
-        return count + (self.number - 1) * _THINGS_PER_NODE
+        """Return a number that no namesake of this node uses for the same kind of entity."""
+        return count + (self.number - 1) * _ENTITIES_PER_NODE_MAX
 
     def timer_periods(self) -> Iterable[tuple[str, int]]:
-        """Yield (callback, period in ns) of its timers."""
         return ((callback_name(timer.callback), timer.state.period_ns) for timer in self.timers)
 
     def shortest_period_ns(self) -> int | None:
-        """Return the period of its fastest timer, None if it has none."""
         return min((period_ns for _, period_ns in self.timer_periods()), default=None)
 
     def trace_name(self) -> str:
@@ -131,5 +123,4 @@ class Participant(DomainEntity):
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return a node's fully qualified name."""
     return (namespace if namespace.endswith("/") else namespace + "/") + name

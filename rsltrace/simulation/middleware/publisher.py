@@ -10,17 +10,15 @@ from typing import Any
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, TopicFaults
-from rsltrace.simulation.middleware.links import Link, Network
+from rsltrace.simulation.middleware.links import Network, PublisherLink
 from rsltrace.simulation.middleware.qos.policies import Durability, Qos, Reliability
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import Offers, finite
+from rsltrace.simulation.middleware.qos.timing import OfferedQosTimers, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import OutputKind
-
-# What endpoints send through: the trace's channels, links with a model, and who listens in.
 
 Watcher = Callable[[Any, bytes], None]
 """Is called with the publisher and the canonical bytes of each message on a topic."""
@@ -31,8 +29,7 @@ and returns those that are published in their place; None: the message is not pu
 
 
 class TopicObservers:
-    """Who sees every message of a topic: ``filter`` decides what is published, ``watchers`` are
-    told what was."""
+    """Observers of a topic: ``filter`` decides what is published, ``watchers`` are called after."""
 
     def __init__(self) -> None:
         self.filter: MessageFilter | None = None
@@ -40,8 +37,8 @@ class TopicObservers:
 
 
 class Transport:
-    """How what is sent gets to others. ``network`` is None in a run without models of links;
-    ``faults`` are those of single messages, by topic."""
+    """How messages reach receivers. ``network`` is None in a run without link models; ``faults``
+    are those of single messages, by topic."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self.dispatcher = dispatcher
@@ -74,9 +71,8 @@ class Transport:
 class Publisher(DomainEntity):
     """Sends a topic.
 
-    ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job
-    with delay models, and are None in others. ``observers`` are those of
-    its topic's messages, if there are any.
+    ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job with
+    delay models, else it is None. ``observers`` are those of its topic, or None.
     """
 
     kind = EntityKind.PUBLISHER
@@ -91,9 +87,9 @@ class Publisher(DomainEntity):
         self.type = type
         self.qos = qos.resolved(publisher=True, peers=[])
         self.subscriptions: list[Subscription] = []
-        self.links: list[Link] | None = None if transport.network is None else []
+        self.links: list[PublisherLink] | None = None if transport.network is None else []
         self.events = EndpointEvents()
-        self._offers = Offers.of(self.dispatcher.loop, self.qos, self.events)
+        self._offers = OfferedQosTimers.of(self.dispatcher.loop, self.qos, self.events)
         self._faults = transport.faults.get(topic)
         if finite(self.qos.lifespan_ns) or self._faults is not None:
             self.links = []
@@ -106,7 +102,6 @@ class Publisher(DomainEntity):
 
     @property
     def type_name(self) -> str:
-        """The name of its type."""
         return self.type.name
 
     def send(self, data: bytes, content_hash: int | None = None) -> None:
@@ -173,10 +168,8 @@ class Publisher(DomainEntity):
         )
         return self._channel
 
-    # -- who is connected ------------------------------------------------------------------------
-
     def connect(self, subscription: Subscription) -> None:
-        """Send to this subscription, too; fan-out is in the creation order of subscriptions."""
+        """Connect a subscription; fan-out is in creation order of subscriptions."""
         if self.links is None and subscription.timed:
             self.links = [self._link_to(other) for other in self.subscriptions]
         insort(self.subscriptions, subscription, key=lambda other: other.entity_id)
@@ -184,15 +177,13 @@ class Publisher(DomainEntity):
             link = self._link_to(subscription)
             insort(self.links, link, key=lambda link: link.subscription.entity_id)
 
-    def _link_to(self, subscription: Subscription) -> Link:
-        """Make the link to a subscription, with the model that the job has for it."""
+    def _link_to(self, subscription: Subscription) -> PublisherLink:
         network = self._transport.network
         if network is None:
-            return Link(self.dispatcher, self.qos, subscription, None, self._faults)
+            return PublisherLink(self.dispatcher, self.qos, subscription, None, self._faults)
         return network.link(self, self.topic, self.qos, subscription, self._faults)
 
     def disconnect(self, subscription: Subscription) -> None:
-        """Send to this subscription no longer."""
         self.subscriptions.remove(subscription)
         if self.links is not None:
             for link in self.links:
@@ -201,7 +192,6 @@ class Publisher(DomainEntity):
             self.links = [link for link in self.links if link.subscription is not subscription]
 
     def disconnect_all(self) -> None:
-        """Send to nobody any more."""
         self.subscriptions = []
         for link in self.links or ():
             link.close()
@@ -209,7 +199,7 @@ class Publisher(DomainEntity):
             self.links.clear()
 
     def send_history(self, subscription: Subscription) -> None:
-        """Give a late joiner what it asks for and this publisher kept; never by best effort."""
+        """Send a late joiner the kept messages; never by best effort."""
         if (
             not self._history
             or subscription.qos.durability is not Durability.TRANSIENT_LOCAL
@@ -227,17 +217,14 @@ class Publisher(DomainEntity):
             link.send(*delivery[4:])
 
     def assert_liveliness(self) -> None:
-        """Show that this publisher is alive, without a message."""
         if self._offers is not None:
             self._offers.asserted()
         for link in self.links or ():
             link.sign_of_life()
 
     def acknowledged_ns(self) -> int:
-        """Return when all that was sent has arrived wherever that is acknowledged."""
+        """Return when all acknowledged messages have arrived."""
         return max((link.acked_ns() for link in self.links or ()), default=0)
-
-    # -- the trace -------------------------------------------------------------------------------
 
     def settle(self) -> bool:
         return True

@@ -1,12 +1,12 @@
-"""What an ordered loop has to know of what may run: names, periods, groups, simulated executors;
-and execution times, which keep workers busy and hold back what a callback sends."""
+"""What an ordered loop needs to know of callbacks: names, periods, groups, simulated executors; and
+execution times, which keep workers busy and delay what a callback sends."""
 
 from __future__ import annotations
 
 from array import array
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.simulation.chance.distribution import Distribution, Sampler
 from rsltrace.simulation.chance.stream import Stream
@@ -14,27 +14,23 @@ from rsltrace.simulation.loop.ordered import OrderedLoop, Place, Workers
 from rsltrace.simulation.loop.policy import Candidate, Policy
 from rsltrace.simulation.middleware.entity import Receiver, Runnable
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import OutsideEvent, Owner
+from rsltrace.simulation.middleware.events.event import EventOwner, OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import Draw, EventKind, encode_draw
 
-# At what rate chains run: a message has the period of the timer that it came of.
-#
-# The rate of a subscription (service, client) is the fastest of the chains that have reached it so
-# far, that of a timer its own; of what no timer has caused (bags, drivers), its node's fastest
-# timer.
+# The period of a subscription (service, client) is that of the fastest chain that has reached it;
+# without a timer as cause (bags, drivers), that of its node's fastest timer.
 
 _UNKNOWN = -1
 
 
 def follows_chains(policy: object) -> bool:
-    """Whether a policy wants the periods of chains (``Rates``)."""
     return bool(getattr(policy, "follows_chains", False))
 
 
-class Rates(EventObserver):
-    """Follows which period each event goes back to."""
+class ChainPeriods(EventObserver):
+    """Tracks the timer period that each event goes back to."""
 
     order = ObserverOrder.RATES
 
@@ -45,7 +41,7 @@ class Rates(EventObserver):
         dispatcher.add_observer(self)
 
     def period(self, item: Any, what: Runnable) -> int | None:
-        """Return the period (ns) of something that may run; its latest arrival counts, too."""
+        """Return the period (ns) of an item, including its latest arrival."""
         if what.kind == "timer" and what.period_ns is not None:
             self._of_entities[what.entity] = what.period_ns
         elif isinstance(item, Receiver) and item.queue:
@@ -60,7 +56,6 @@ class Rates(EventObserver):
         return self._of_events[event] if known else None
 
     def before_event(self, call: EventCall) -> bool:
-        """Take note of the event's period."""
         period_ns = self._of_entities.get(call.entity)
         if period_ns is None:
             period_ns = self._of_event(call.cause_event)
@@ -106,10 +101,10 @@ class ExecutionRule:
 
 @dataclass(frozen=True, slots=True)
 class SchedulingPlan:
-    """What a job says of order, executors and execution times. The first rule that fits counts.
+    """What a job says of order, executors and execution times. The first matching rule counts.
 
-    Nodes without an executor have one of their own with one worker; ``occupies`` says whether
-    callbacks occupy workers at all.
+    Nodes without an executor have one of their own with one worker; ``occupies``: callbacks occupy
+    workers at all.
     """
 
     policy: Policy
@@ -120,13 +115,6 @@ class SchedulingPlan:
     start_ns: int = 0
 
 
-class Schedulable(Protocol):
-    """What is in a queue of the loop: it can say what a policy has to know of it."""
-
-    def runnable(self) -> Runnable:
-        """Return what there is to know."""
-
-
 class Scheduling:
     """Describes to the loop what may run."""
 
@@ -135,16 +123,13 @@ class Scheduling:
         self._workers: dict[object, Workers] = {}
         loop.policy = plan.policy
         loop.place = self.place
-        self._rates: Rates | None = None
+        self._rates: ChainPeriods | None = None
         if follows_chains(plan.policy):
-            self._rates = Rates(dispatcher)
+            self._rates = ChainPeriods(dispatcher)
         if plan.execution:
             dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
 
-    # -- what may run --------------------------------------------------------------------------
-
-    def place(self, item: Schedulable | Any) -> Place:
-        """Describe something that may run."""
+    def place(self, item: Any) -> Place:
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
         workers = self._workers_of(what)
@@ -162,7 +147,7 @@ class Scheduling:
         return Place(candidate, workers, what.group, what.told)
 
     def _workers_of(self, what: Runnable) -> Workers | None:
-        """Return the simulated executor that something runs on, if it does on any."""
+        """Return the simulated executor of an item, or None."""
         if not self._plan.occupies or what.node is None or not what.executor:
             return None
         name = what.node.fully_qualified_name
@@ -179,8 +164,6 @@ class Scheduling:
 
 
 class ExecutionTimes(EventObserver):
-    """Gives callbacks their durations."""
-
     order = ObserverOrder.EXECUTION_TIMES
 
     def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
@@ -191,7 +174,7 @@ class ExecutionTimes(EventObserver):
         self._counts: dict[tuple[str, str, str], int] = {}
 
     def before_event(self, call: EventCall) -> bool:
-        """Draw how long the callback takes, and charge it with that when it is over."""
+        """Draw the execution time, and charge it when the callback is over."""
         event, charge = self._dispatcher.event, self._loop.charge
         duration = None
         if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):
@@ -209,7 +192,7 @@ class ExecutionTimes(EventObserver):
         call.on_end.append(ended)
         return True
 
-    def _duration_of(self, handle: Any, entity: int, node: Owner | None) -> Sampler | None:
+    def _duration_of(self, handle: Any, entity: int, node: EventOwner | None) -> Sampler | None:
         if entity in self._durations:
             return self._durations[entity]
         sampler = None

@@ -1,9 +1,10 @@
-"""Services and clients: requests and responses are sent once, as messages are, and correlated."""
+"""Services and clients. A request or response is recorded when it is sent, as messages are."""
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.simulation.middleware.entity import Receiver, callback_name
@@ -21,14 +22,12 @@ _REQUEST = int(OutputKind.REQUEST)
 _RESPONSE = int(OutputKind.RESPONSE)
 
 
+@dataclass(eq=False, slots=True)
 class RequestId:
-    """Who asked, and which of its requests it is (``rmw_request_id_t``)."""
+    """A request by its client and number (``rmw_request_id_t``)."""
 
-    __slots__ = ("client", "sequence_number")
-
-    def __init__(self, client: Client, sequence_number: int) -> None:
-        self.client = client
-        self.sequence_number = sequence_number
+    client: Client
+    sequence_number: int
 
 
 class ServiceInfo:
@@ -47,8 +46,6 @@ Exchange = tuple[bytes, int, int, int, ServiceInfo]
 
 
 class ServiceEnd(Receiver):
-    """What a client and a server have in common."""
-
     def __init__(
         self, transport: Transport, node: Any, service: str, type: ServiceType, qos: Qos
     ) -> None:
@@ -63,7 +60,6 @@ class ServiceEnd(Receiver):
 
     @property
     def type_name(self) -> str:
-        """The name of its type."""
         return self.type.name
 
     def _emit(self, kind: int, prefix: str, type: MessageType, data: bytes) -> tuple[int, int]:
@@ -124,7 +120,6 @@ class Service(ServiceEnd):
         self.respond(self.callback(data), info.request_id)
 
     def respond(self, data: bytes, request_id: RequestId) -> None:
-        """Send a response to the client that asked."""
         position, digest = self._emit(_RESPONSE, PREFIX_RESPONSE, self.type.response, data)
         client = request_id.client
         if client.destroyed:
@@ -155,7 +150,6 @@ class Client(ServiceEnd):
         self._pending: dict[int, Callable[[bytes], object]] = {}
 
     def servers(self) -> list[Service]:
-        """Return the servers that there are now."""
         return [] if self.graph is None else self.graph.services(self.service)
 
     def call(self, data: bytes, callback: Callable[[bytes], object]) -> None:
@@ -163,11 +157,11 @@ class Client(ServiceEnd):
         self._pending[self.request(data).sequence_number] = callback
 
     def has_asked(self, sequence: int) -> bool:
-        """Return whether it has sent a request of that number."""
+        """Whether it has sent a request of that number."""
         return sequence <= self._sequence
 
     def request(self, data: bytes) -> RequestId:
-        """Send a request to every server of that name; without one it is lost, as in DDS."""
+        """Send a request to every server of the service; without one it is lost, as in DDS."""
         self._sequence += 1
         position, digest = self._emit(_REQUEST, PREFIX_REQUEST, self.type.request, data)
         loop = self.dispatcher.loop
@@ -182,7 +176,7 @@ class Client(ServiceEnd):
         return info.request_id
 
     def dispatch(self) -> None:
-        """Take the oldest response and hand it to who waits for it."""
+        """Take the oldest response and call its callback."""
         if not self.may_run():
             return
         data, *cause, info = self.queue.popleft()

@@ -1,4 +1,4 @@
-"""Subscriptions: what has been published waits in their queue until their callback runs."""
+"""Subscriptions: published messages wait in their queue until their callback runs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.qos.policies import Qos
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import Deadline, finite
+from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, finite
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
@@ -26,8 +26,8 @@ Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
 class Subscription(Receiver):
     """Receives a topic; ``callback`` is called with each message's bytes.
 
-    A full queue drops its oldest message. ``qos`` is resolved, ``publishers`` are the connected
-    ones; ``timed`` says whether its QoS looks at the clock.
+    A full queue drops its oldest message. ``qos`` is resolved, ``publishers`` are connected;
+    ``timed``: its QoS depends on time.
     """
 
     kind = EntityKind.SUBSCRIPTION
@@ -52,13 +52,12 @@ class Subscription(Receiver):
         self.timed = any(map(finite, (qos.deadline_ns, qos.lifespan_ns, qos.lease_ns)))
         self.publishers: list[DomainEntity] = []
         self.events = EndpointEvents()
-        self.deadline: Deadline | None = None
+        self.deadline: DeadlineTimer | None = None
         if finite(qos.deadline_ns):
-            self.deadline = Deadline(dispatcher.loop, qos.deadline_ns, self.events)
+            self.deadline = DeadlineTimer(dispatcher.loop, qos.deadline_ns, self.events)
 
     @property
     def type_name(self) -> str:
-        """The name of its type."""
         return self.type.name
 
     def dispatch(self) -> None:

@@ -41,12 +41,11 @@ class Timer(DomainEntity):
         self.activate()
 
     def activate(self) -> None:
-        """Let the loop know when it is due."""
         if self.active and not self.state.canceled and not self.destroyed:
             self.dispatcher.loop.timers.add(self.state)
 
     def dispatch(self) -> None:
-        """Run the callback of a timer that is due, and move it to its next deadline."""
+        """Run the callback of a due timer, and set its next deadline."""
         callback = self.callback
         assert callback is not None
         digest = self.deadline_hash()
@@ -58,7 +57,7 @@ class Timer(DomainEntity):
         )
 
     def deadline_hash(self) -> int:
-        """Return what stands for the input of a timer's event: when it was due."""
+        """Return the input hash of a timer's event: its deadline."""
         if self.dispatcher.recorder is None:
             return 0
         return hash64(_pack_deadline(self.state.deadline_ns))
@@ -70,7 +69,6 @@ class Timer(DomainEntity):
         self._note(TIMER_CANCEL, 0)
 
     def reset(self) -> None:
-        """Start a new period now."""
         self.state.reset(self.dispatcher.loop.now_ns)
         if self.active:
             self.dispatcher.loop.timers.add(self.state)

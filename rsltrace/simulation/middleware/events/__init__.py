@@ -1,1 +1,1 @@
-"""Running events and recording them: who is called, what caused it, how the run has gone."""
+"""Run events and record them."""

@@ -1,7 +1,7 @@
 """How an event is run and recorded.
 
-``Dispatcher.execute`` is the middle of everything: each event of a run passes through it once. Keep
-it small; what only some runs need is an observer (``observer.py``).
+Each event of a run passes through ``Dispatcher.execute`` once. Keep it small; what only some runs
+need is an observer (``observer.py``).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from typing import Any, Protocol
 from rsltrace.errors import OutputError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.events.event import (
-    Census,
     Door,
     Event,
+    EventOwner,
+    NameRegistry,
     Outcome,
     OutsideEvent,
-    Owner,
 )
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, overrides
 from rsltrace.trace.chain import hash64
@@ -27,11 +27,9 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import pack_operation
 from rsltrace.trace.recorder import Recorder
 
-# The book of entities: their ids, and when the trace is told of each.
-
 
 class Recordable(Protocol):
-    """Something that has an id in the trace. ``announced`` says whether the trace is told of it."""
+    """Something with an id in the trace. ``announced``: it is recorded when it is created."""
 
     announced: bool
 
@@ -42,18 +40,17 @@ class Recordable(Protocol):
         """Return it as the trace describes it."""
 
 
-class EntityBook:
-    """Gives out ids, and keeps what has been created until it can be written down.
+class EntityRegistry:
+    """Assigns entity ids, and keeps new entities until they can be recorded.
 
-    ``pending`` was created in the event under way, ``unowned`` still has no owner (a timer that no
-    node lists yet). ``census`` is that of the run, if it has one; ``observers`` are told
-    of each entity.
+    ``pending`` were created in the current event, ``unowned`` have no owner yet (a timer that no
+    node lists). ``census`` has the run's names if needed; ``observers`` are told of each entity.
     """
 
     def __init__(self) -> None:
         self.pending: list[Recordable] = []
         self.unowned: list[Recordable] = []
-        self.census: Census | None = None
+        self.census: NameRegistry | None = None
         self.observers: tuple[EventObserver, ...] = ()
         self._count = 0
 
@@ -63,7 +60,7 @@ class EntityBook:
         return self._count
 
     def settle(self, recorder: Recorder | None) -> None:
-        """Write down the entities created in this event, now that their owners are known."""
+        """Record the entities of this event whose owners are known."""
         waiting, self.unowned = self.unowned, []
         created = [*waiting, *self.pending]
         self.pending.clear()
@@ -78,7 +75,7 @@ class EntityBook:
                     observer.entity_created(entity)
 
     def look_again(self, node: Any) -> None:
-        """Write down in this event what of ``node`` has waited for an owner."""
+        """Record the unowned entities that turn out to be ``node``'s."""
         if self.unowned:  # a timer made long before its node is spun is written down now
             waiting, self.unowned = self.unowned, []
             for one in waiting:
@@ -87,17 +84,17 @@ class EntityBook:
 
 
 class Dispatcher:
-    """Runs the callbacks of one run, one event at a time, and records what comes of them.
+    """Runs the callbacks of a run, one event at a time, and records the results.
 
-    ``recorder`` is None in a run that records nothing; ``unrecorded`` then counts the outputs of
-    the event under way. ``door`` speaks for what belongs to no participant (construction, mains).
-    ``resume_observers`` and ``node_observers`` are those to be told by whoever resumes a callback.
+    ``recorder`` is None in an unrecorded run; ``unrecorded`` then counts the outputs of the event.
+    ``door`` handles exceptions of what belongs to no participant (construction, mains). Whoever
+    resumes a callback has to call ``resume_observers`` and ``node_observers``.
     """
 
     def __init__(self, loop: EventLoop) -> None:
         self.loop = loop
         self.event = Event()
-        self.entities = EntityBook()
+        self.entities = EntityRegistry()
         self.outcome = Outcome()
         self.recorder: Recorder | None = None
         self.unrecorded = 0
@@ -109,28 +106,25 @@ class Dispatcher:
         self.resume_observers: tuple[EventObserver, ...] = ()
         self.node_observers: tuple[EventObserver, ...] = ()
 
-    # -- who watches and steers --------------------------------------------------------------------
-
     def record(self, recorder: Recorder | None) -> None:
-        """Record with ``recorder`` from now on; None: nothing any more."""
+        """Record with ``recorder`` from now on; None: record nothing."""
         self.recorder = recorder
         if recorder is not None:
             recorder.tell([one.output for one in self._with("output")])
 
     def add_observer(self, observer: EventObserver) -> None:
-        """Have an observer called from now on, among the others as its ``order`` says."""
+        """Add an observer, in the place given by its ``order``."""
         assert all(one is not observer for one in self._observers), "it is there already"
         self._observers.append(observer)
         self._observers.sort(key=lambda one: one.order)  # stable
         self._choose_observers()
 
     def remove_observer(self, observer: EventObserver) -> None:
-        """Call an observer no longer, if it is called."""
         self._observers = [one for one in self._observers if one is not observer]
         self._choose_observers()
 
     def _choose_observers(self) -> None:
-        """Find out for each hook who has one: what nobody wants to know costs nothing."""
+        """List the observers of each hook: hooks without observers cost nothing."""
         self._before = self._with("before_event")[::-1]
         self._after = self._with("after_event")
         self.resume_observers = self._with("resumed")
@@ -141,17 +135,15 @@ class Dispatcher:
     def _with(self, hook: str) -> tuple[EventObserver, ...]:
         return tuple(one for one in self._observers if overrides(one, hook))
 
-    def _is_to_happen(self, call: EventCall) -> bool:
-        """Ask observers before an event; the first that does not want it is the last one asked."""
+    def _accepted_by_observers(self, call: EventCall) -> bool:
+        """Ask observers before an event; the first that rejects it is the last one asked."""
         return all(observer.before_event(call) for observer in self._before)
-
-    # -- events ------------------------------------------------------------------------------------
 
     def execute(
         self,
         handle: Dispatchable,
         entity: int,
-        node: Owner | None,
+        node: EventOwner | None,
         kind: int,
         callback: Callable[..., object],
         args: tuple[Any, ...],
@@ -160,13 +152,13 @@ class Dispatcher:
         input_hash: int,
         is_decided: int = False,
     ) -> None:
-        """Run one event: call ``callback(*args)`` and record what came of it. If it ``is_decided``,
-        observers have been asked."""
+        """Run one event: call ``callback(*args)`` and record what came of it. ``is_decided``: the
+        observers have already been asked."""
         if self._before and not is_decided:
             call = EventCall(
                 handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
             )
-            if self._is_to_happen(call):
+            if self._accepted_by_observers(call):
                 self.execute(*call.values(), True)
             call.end()
             return
@@ -188,10 +180,7 @@ class Dispatcher:
             on_end()
 
     def _raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Let a door decide what becomes of an exception.
-
-        :raises OutputError: the trace cannot be written; no event may be lost quietly.
-        """
+        """Let the exception handler decide what happens next."""
         if isinstance(error, OutputError):
             raise error
         node = self.event.node
@@ -199,7 +188,7 @@ class Dispatcher:
         door.raised(error, handle)
 
     def end_event(self) -> None:
-        """Record the event under way, which may be a later part of the one ``execute`` began."""
+        """Record the current event, possibly a later part of the one ``execute`` began."""
         if self._pending:
             self.entities.settle(self.recorder)
         event = self.event
@@ -238,28 +227,24 @@ class Dispatcher:
         body: Callable[[], Any],
         cause: tuple[int, int] = (NO_EVENT, 0),
     ) -> None:
-        """Run an event that is no entity's callback; most of them nothing in the run has caused."""
+        """Run an event that is not an entity's callback."""
         self.execute(handle, entity, node, kind, body, (), *cause, 0)
 
     def in_callback(self) -> bool:
-        """Return whether the event under way is a callback's, not a main's or a thread's."""
         return not isinstance(self.event.handle, OutsideEvent)
 
     def has_outputs(self) -> bool:
-        """Return whether the event under way has had outputs."""
         outputs = self.unrecorded if self.recorder is None else self.recorder.outputs
         return bool(outputs or self._pending)
 
     @contextlib.contextmanager
     def outside_events(self) -> Iterator[None]:
-        """Run what belongs to no event (a stop function, finalizers): it cannot wait."""
+        """Run code that belongs to no event (a stop function, finalizers); it cannot wait."""
         handle, self.event.handle = self.event.handle, None
         try:
             yield
         finally:
             self.event.handle = handle
-
-    # -- outputs other than messages -----------------------------------------------------------
 
     def note(self, kind: OutputKind, entity: int, operation: int = 0, value: int = 0) -> int:
         """Add a small output (a timer changed, a task was made); return its position."""
@@ -269,6 +254,6 @@ class Dispatcher:
         return self.recorder.output(kind, entity, hash64(pack_operation(operation, value)))
 
     def draw(self, entity: int, draw: int) -> None:
-        """Write down what chance has decided, as an output of the event under way."""
+        """Record a random draw as an output of the current event."""
         if self.recorder is not None:
             self.recorder.draw(entity, draw)

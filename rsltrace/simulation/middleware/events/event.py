@@ -1,4 +1,4 @@
-"""The event under way: whose code runs, what caused it, and how it will be recorded."""
+"""The current event: whose code runs, what caused it, and how it will be recorded."""
 
 from __future__ import annotations
 
@@ -8,15 +8,11 @@ from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable
-from rsltrace.simulation.loop.recorded import THE_RUN, described
+from rsltrace.simulation.loop.recorded_order import THE_RUN, entity_text
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
 from rsltrace.trace.model.finding import EndlessWait
-
-# Who and what there has been in a run: every node, topic, service and timer.
-#
-# A rule of a job that fits none of them does nothing, and nobody would notice.
 
 _ACTIONS = (EntityKind.ACTION_CLIENT, EntityKind.ACTION_SERVER)
 _ACTION_TOPICS = ("feedback", "status")
@@ -27,16 +23,15 @@ _SERVICES = (EntityKind.CLIENT, EntityKind.SERVICE)
 
 
 class Asker(NamedTuple):
-    """A node that has asked what a name becomes; ``entry_key`` is that of the job's entry that made
-    it, empty if none did."""
+    """A node that resolved a name; ``entry_key`` is the key of its job entry, or ""."""
 
     entry_key: str
     name: str
     namespace: str
 
 
-class Census(EventObserver):
-    """The names there have been, each once, in the order of their coming."""
+class NameRegistry(EventObserver):
+    """The names of all nodes, topics, services and timers of a run, in order of creation."""
 
     order = ObserverOrder.CENSUS
 
@@ -52,11 +47,10 @@ class Census(EventObserver):
         self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
         self.described: dict[int, str] | None = None
-        """Every entity as in ``described``, by its id, if somebody wants to know: a run may make
-        a thread in each of a million callbacks."""
+        """Every entity as in ``entity_text``, by its id, if needed: a run may make a
+        thread in each of a million callbacks."""
 
     def entity_created(self, entity: Entity) -> None:
-        """Remember an entity; its node comes before it."""
         if entity.kind is EntityKind.NODE:
             self._names[entity.id] = entity.name
             self._describe(entity, entity.name)
@@ -76,29 +70,24 @@ class Census(EventObserver):
                 topics[node, entity.name] = None
 
     def describe_all(self) -> Callable[[int], str | None]:
-        """Keep the names of all entities from now on; return the function that knows them."""
+        """Keep the names of all entities from now on; return the lookup function."""
         self.described = {0: THE_RUN}
         return self.described.get
 
     def _describe(self, entity: Entity, node: str) -> None:
         if self.described is not None:
-            self.described[entity.id] = described(entity, node)
+            self.described[entity.id] = entity_text(entity, node)
 
     @property
     def topics(self) -> dict[str, None]:
-        """Every topic that somebody publishes or subscribes."""
         return {topic: None for _, topic in (*self.publishers, *self.subscriptions)}
-
-
-# How a run has gone so far: the error that ends it, and what is worth saying of it.
 
 
 @dataclass(slots=True)
 class Outcome:
-    """``ended_after`` is how many events there were when the run ended: what follows is the
-    ending. ``waits`` are the calls that still waited then. ``drops`` count what full queues
-    dropped, by receiver, and by how many messages a publisher holds if its queue was the full one
-    (in an outage), else 0."""
+    """How a run has gone. ``ended_after`` is the number of events when it ended; later ones are its
+    shutdown. ``waits`` are the calls that still waited then. ``drops`` counts the drops of full
+    queues by receiver, and by queue size of a publisher in an outage (else 0)."""
 
     error: RunError | None = None
     notes: list[str] = field(default_factory=list)
@@ -107,79 +96,63 @@ class Outcome:
     drops: dict[tuple[Any, int], int] = field(default_factory=dict)
 
     def note_end(self, events: int) -> None:
-        """Remember how many events there were when the run ended; the first call counts."""
+        """Remember the number of events at the end of the run; the first call counts."""
         if self.ended_after is None:
             self.ended_after = events
 
 
 class Door(Protocol):
-    """Speaks for participants: it is asked for what only it can know of their code."""
+    """Handles the exceptions of participants."""
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Decide what becomes of the run now that the event under way has raised ``error``."""
+        """Decide what becomes of the run after the current event raised ``error``."""
 
 
-class State(Protocol):
-    """The state of a participant, where it is hashed after each of its events."""
+class ParticipantState(Protocol):
+    """The hashed state of a participant."""
 
     def after_event(self) -> int:
-        """Return its hash now, 0 if there is none."""
+        """Return the hash now, 0 if there is none."""
 
 
-class Owner(Protocol):
-    """A participant as those see it who record what its code does."""
+class EventOwner(Protocol):
+    """A participant, as the recording code sees it."""
 
     entity_id: int
     fully_qualified_name: str
-    state: State | None
+    state: ParticipantState | None
     door: Door
 
 
+@dataclass(eq=False, slots=True)
 class Event:
-    """The event under way. There is one object of it, which each event fills anew.
+    """The current event: one object that each event fills in anew.
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
     ``took_ns``. A ``quiet`` event is recorded only if something comes of it. ``on_end`` is called
-    once it is over. ``node`` is a participant (an ``Owner``), whose door may know more of it.
+    after it. ``node`` is an ``Owner`` or None.
     """
 
-    __slots__ = (
-        "busy_ns",
-        "cause_event",
-        "cause_output",
-        "entity",
-        "flags",
-        "handle",
-        "input_hash",
-        "kind",
-        "node",
-        "on_end",
-        "quiet",
-        "took_ns",
-    )
-
-    def __init__(self) -> None:
-        self.handle: Dispatchable | None = None
-        self.entity = 0
-        self.node: Any = None
-        self.kind = 0
-        self.cause_event = NO_EVENT
-        self.cause_output = 0
-        self.input_hash = 0
-        self.flags = 0
-        self.quiet = False
-        self.on_end: Callable[[], None] | None = None
-        self.busy_ns = 0
-        self.took_ns = 0
+    handle: Dispatchable | None = None
+    entity: int = 0
+    node: Any = None
+    kind: int = 0
+    cause_event: int = NO_EVENT
+    cause_output: int = 0
+    input_hash: int = 0
+    flags: int = 0
+    quiet: bool = False
+    on_end: Callable[[], None] | None = None
+    busy_ns: int = 0
+    took_ns: int = 0
 
 
 class OutsideEvent:
-    """Stands for a handle in an event that is no entity's callback: construction, shutdown, a clock
+    """The handle of an event that is not an entity's callback: construction, shutdown, a clock
     jump, a main, a thread."""
 
     def __init__(self, describe: Callable[[], str]) -> None:
         self.describe = describe
 
     def dispatch(self) -> None:
-        """Fail: the loop never has it in a queue."""
         raise AssertionError("never in a queue")

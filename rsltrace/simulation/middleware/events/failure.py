@@ -1,4 +1,4 @@
-"""A callback that raised: what it says, how it is recorded, and the plain way it ends a run.
+"""A callback that raised: its text, how it is recorded, and how it ends a run.
 
 User exceptions can be anything: ``__str__`` may raise, and texts may hold what no file can.
 """
@@ -30,10 +30,10 @@ _OWN_FILES = (
 
 @dataclass(frozen=True, slots=True)
 class Raised:
-    """An exception that came out of an event.
+    """An exception of an event.
 
-    ``label`` names the event, ``node`` is the node's full name or empty, ``stamp_ns`` the simulated
-    time, ``traceback`` the user's frames and ``said`` the exception's own words as text.
+    ``label`` names the event, ``node`` is the full name or "", ``stamp_ns`` simulated time,
+    ``traceback`` has the user's frames and ``said`` is the exception's text.
     """
 
     error: BaseException
@@ -45,16 +45,13 @@ class Raised:
 
     @property
     def kind(self) -> str:
-        """The name of the exception's class."""
         return type(self.error).__qualname__
 
     @property
     def where(self) -> str:
-        """The event and its time, for an error message."""
         return f"{self.label}, at simulated time {format_seconds(self.stamp_ns)} s"
 
     def as_error(self, hint: str = "") -> NodeError:
-        """Return the error with which the run ends because of it."""
         return NodeError(
             f"{self.where} raised {self.kind}: {self.said}{hint}",
             node=self.node,
@@ -65,7 +62,6 @@ class Raised:
 
 
 def described(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
-    """Return how the event under way has raised."""
     node = dispatcher.event.node
     return Raised(
         error,
@@ -78,7 +74,7 @@ def described(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable
 
 
 def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
-    """Record that the event under way has raised, as one of its outputs; return how."""
+    """Record that the current event raised, as one of its outputs; return the description."""
     event, recorder = dispatcher.event, dispatcher.recorder
     event.flags |= _RAISED
     raised = described(dispatcher, error, handle)
@@ -91,14 +87,14 @@ def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchab
 
 
 def end_run(dispatcher: Dispatcher, raised: Raised, error: RunError) -> None:
-    """End the run after the present event, because of what it has raised."""
+    """End the run because of an exception."""
     dispatcher.outcome.error = error
     error.__cause__ = raised.error
     dispatcher.loop.stop(Stop(f"{raised.label} raised {raised.kind}", error.exit_code))
 
 
-class FailuresEndTheRun:
-    """The door of participants that have no other: what they raise ends the run."""
+class RunEndingExceptionHandler:
+    """Ends the run at any exception."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
@@ -109,7 +105,7 @@ class FailuresEndTheRun:
 
 
 def text_of(error: BaseException) -> str:
-    """Return what an exception says, as text that can be written to any file."""
+    """Return an exception's text, in a form that can be written to any file."""
     try:
         return _writable(str(error))
     except Exception:
@@ -121,17 +117,18 @@ def _writable(text: str) -> str:
 
 
 def is_own_frame(frame: FrameType) -> bool:
-    """Say whether a frame is rsltrace's."""
     return frame.f_code.co_filename.startswith(_OWN_FILES)
 
 
 def user_traceback(error: BaseException) -> str:
-    """Return the traceback without the frames of rsltrace, if there are others."""
+    """Return the traceback without rsltrace's frames, if others remain."""
     with contextlib.suppress(Exception):
-        told = traceback.TracebackException(type(error), error, error.__traceback__, compact=True)
-        if not all(map(_is_own_line, told.stack)):
-            _leave_out_own(told)
-        return _writable("".join(told.format()))
+        summary = traceback.TracebackException(
+            type(error), error, error.__traceback__, compact=True
+        )
+        if not all(map(_is_own_line, summary.stack)):
+            _leave_out_own(summary)
+        return _writable("".join(summary.format()))
     return f"{type(error).__qualname__} (its text could not be made)"
 
 
@@ -139,12 +136,12 @@ def _is_own_line(line: traceback.FrameSummary) -> bool:
     return line.filename.startswith(_OWN_FILES)
 
 
-def _leave_out_own(told: traceback.TracebackException | None) -> None:
-    while told is not None:
-        told.stack = traceback.StackSummary.from_list(
-            [line for line in told.stack if not _is_own_line(line)]
+def _leave_out_own(summary: traceback.TracebackException | None) -> None:
+    while summary is not None:
+        summary.stack = traceback.StackSummary.from_list(
+            [line for line in summary.stack if not _is_own_line(line)]
         )
-        for one in getattr(told, "exceptions", None) or ():  # of a group, from Python 3.11 on
+        for one in getattr(summary, "exceptions", None) or ():  # of a group, from Python 3.11 on
             _leave_out_own(one)
-        _leave_out_own(told.__context__)
-        told = told.__cause__
+        _leave_out_own(summary.__context__)
+        summary = summary.__cause__

@@ -1,29 +1,27 @@
 """How others watch and steer a run: one protocol, in one order.
 
-Everything but the recorder that has to know of events, or decides about them, is an observer of the
+Everything except the recorder that watches events or decides about them is an observer of the
 dispatcher: edits, the debugger, faults, execution times, the comparison with a recording.
 ``Dispatcher.add_observer`` and ``remove_observer`` are the only ways in and out. An observer is
-called for the hooks that its class overrides and for no others, so a run without observers pays for
-none, and one with an observer of events pays nothing at each output.
+called only for the hooks that its class overrides, so unused hooks cost nothing.
 
-Rejected: letting each of them replace methods of the dispatcher. Then the order is whatever the
-order of construction happens to be, and whoever puts an old method back removes what came later.
+Rejected: replacing methods of the dispatcher. The order would depend on the order of construction,
+and restoring an old method would remove later replacements.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
-from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.trace.model.entity import Entity
 
 
 class ObserverOrder(IntEnum):
-    """Who comes first. Before an event the last is asked first: what the debugger and the edits
-    decide is what the others see. After an event, and at everything else, the first is told first:
-    the recorder has written the event down before anybody looks at it."""
+    """The order of observers. Before an event the last is asked first: the others see what the
+    debugger and the edits decide. All other hooks are called first to last."""
 
     RECORDER = 0
     """No observer, but where it stands: the dispatcher calls it without asking."""
@@ -50,51 +48,26 @@ class ObserverOrder(IntEnum):
 ExecuteArguments = tuple[Any, int, Any, int, Callable[..., object], tuple[Any, ...], int, int, int]
 
 
+@dataclass(eq=False, slots=True)
 class EventCall:
-    """An event that is about to run; an observer may change what runs.
+    """An event that is about to run; an observer may change it.
 
-    ``on_end`` are called once it is over, the last one first: on the stack that it ran on, after
-    ``after_event``, and also if a later observer decides that it does not happen.
+    ``on_end`` are called after the event, the last one first, on its stack; also if a later
+    observer rejects the event.
     """
 
-    __slots__ = (
-        "args",
-        "callback",
-        "cause_event",
-        "cause_output",
-        "entity",
-        "handle",
-        "input_hash",
-        "kind",
-        "node",
-        "on_end",
-    )
-
-    def __init__(
-        self,
-        handle: Dispatchable,
-        entity: int,
-        node: Any,
-        kind: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        cause_event: int,
-        cause_output: int,
-        input_hash: int,
-    ) -> None:
-        self.handle: Any = handle
-        self.entity = entity
-        self.node = node
-        self.kind = kind
-        self.callback = callback
-        self.args = args
-        self.cause_event = cause_event
-        self.cause_output = cause_output
-        self.input_hash = input_hash
-        self.on_end: list[Callable[[], None]] = []
+    handle: Any
+    entity: int
+    node: Any
+    kind: int
+    callback: Callable[..., object]
+    args: tuple[Any, ...]
+    cause_event: int
+    cause_output: int
+    input_hash: int
+    on_end: list[Callable[[], None]] = field(default_factory=list)
 
     def values(self) -> ExecuteArguments:
-        """Return what ``Dispatcher.execute`` takes."""
         return (
             self.handle,
             self.entity,
@@ -108,7 +81,6 @@ class EventCall:
         )
 
     def end(self) -> None:
-        """Call all of ``on_end``."""
         for ended in reversed(self.on_end):
             ended()
 
@@ -119,31 +91,30 @@ class EventObserver:
     order: ObserverOrder
 
     def before_event(self, call: EventCall) -> bool:
-        """Look at an event before it runs; return whether it happens."""
+        """Look at an event before it runs; return whether it runs."""
         raise NotImplementedError
 
     def after_event(self) -> None:
-        """Look at the event that has ended; ``Dispatcher.event`` still describes it. A callback
-        that waits makes several events of one call."""
+        """Look at the event that has ended (``Dispatcher.event``). A callback that waits makes
+        several events."""
         raise NotImplementedError
 
     def resumed(self) -> None:
-        """Look at a callback that goes on after a wait, on its own stack."""
+        """Look at a callback that resumes after a wait, on its own stack."""
         raise NotImplementedError
 
     def node_entered(self, node: Any, *, is_made: bool) -> None:
-        """Take note that the code of a node goes on (after a wait), or that a node ``is_made``."""
+        """Note that a node's code resumes, or that a node ``is_made``."""
         raise NotImplementedError
 
     def entity_created(self, entity: Entity) -> None:
-        """Take note of an entity, at the end of the event that created it."""
+        """Note an entity, at the end of the event that created it."""
         raise NotImplementedError
 
     def output(self, kind: int, entity: int, content_hash: int) -> None:
-        """Take note of an output of the event under way. Of a run that is recorded only."""
+        """Note an output of the current event; only in recorded runs."""
         raise NotImplementedError
 
 
 def overrides(observer: EventObserver, hook: str) -> bool:
-    """Return whether an observer has a hook of its own."""
     return getattr(type(observer), hook) is not getattr(EventObserver, hook)

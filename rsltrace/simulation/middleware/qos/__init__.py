@@ -1,1 +1,1 @@
-"""Quality of service: who connects to whom, deadlines and liveliness, and what came of them."""
+"""Quality of service: compatibility, deadlines, liveliness and their statuses."""

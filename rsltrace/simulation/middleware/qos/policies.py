@@ -115,11 +115,11 @@ class Qos:
 
     @property
     def keep(self) -> int | None:
-        """How many messages a queue holds; None: all."""
+        """The size of a queue; None: unlimited."""
         return None if self.history is History.KEEP_ALL else max(self.depth, 1)
 
     def to_yaml(self) -> str:
-        """Return the one-element YAML list that rosbag2 keeps as ``offered_qos_profiles``."""
+        """Return the YAML list that rosbag2 keeps as ``offered_qos_profiles``."""
         lines = [
             f"- history: {self.history.name.lower()}",
             f"  depth: {self.depth}",
@@ -135,7 +135,7 @@ class Qos:
         return "\n".join(lines)
 
     def summary(self) -> dict[str, object]:
-        """Return the policies worth showing for an entity: of times only those that are limits."""
+        """Return the policies to show for an entity; durations only if they are limits."""
         shown: dict[str, object] = {
             "history": self.history.name.lower(),
             "depth": self.depth,
@@ -151,9 +151,9 @@ class Qos:
 
 
 def incompatible_policies(offered: Qos, requested: Qos) -> list[PolicyKind]:
-    """Return the policies that keep a publisher and a subscription apart, none if they match.
+    """Return the policies that prevent a connection, none if they match.
 
-    The first is the one that Fast DDS names, which counts a lease as liveliness.
+    The first is the one that Fast DDS reports, which counts a lease as liveliness.
     """
     found = []
     if (

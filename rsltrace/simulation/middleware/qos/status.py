@@ -1,9 +1,9 @@
-"""What has happened to an endpoint that its QoS cares about: counts, as DDS keeps them."""
+"""The QoS statuses of an endpoint: counts, as DDS keeps them."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.simulation.middleware.qos.policies import PolicyKind
 
@@ -59,28 +59,20 @@ _KINDS: dict[str, type] = {
 }
 
 
-class Listener(Protocol):
-    """Wants to hear of one status."""
-
-    def trigger(self) -> None:
-        """There is news, perhaps."""
-
-
 class EndpointEvents:
-    """The statuses of one endpoint, and who wants to hear of each."""
+    """The statuses of one endpoint, and their listeners."""
 
     __slots__ = ("_statuses", "listeners")
 
     def __init__(self) -> None:
-        self.listeners: dict[str, Listener] = {}
+        self.listeners: dict[str, Any] = {}  # QosEvents, by status
         self._statuses: dict[str, Any] = {}
 
     def matched(self, change: int) -> None:
-        """Count a peer that came (+1) or went (-1)."""
+        """Count a peer that connected (+1) or disconnected (-1)."""
         self.add(MATCHED, current=change, **({"total": change} if change > 0 else {}))
 
     def incompatible(self, policy: PolicyKind) -> None:
-        """Count a peer whose QoS does not fit."""
         self._status(INCOMPATIBLE).last_policy_kind = int(policy)
         self.add(INCOMPATIBLE, total=1)
 
@@ -97,12 +89,11 @@ class EndpointEvents:
             listener.trigger()
 
     def news(self, name: str) -> bool:
-        """Return whether there is something to take."""
         status = self._statuses.get(name)
         return status is not None and any(getattr(status, field) for field in _changes(status))
 
     def take(self, name: str) -> Any:
-        """Return the status and forget its changes."""
+        """Return the status and reset its changes."""
         status = self._status(name)
         taken = replace(status)
         for field in _changes(status):

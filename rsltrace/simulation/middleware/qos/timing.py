@@ -1,8 +1,8 @@
 """QoS that depends on time: deadlines, and the liveliness of publishers.
 
-A watch looks at the clock only when its time may be up, not at every message; and only where there
-is a callback that wants to know, so that a run without one can still end because nothing is left.
-What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` compares the two.
+A timer looks at the clock only when its period may be over, and only where a callback listens, so
+that a run without one can still end because nothing is left. The behaviour follows Fast DDS;
+``tests/middleware/test_qos_native.py`` compares the two.
 """
 
 from __future__ import annotations
@@ -19,24 +19,27 @@ from rsltrace.simulation.middleware.qos.status import (
 )
 
 
-class _Watch(ABC):
-    """Calls ``_up`` when nothing was seen for ``period_ns``."""
+class _QosTimer(ABC):
+    """Calls ``_up`` when nothing was seen for ``period_ns`` and a callback wants ``status``."""
 
-    def __init__(self, loop: EventLoop, period_ns: int) -> None:
+    status: str
+
+    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
         self._loop = loop
         self._period_ns = period_ns
+        self._events = events
         self._due_ns = -1
         self._scheduled = False
         self.over = False
 
     def seen(self) -> None:
-        """Start anew: there was a message, or a sign of life."""
+        """Start a new period."""
         self._due_ns = self._loop.now_ns + self._period_ns
         if not self._scheduled:
             self._schedule()
 
     def _schedule(self) -> None:
-        if self._wanted():
+        if self.status in self._events.listeners:
             self._scheduled = True
             self._loop.schedule(self._due_ns, self._look)
 
@@ -50,23 +53,14 @@ class _Watch(ABC):
             self._schedule()
 
     @abstractmethod
-    def _wanted(self) -> bool:
-        """Return whether anybody listens."""
-
-    @abstractmethod
     def _up(self) -> None:
-        """Say that the time is up."""
+        """Report that the period is over."""
 
 
-class Deadline(_Watch):
+class DeadlineTimer(_QosTimer):
     """Counts the periods without a message, from the first message on."""
 
-    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
-        super().__init__(loop, period_ns)
-        self._events = events
-
-    def _wanted(self) -> bool:
-        return DEADLINE_MISSED in self._events.listeners
+    status = DEADLINE_MISSED
 
     def _up(self) -> None:
         self._events.add(DEADLINE_MISSED, total=1)
@@ -74,32 +68,28 @@ class Deadline(_Watch):
         self._schedule()
 
 
-class OfferedLease(_Watch):
+class OfferedLease(_QosTimer):
     """Notices that a publisher with manual liveliness has not shown life in time."""
 
-    def __init__(self, loop: EventLoop, period_ns: int, events: EndpointEvents) -> None:
-        super().__init__(loop, period_ns)
-        self._events = events
-
-    def _wanted(self) -> bool:
-        return LIVELINESS_LOST in self._events.listeners
+    status = LIVELINESS_LOST
 
     def _up(self) -> None:
         self._events.add(LIVELINESS_LOST, total=1)
 
 
-class RequestedLease(_Watch):
-    """Whether a subscription holds one publisher for alive.
+class RequestedLease(_QosTimer):
+    """Whether a subscription considers one publisher alive.
 
     With automatic liveliness the publisher is alive as long as it exists and can be heard; with
-    manual liveliness from its first sign of life until the lease has passed without another.
+    manual liveliness from its first sign of life until a lease passes without another.
     """
+
+    status = LIVELINESS_CHANGED
 
     def __init__(
         self, loop: EventLoop, lease_ns: int, kind: Liveliness, events: EndpointEvents
     ) -> None:
-        super().__init__(loop, lease_ns)
-        self._events = events
+        super().__init__(loop, lease_ns, events)
         self._manual = kind is Liveliness.MANUAL_BY_TOPIC
         self._alive: bool | None = None
         if not self._manual:
@@ -111,21 +101,17 @@ class RequestedLease(_Watch):
             super().seen()
 
     def cut_off(self, from_ns: int, to_ns: int) -> None:
-        """Nothing is heard for some time, not even what automatic liveliness rests on."""
+        """Lose liveliness during an outage longer than the lease."""
         if not self._manual and to_ns - from_ns > self._period_ns:
             at_ns = from_ns + self._period_ns
             self._loop.schedule(at_ns, lambda: self._becomes(False))
             self._loop.schedule(to_ns, lambda: self._becomes(True))
 
     def gone(self) -> None:
-        """Forget the publisher."""
         if self._alive is not None:
             self._events.add(LIVELINESS_CHANGED, **{_NAME[self._alive]: -1})
         self._alive = None
         self.over = True
-
-    def _wanted(self) -> bool:
-        return LIVELINESS_CHANGED in self._events.listeners
 
     def _up(self) -> None:
         self._becomes(False)
@@ -144,39 +130,35 @@ _NAME = {True: "alive", False: "not_alive"}
 
 
 def finite(duration_ns: int) -> bool:
-    """Whether a QoS duration is a limit."""
     return 0 < duration_ns < INFINITE_NS
 
 
-class Offers:
-    """What a publisher promises: its deadline, and its liveliness if that is manual."""
+class OfferedQosTimers:
+    """The deadline of a publisher, and its manual liveliness."""
 
     def __init__(self, loop: EventLoop, qos: Qos, events: EndpointEvents) -> None:
-        self._watches: list[_Watch] = []
+        self._watches: list[_QosTimer] = []
         self._lease: OfferedLease | None = None
         if finite(qos.deadline_ns):
-            self._watches.append(Deadline(loop, qos.deadline_ns, events))
+            self._watches.append(DeadlineTimer(loop, qos.deadline_ns, events))
         if qos.liveliness is Liveliness.MANUAL_BY_TOPIC and finite(qos.lease_ns):
             self._lease = OfferedLease(loop, qos.lease_ns, events)
             self._watches.append(self._lease)
 
     @classmethod
-    def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> Offers | None:
-        """Return the promises of a profile, or None if it makes none."""
+    def of(cls, loop: EventLoop, qos: Qos, events: EndpointEvents) -> OfferedQosTimers | None:
+        """Return the timers of a profile, or None if it needs none."""
         offers = cls(loop, qos, events)
         return offers if offers._watches else None
 
     def sent(self) -> None:
-        """A message was published."""
         for watch in self._watches:
             watch.seen()
 
     def asserted(self) -> None:
-        """The publisher has said that it is alive."""
         if self._lease is not None:
             self._lease.seen()
 
     def end(self) -> None:
-        """The publisher is gone."""
         for watch in self._watches:
             watch.over = True

@@ -1,4 +1,4 @@
-"""The policy ``recorded``: what a recording ran next runs next, event by event."""
+"""The policy ``recorded``: repeats the order of a recording, event by event."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.loop.policy import After, Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, FifoUntil, Moment
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
@@ -18,7 +18,7 @@ THE_RUN = "the run"
 _OF_THE_RUN = {
     int(EventKind.CONSTRUCT): "the construction of a node",
     int(EventKind.CLOCK_JUMP): "the jump to the start",
-    int(EventKind.OUTSIDE): "something that the run was told from outside",
+    int(EventKind.OUTSIDE): "an event from outside of the run",
 }
 _SHOWN = 5
 
@@ -35,8 +35,8 @@ class RecordedEvent(NamedTuple):
         return event_text(self.kind, self.name, self.stamp_ns)
 
 
-def described(entity: Entity, node: str) -> str:
-    """Name an entity, of the node of that name, as ``RecordedEvent.name`` does."""
+def entity_text(entity: Entity, node: str) -> str:
+    """Name an entity of a node, as in ``RecordedEvent.name``."""
     if entity.kind is EntityKind.SYSTEM:
         return THE_RUN
     what = f"{entity.kind.label} {entity.name}"
@@ -44,7 +44,7 @@ def described(entity: Entity, node: str) -> str:
 
 
 def event_text(kind: int, name: str, stamp_ns: int) -> str:
-    """Describe an event for people; ``name`` is that of the entity."""
+    """Describe an event for people; ``name`` is its entity's."""
     if name == THE_RUN:
         name = _OF_THE_RUN.get(kind, name)
     if kind == EventKind.FAULT:
@@ -53,18 +53,16 @@ def event_text(kind: int, name: str, stamp_ns: int) -> str:
     return f"{name}{goes_on} at {format_seconds(stamp_ns)} s"
 
 
-class Recorded:
+class RecordedOrder:
     """The order of a recording.
 
-    ``event`` returns the recording's event of an index, or None after its end; from there on it is
-    first come, first served. Entities are the same if their names are: ``name_of`` returns the name
-    of one of this run, by its id. ``chosen`` chooses as the recording's own policy did: then the
-    run is the recording's as long as it does the same, which whoever ends the events has to
-    look at (``recorded_run`` in ``simulation/middleware/events``). Where nobody knows what it
-    chose (None) the events are all there is, and what has none of its own, see ``Choices`` in
-    ``policy.py``, runs as it comes.
+    ``event`` returns the recorded event of an index, or None after the end; from there on it is
+    first come, first served. ``name_of`` returns the name of an entity of this run; entities with
+    equal names are the same. ``chosen`` repeats the choices of the recording's policy;
+    ``RecordedOrderObserver`` then checks the events. Without it (None) only events are known, and
+    what has no event runs as it comes.
 
-    :raises RunError: from ``choose``, if what the recording has next cannot run now.
+    :raises RunError: from ``choose``, if the next recorded event cannot run now.
     """
 
     follows_chains = True
@@ -84,9 +82,8 @@ class Recorded:
         self.polls_from_ns: int | None = None
         self.forget: Callable[[str], None] | None = None
 
-    def poll_as(self, policy: RclpyWaitSet | After) -> None:
-        """Have executors poll as in the recording: of that policy's choices, all follow from what
-        has happened."""
+    def poll_as(self, policy: RclpyWaitSet | FifoUntil) -> None:
+        """Let executors poll as in the recording: this policy's choices follow from the events."""
         self._chosen = policy.choose
         self.polls_from_ns, self.forget = policy.polls_from_ns, policy.forget
 
@@ -117,7 +114,7 @@ class Recorded:
         return self.cannot_follow(moment.events, expected, here)
 
     def cannot_follow(self, index: int, expected: RecordedEvent, here: str) -> RunError:
-        """Return the error that this run does not do what the recording did."""
+        """Return the error that this run differs from the recording."""
         why = "Nodes, job or input differ from those of the recording"
         if self._chosen is None:
             why += ", or its events are not enough: what its policy chose is not in it (cut off?)"
@@ -134,46 +131,43 @@ class Recorded:
 
 
 def has_event(item: Any) -> bool:
-    """Say whether there is an event if something runs.
+    """Whether running an item makes an event.
 
-    There is none if a full queue has dropped the message it stood for, if an executor of the user's
-    own is only told of it, or if somebody wakes who may just go on waiting.
+    It makes none if a full queue has dropped its message, if it is only handed to one of the user's
+    own executors, or if it wakes a call that may continue to wait.
     """
     node = getattr(item, "node", None)
-    is_told = getattr(node, "mailbox", None) is not None
+    is_handed_over = getattr(node, "mailbox", None) is not None
     is_there = bool(getattr(item, "queue", True)) and not getattr(item, "destroyed", False)
-    return is_there and not is_told and not getattr(item, "quiet", False)
+    return is_there and not is_handed_over and not getattr(item, "quiet", False)
 
 
-# The policy ``recorded`` of a native run: what ran next there runs next, where it can.
-#
-# A native run does not do the same again: its timers drift, its messages take their time. So its
-# order is a wish. Callbacks are the same if their names are, and if each is the one of that
-# number: the third of a timer is the third of it there.
+# The order of a native run can only be followed approximately: its timers drift, its messages take
+# time. Callbacks correspond by name and number: a timer's third call there is its third call here.
 
 CALLBACKS = frozenset(
     map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))
 )
-"""What has a place in the order; everything else runs as soon as it can."""
+"""Events with a place in the order; all others run as soon as they can."""
 
 
-class ObservedCallback(NamedTuple):
-    """A callback of the native run: which of its events, and what ran."""
+class NativeCallback(NamedTuple):
+    """A callback of the native run and the number of its event."""
 
     number: int
     event: RecordedEvent
 
 
-class ObservedOrder:
-    """The order of a native run, as far as it can be followed.
+class NativeOrder:
+    """The order of a native run, followed as far as possible.
 
-    Who is ready before its turn is held back until those are ready that came before, but no longer
-    than until the time at which it ran itself, counted from the first callback of both runs.
-    ``name_of`` returns the name of an entity of this run, by its id.
+    A callback that is ready early waits for those before it, but no longer than until its own time
+    in the native run, counted from the first callback of both runs. ``name_of`` returns the name of
+    an entity of this run.
     """
 
     def __init__(
-        self, file: str, observed: Sequence[ObservedCallback], name_of: Callable[[int], str | None]
+        self, file: str, observed: Sequence[NativeCallback], name_of: Callable[[int], str | None]
     ) -> None:
         self.file = file
         self.name_of = name_of
@@ -186,12 +180,14 @@ class ObservedOrder:
         self._ahead_ns: int | None = None
         self._ran = bytearray(len(observed))
         self._in_turn = self._late = self._others = 0
-        self._first: tuple[ObservedCallback, str] | None = None
+        self._first: tuple[NativeCallback, str] | None = None
 
     def hold_until(self, ready: Sequence[Candidate], moment: Moment) -> int | None:
-        """Return until when all that is ready is to wait for who comes before; None: one runs."""
+        """Return until when all that is ready waits for earlier callbacks; None: run one now."""
         places = [self._place(one) for one in ready]
-        first = min(place for place in places if place is not None) if all_known(places) else None
+        first = (
+            min(place for place in places if place is not None) if all_have_places(places) else None
+        )
         if first is None or first <= self._next or self._ahead_ns is None:
             return None
         until_ns = self._observed[first].event.stamp_ns - self._ahead_ns
@@ -206,7 +202,7 @@ class ObservedOrder:
         return min(range(len(ready)), key=lambda index: places[index] or 0)
 
     def happened(self, kind: int, entity: int, now_ns: int) -> None:
-        """Take note of an event of this run that is over."""
+        """Note an event of this run."""
         name = self.name_of(entity)
         if kind not in CALLBACKS or name is None:
             return
@@ -227,8 +223,8 @@ class ObservedOrder:
             self._first = missed, self._why(missed, name, now_ns)
         self._next = place + 1
 
-    def _why(self, missed: ObservedCallback, name: str, now_ns: int) -> str:
-        """Say why what was missed did not run before an event of that name."""
+    def _why(self, missed: NativeCallback, name: str, now_ns: int) -> str:
+        """Say why the missed callback did not run before an event of that name."""
         there = sum(place < self._next for place in self._places[missed.event.name])
         return (
             f"its run number {there + 1} was not ready here, and {name}, which came after it, did "
@@ -246,7 +242,7 @@ class ObservedOrder:
         return places[count] if count < len(places) else None
 
     def notes(self) -> Iterator[str]:
-        """Yield how far the order was followed, and where first it was not."""
+        """Yield how far the order was followed, and where it first was not."""
         count, end = self._next, len(self._observed)
         missing = count - sum(self._ran)
         if self._in_turn == count and not self._others:
@@ -267,6 +263,5 @@ class ObservedOrder:
             )
 
 
-def all_known(places: Sequence[int | None]) -> bool:
-    """Whether all have a place."""
+def all_have_places(places: Sequence[int | None]) -> bool:
     return None not in places

@@ -1,9 +1,9 @@
-"""Loops that run a part of a recorded graph: what others did is done at its recorded place.
+"""Loops that run one entry of a recorded graph with its recorded inputs.
 
-The recorded events are a script. Those of others are steps to perform; those of the nodes that run
-here keep what follows them waiting until they have happened. So the nodes meet each input in the
-state in which they met it in the recording, by the rules of ``loop.py``. An event of theirs that
-does not come (their code has changed) is passed over once nothing else is left to do at its time.
+The recorded events are a script. Those of other nodes are steps to perform; those of the nodes that
+run here delay what follows them until they have happened. So the nodes meet each input in the state
+in which they met it in the recording. An event of theirs that does not come (their code has
+changed) is skipped once nothing else is left to do at its time.
 """
 
 from __future__ import annotations
@@ -20,13 +20,21 @@ from rsltrace.trace.model.event import EventKind
 
 NEVER = 1 << 64
 _QOS_EVENT = "qos_event"
-_HELD = ("subscription", "timer", "client", "service", "guard_condition", "task", _QOS_EVENT)
+_WAITING_KINDS = (
+    "subscription",
+    "timer",
+    "client",
+    "service",
+    "guard_condition",
+    "task",
+    _QOS_EVENT,
+)
 
 
 @dataclass(slots=True)
-class Step:
-    """A recorded event. ``perform`` does what it did, and is None for one that happens by itself:
-    then ``kind`` and ``entity`` (of the recording) say which it is."""
+class RecordedStep:
+    """A recorded event. ``perform`` repeats it; it is None for an event that happens by itself,
+    which recorded ``kind`` and ``entity`` identify."""
 
     index: int
     stamp_ns: int
@@ -36,14 +44,14 @@ class Step:
     done: bool = False
 
 
-class Script(Protocol):
+class StepScript(Protocol):
     """The recorded events that matter, in their order."""
 
     end_ns: int
     """When the recorded run ended."""
 
     @property
-    def next(self) -> Step | None:
+    def next(self) -> RecordedStep | None:
         """The first step that is not done, None after the last."""
 
     def entity(self, entity: int) -> int:
@@ -53,8 +61,8 @@ class Script(Protocol):
         """Return the index of the next event of a recorded entity, NEVER if none is to come."""
 
 
-def end_of(script: Script, loop: EventLoop) -> Callable[[Progress], Stop | None]:
-    """Return the stop condition of a run that ends when its recording did."""
+def stop_at_recorded_end(script: StepScript, loop: EventLoop) -> Callable[[Progress], Stop | None]:
+    """Return the stop condition that ends the run when the recording ends."""
 
     def condition(progress: Progress) -> Stop | None:
         ahead = progress.next_ns is not None and progress.next_ns < script.end_ns
@@ -66,26 +74,24 @@ def end_of(script: Script, loop: EventLoop) -> Callable[[Progress], Stop | None]
     return condition
 
 
-class FedLoop(EventLoop):
-    """The plain loop, fed from ``script``, which is set before it runs."""
+class RecordedInputLoop(EventLoop):
+    """The plain loop with inputs from ``script``, which is set before it runs."""
 
-    script: Script
+    script: StepScript
     by_steps = False
     """Whether time moves on from step to step (``min_time_step``); what is due between is late."""
 
     def next_ns(self) -> int | None:
-        """Return when the next timer, release or step is due."""
         step = self.script.next
         if step is not None and self.by_steps:
             return step.stamp_ns
-        return _sooner(super().next_ns(), step)
+        return _earlier_ns(super().next_ns(), step)
 
     def run_step(self) -> None:
-        """Run everything that is due at the present time."""
         now_ns = self.now_ns
         self._release()
         limit = self.events + self._livelock_limit
-        while not self._interrupt and self._one():
+        while not self._interrupt and self._do_next():
             if self.events >= limit:
                 if self.now_ns == now_ns:
                     self._livelock(now_ns)
@@ -102,8 +108,8 @@ class FedLoop(EventLoop):
             released = True
         return released
 
-    def _one(self) -> bool:
-        """Do the next thing that is due; False if nothing is."""
+    def _do_next(self) -> bool:
+        """Do the next thing that is due; return False if there is none."""
         step = self.script.next
         if step is None and self.now_ns >= self.script.end_ns:
             return False
@@ -122,13 +128,12 @@ class FedLoop(EventLoop):
         step.done = True  # what should have happened does not: the code has changed
         return True
 
-    def _run_task(self, step: Step | None) -> bool:
-        """Run what the last event has left to do at once."""
+    def _run_task(self, step: RecordedStep | None) -> bool:
         self.tasks.popleft().dispatch()
         return True
 
-    def _dispatch_one(self, step: Step | None) -> bool:
-        """Dispatch what is ready or due; ``step`` is the event that the recording has next."""
+    def _dispatch_one(self, step: RecordedStep | None) -> bool:
+        """Dispatch what is ready or due; ``step`` is the next recorded event."""
         if self.ready:
             self.ready.popleft().dispatch()
             return True
@@ -140,34 +145,36 @@ class FedLoop(EventLoop):
         return True
 
 
-class FedOrderedLoop(FedLoop, OrderedLoop):
-    """The loop of jobs that say who runs next, fed: policies, executors, execution times, ties.
+class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
+    """The loop with recorded inputs for jobs with policies, executors, execution times or ties.
 
-    The recording says what ran when, so neither policy nor executors are asked. Where callbacks
-    have to wait for workers (``has_workers``), what the recording knows runs when it ran there;
-    anything else is first come, first served. A look whether something has come (``spin_once``) has
-    no event, so where nobody but the order of arrival decides, it is first come, too.
+    The recording decides the order, so neither policy nor executors are asked. Where callbacks wait
+    for workers (``has_workers``), those in the recording run at their recorded time; others are
+    first come, first served. Polling calls (``spin_once``) have no event, so without a policy they
+    are first come, first served, too.
     """
 
     has_workers = False
     by_policy = False
 
     def next_timer(self) -> Any:
-        """Return the timer that is due next; those that wait for their recorded time are not."""
+        """Return the next timer that does not wait for its recorded time."""
         due, after = self.timers.due(self.now_ns)
-        free = (timer for timer in due if not self._is_held(self.place(timer.owner)))  # type: ignore[arg-type]
+        free = (timer for timer in due if not self._waits_for_recording(self.place(timer.owner)))  # type: ignore[arg-type]
         return next(free, after)
 
-    def _run_task(self, step: Step | None) -> bool:
+    def _run_task(self, step: RecordedStep | None) -> bool:
         for index, place in enumerate(self._tasks.places):
-            if not self._is_held(place) or (step is not None and self._is_that_of(place, step)):
+            if not self._waits_for_recording(place) or (
+                step is not None and self._matches(place, step)
+            ):
                 del self._tasks.places[index]
                 item: Any = place.candidate.item
                 item.dispatch()
                 return True
         return False
 
-    def _dispatch_one(self, step: Step | None) -> bool:
+    def _dispatch_one(self, step: RecordedStep | None) -> bool:
         due, _ = self.timers.due(self.now_ns)
         waiting = self._ready.places
         places = [*waiting, *(self.place(timer.owner) for timer in due)]  # type: ignore[arg-type]
@@ -182,58 +189,62 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
         item.dispatch()
         return True
 
-    def _recorded_choice(self, places: list[Place], step: Step | None) -> Place | None:
+    def _recorded_choice(self, places: list[Place], step: RecordedStep | None) -> Place | None:
         if step is not None:
             for place in places:
-                if not _goes_elsewhere(place.candidate.item) and self._is_that_of(place, step):
+                if not _has_no_event(place.candidate.item) and self._matches(place, step):
                     return place
-        free = [place for place in places if not self._is_held(place)]
-        if not free or not _goes_elsewhere(free[0].candidate.item):
+        free = [place for place in places if not self._waits_for_recording(place)]
+        if not free or not _has_no_event(free[0].candidate.item):
             return free[0] if free else None
-        if _looks(free[0]):
-            return self._looked_for(free, step) if self.by_policy else free[0]
+        if _is_poll(free[0]):
+            return self._next_for_poll(free, step) if self.by_policy else free[0]
         # An executor of the user's own takes them in the order in which it gets them.
-        others = [p for p in free if _goes_elsewhere(p.candidate.item) and not _looks(p)]
+        others = [p for p in free if _has_no_event(p.candidate.item) and not _is_poll(p)]
         entity, following = self.script.entity, self.script.following
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
 
-    def _looked_for(self, free: list[Place], step: Step | None) -> Place:
-        """Return what the recording has next, if that is here: its policy let the look wait."""
+    def _next_for_poll(self, free: list[Place], step: RecordedStep | None) -> Place:
+        """Return the next recorded item if it is ready: the policy let the poll wait."""
         if step is None:
             return free[0]
-        return next((place for place in free if self._is_that_of(place, step)), free[0])
+        return next((place for place in free if self._matches(place, step)), free[0])
 
-    def _is_that_of(self, place: Place, step: Step) -> bool:
+    def _matches(self, place: Place, step: RecordedStep) -> bool:
         candidate = place.candidate
         recorded = self.script.entity(candidate.entity_id)
         if recorded < 0 and candidate.kind == _QOS_EVENT:  # which has its id when it runs first
             return step.kind == EventKind.QOS_EVENT
         return recorded == step.entity
 
-    def _is_held(self, place: Place) -> bool:
-        """Whether it waits until the recording has it."""
+    def _waits_for_recording(self, place: Place) -> bool:
+        """Whether it waits for its recorded time."""
         candidate = place.candidate
-        if not self.has_workers or candidate.kind not in _HELD or _is_handed_over(candidate.item):
+        if (
+            not self.has_workers
+            or candidate.kind not in _WAITING_KINDS
+            or _is_handed_over(candidate.item)
+        ):
             return False
         return candidate.kind == _QOS_EVENT or self.script.entity(candidate.entity_id) >= 0
 
 
 def _is_handed_over(item: Any) -> bool:
-    """Whether an executor of the user's own runs it."""
+    """Whether one of the user's own executors runs it."""
     return getattr(getattr(item, "node", None), "mailbox", None) is not None
 
 
-def _looks(place: Place) -> bool:
-    """Whether it is a call that only looks whether something has come, and has no event then."""
+def _is_poll(place: Place) -> bool:
+    """Whether it is a call that only polls, and then has no event."""
     return bool(getattr(place.candidate.item, "quiet", False))
 
 
-def _goes_elsewhere(item: Any) -> bool:
-    """Whether it is no event itself: it is handed over, or a blocked call goes on."""
+def _has_no_event(item: Any) -> bool:
+    """Whether it makes no event itself: it is handed over, or resumes a blocked call."""
     return _is_handed_over(item) or hasattr(item, "quiet")
 
 
-def _sooner(own_ns: int | None, step: Step | None) -> int | None:
+def _earlier_ns(own_ns: int | None, step: RecordedStep | None) -> int | None:
     if step is None:
         return own_ns
     return step.stamp_ns if own_ns is None else min(own_ns, step.stamp_ns)

@@ -1,7 +1,7 @@
-"""What a node has put out in two recordings, side by side.
+"""Compare the outputs of a node in two recordings.
 
-Outputs are compared topic by topic (or service, or the log): those of one simulated time in their
-order. Where one has more than the other, something is missing or new.
+Outputs are compared topic by topic (or service, or the log), those of one simulated time in order.
+Where one recording has more than the other, an output is missing or new.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from rsltrace.diff.facts.evidence import FieldDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.values.fields import WHOLE, diff_messages, preview
 from rsltrace.errors import TraceError
-from rsltrace.replay.one_node.result import Change, OutputChange
+from rsltrace.replay.one_node.result import OutputChange, OutputChangeKind
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.format import TOPIC_ROSOUT
@@ -40,10 +40,10 @@ Key = tuple[OutputKind, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Put:
-    """An output of a node: when, where to, its place among all outputs of the node.
+class NodeOutput:
+    """An output of a node: time, topic, and its place among all outputs of the node.
 
-    Outputs of two sides that are ``at`` the same stand for each other, those of one side in order.
+    Outputs of two recordings with the same ``at`` are compared, in order.
     """
 
     stamp_ns: int
@@ -53,14 +53,14 @@ class Put:
     at: int
 
 
-class Side:
+class NodeOutputs:
     """The outputs of a node in a trace."""
 
-    def __init__(self, trace: Trace, puts: Sequence[Put]) -> None:
+    def __init__(self, trace: Trace, puts: Sequence[NodeOutput]) -> None:
         self.trace, self.puts = trace, puts
 
-    def decoded(self, put: Put) -> object | None:
-        """Return what was put out, None if it was not kept or cannot be decoded."""
+    def decoded(self, put: NodeOutput) -> object | None:
+        """Return the decoded output, None if it was not kept or cannot be decoded."""
         trace, output = self.trace, put.output
         if output.kind is OutputKind.EXCEPTION:
             return trace.detail(output)
@@ -73,13 +73,13 @@ class Side:
             return None
 
 
-def outputs_of_node(trace: Trace, node: str) -> list[Put]:
-    """Return what a node has published, called, answered, logged and raised, in its order."""
+def outputs_of_node(trace: Trace, node: str) -> list[NodeOutput]:
+    """Return all that a node published, called, answered, logged and raised, in order."""
     entities = trace.entities
     named = [one for one in entities.values() if one.name == node]
     nodes = {one.id for one in named if one.kind is EntityKind.NODE}
     own = {one.id: one.name for one in entities.values() if one.node in nodes}
-    found: list[Put] = []
+    found: list[NodeOutput] = []
     for rows, outputs in zip(trace.events(), trace.outputs(), strict=True):
         first = int(rows["index"][0]) if len(rows) else 0
         stamps = rows["stamp"]
@@ -96,12 +96,14 @@ def outputs_of_node(trace: Trace, node: str) -> list[Put]:
                 name = TOPIC_ROSOUT if kind is OutputKind.LOG else own[entity]
                 output = Output(event, entity, kind, digest, sequence)
                 stamp_ns = int(stamps[event - first])
-                found.append(Put(stamp_ns, (kind, name), len(found), output, stamp_ns))
+                found.append(NodeOutput(stamp_ns, (kind, name), len(found), output, stamp_ns))
     return found
 
 
-def changes(recorded: Side, present: Side, options: DiffOptions) -> Iterator[OutputChange]:
-    """Yield what has changed, in the order of its time."""
+def output_changes(
+    recorded: NodeOutputs, present: NodeOutputs, options: DiffOptions
+) -> Iterator[OutputChange]:
+    """Yield the outputs that differ, by time."""
     for before, after in _pairs(recorded.puts, present.puts):
         if before is not None and after is not None:
             if before.output.hash == after.output.hash:
@@ -109,21 +111,21 @@ def changes(recorded: Side, present: Side, options: DiffOptions) -> Iterator[Out
             fields = _fields(recorded, before, present, after, options)
             if not fields:
                 continue  # what differs is ignored, or tolerated
-            yield _change(Change.CHANGED, before, before, after, fields)
+            yield _change(OutputChangeKind.CHANGED, before, before, after, fields)
         elif before is not None:
             whole = FieldDifference(WHOLE, _preview(recorded, before), "")
-            yield _change(Change.MISSING, before, before, None, (whole,))
+            yield _change(OutputChangeKind.MISSING, before, before, None, (whole,))
         else:
             assert after is not None
             whole = FieldDifference(WHOLE, "", _preview(present, after))
-            yield _change(Change.NEW, after, None, after, (whole,))
+            yield _change(OutputChangeKind.NEW, after, None, after, (whole,))
 
 
 def _change(
-    what: Change,
-    at: Put,
-    before: Put | None,
-    after: Put | None,
+    what: OutputChangeKind,
+    at: NodeOutput,
+    before: NodeOutput | None,
+    after: NodeOutput | None,
     fields: tuple[FieldDifference, ...],
 ) -> OutputChange:
     return OutputChange(
@@ -137,18 +139,20 @@ def _change(
     )
 
 
-def _event(put: Put | None) -> int | None:
+def _event(put: NodeOutput | None) -> int | None:
     return None if put is None or put.output.event == NO_EVENT else put.output.event
 
 
-def _pairs(recorded: Sequence[Put], present: Sequence[Put]) -> list[tuple[Put | None, Put | None]]:
-    """Return outputs that stand for each other, in order."""
-    waiting: dict[tuple[Key, int], list[Put]] = {}
+def _pairs(
+    recorded: Sequence[NodeOutput], present: Sequence[NodeOutput]
+) -> list[tuple[NodeOutput | None, NodeOutput | None]]:
+    """Pair the outputs of two recordings, in order."""
+    waiting: dict[tuple[Key, int], list[NodeOutput]] = {}
     for put in present:
         waiting.setdefault((put.key, put.at), []).append(put)
     for same in waiting.values():
         same.reverse()
-    found: list[tuple[Put | None, Put | None]] = []
+    found: list[tuple[NodeOutput | None, NodeOutput | None]] = []
     for put in recorded:
         others = waiting.get((put.key, put.at))
         found.append((put, others.pop() if others else None))
@@ -156,14 +160,18 @@ def _pairs(recorded: Sequence[Put], present: Sequence[Put]) -> list[tuple[Put | 
     return sorted(found, key=_place)
 
 
-def _place(pair: tuple[Put | None, Put | None]) -> tuple[int, int]:
+def _place(pair: tuple[NodeOutput | None, NodeOutput | None]) -> tuple[int, int]:
     put = pair[0] or pair[1]
     assert put is not None
     return put.stamp_ns, put.place
 
 
 def _fields(
-    recorded: Side, before: Put, present: Side, after: Put, options: DiffOptions
+    recorded: NodeOutputs,
+    before: NodeOutput,
+    present: NodeOutputs,
+    after: NodeOutput,
+    options: DiffOptions,
 ) -> tuple[FieldDifference, ...]:
     a, b = recorded.decoded(before), present.decoded(after)
     if a is None or b is None:
@@ -172,30 +180,28 @@ def _fields(
     return tuple(one for one in found if not one.within_tolerance)
 
 
-def _preview(side: Side, put: Put) -> str:
+def _preview(side: NodeOutputs, put: NodeOutput) -> str:
     message = side.decoded(put)
     return _NOT_KEPT if message is None else preview(message, 60)
 
-
-# Seeing the first output that is not as recorded when it comes about, and ending the run there.
 
 _SENT = frozenset(
     map(int, (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG))
 )
 
 
-class Watch(EventObserver):
-    """Compares the outputs of ``node`` with ``recorded`` ones, and ends the run with ``stop``."""
+class OutputWatch(EventObserver):
+    """Ends the run with ``stop`` at the first output of ``node`` that differs from ``recorded``."""
 
     order = ObserverOrder.OUTPUTS
 
-    def __init__(self, recorded: Sequence[Put], node: str, stop: Stop) -> None:
+    def __init__(self, recorded: Sequence[NodeOutput], node: str, stop: Stop) -> None:
         self._stop = stop
         self._node = node
         self._own: dict[int, str] = {}
         self._nodes: set[int] = set()
         self._in_order = deque(put for put in recorded if put.key[0] is not OutputKind.EXCEPTION)
-        self._expected: dict[tuple[int, str], deque[Put]] = {}
+        self._expected: dict[tuple[int, str], deque[NodeOutput]] = {}
         for put in self._in_order:
             self._expected.setdefault((int(put.key[0]), put.key[1]), deque()).append(put)
         self._met: set[int] = set()
@@ -203,29 +209,25 @@ class Watch(EventObserver):
         self._loop: EventLoop
 
     def attach(self, session: Session) -> None:
-        """Compare what comes from now on."""
         self._loop = session.loop
         session.world.domain.dispatcher.add_observer(self)
 
     def entity_created(self, entity: Entity) -> None:
-        """Remember the node and what belongs to it."""
         if entity.node == entity.id and entity.name == self._node:
             self._nodes.add(entity.id)
         if entity.node in self._nodes:
             self._own[entity.id] = entity.name
 
     def output(self, kind: int, entity: int, content_hash: int) -> None:
-        """Keep what is sent until the event is over."""
         if kind in _SENT:
             self._sent.append((kind, entity, content_hash))
 
     def after_event(self) -> None:
-        """End the run if the outputs of the event were not as recorded."""
         if not self._as_recorded(self._loop.now_ns):
             self._loop.stop(self._stop)
 
     def _as_recorded(self, now_ns: int) -> bool:
-        """Return whether what an event has sent was recorded, and nothing is missing until now."""
+        """Whether the event's outputs were recorded, and none is missing until now."""
         sent, self._sent = self._sent, []
         for kind, entity, content_hash in sent:
             name = TOPIC_ROSOUT if kind == OutputKind.LOG else self._own.get(entity)

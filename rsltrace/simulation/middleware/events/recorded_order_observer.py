@@ -1,7 +1,7 @@
-"""Whether a run does what the recording did whose order it follows, event by event.
+"""Check that a run follows a recording's order, event by event.
 
-A policy only sees what it may choose from. That an event is the recording's shows when it is over,
-whoever ran it: the loop, or an executor of the user's own.
+A policy only sees its candidates. Whether an event is the recorded one shows when it is over,
+whoever ran it: the loop, or one of the user's own executors.
 """
 
 from __future__ import annotations
@@ -10,21 +10,24 @@ from collections.abc import Iterator
 
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.ordered import OrderedLoop
-from rsltrace.simulation.loop.recorded import ObservedOrder, Recorded, RecordedEvent, event_text
+from rsltrace.simulation.loop.recorded_order import (
+    NativeOrder,
+    RecordedEvent,
+    RecordedOrder,
+    event_text,
+)
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.texts import format_seconds
 
-# A run that follows the order of a native one as far as it can.
 
-
-class ObservedRun(EventObserver):
-    """Tells an order of what has run, and lets the loop wait for whose turn it is."""
+class NativeOrderObserver(EventObserver):
+    """Tells the order of a native run what has run, and lets the loop wait."""
 
     order = ObserverOrder.RECORDED_ORDER
 
-    def __init__(self, dispatcher: Dispatcher, order: ObservedOrder) -> None:
+    def __init__(self, dispatcher: Dispatcher, order: NativeOrder) -> None:
         self.policy = order
         self._dispatcher = dispatcher
         dispatcher.add_observer(self)
@@ -32,26 +35,24 @@ class ObservedRun(EventObserver):
         dispatcher.loop.hold_until = order.hold_until
 
     def after_event(self) -> None:
-        """Take note of the event."""
         dispatcher = self._dispatcher
         if dispatcher.outcome.ended_after is None:
             event = dispatcher.event
             self.policy.happened(event.kind, event.entity, dispatcher.loop.now_ns)
 
     def notes(self) -> Iterator[str]:
-        """Yield how far the order was followed."""
         yield from self.policy.notes()
 
 
-class RecordedRun(EventObserver):
-    """Compares the events of a run with those of a recording; the first that differs ends it.
+class RecordedOrderObserver(EventObserver):
+    """Compares the events of a run with a recording; the first difference ends the run.
 
-    ``is_whole`` says that the recording was not cut off.
+    ``is_whole``: the recording is complete.
     """
 
     order = ObserverOrder.RECORDED_ORDER
 
-    def __init__(self, dispatcher: Dispatcher, order: Recorded, *, is_whole: bool) -> None:
+    def __init__(self, dispatcher: Dispatcher, order: RecordedOrder, *, is_whole: bool) -> None:
         self._dispatcher = dispatcher
         self.policy = order
         self._is_whole = is_whole
@@ -61,7 +62,6 @@ class RecordedRun(EventObserver):
         dispatcher.add_observer(self)
 
     def after_event(self) -> None:
-        """See whether the event was right."""
         loop, order = self._dispatcher.loop, self.policy
         event, outcome = self._dispatcher.event, self._dispatcher.outcome
         index, kind, entity, handle = loop.events - 1, event.kind, event.entity, event.handle
@@ -85,7 +85,7 @@ class RecordedRun(EventObserver):
             self._other_time = index, expected, now_ns
 
     def notes(self) -> Iterator[str]:
-        """Yield what somebody should know who takes the run for the recorded one."""
+        """Yield how the run differs from the recorded one."""
         loop, file = self._dispatcher.loop, self.policy.file
         if self._other_time is not None:
             index, expected, now_ns = self._other_time

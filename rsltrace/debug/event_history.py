@@ -1,8 +1,7 @@
-"""What a debugged run has done: the event that has ended last, and whether it was as before.
+"""The events of a debugged run: the last one, and whether each is as in the first run.
 
-A run is recorded as always, but to here instead of a file: what it sends is kept for one event, so
-that conditions can look at it, and its chain hash is compared with the one of that event when it
-ran the first time.
+The recorder writes to an ``EventLedger`` instead of a file. It keeps what an event sends for one
+event, so that conditions can look at it, and compares each chain hash with that of the first run.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import tempfile
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
-from typing import Any, Protocol
+from typing import Any
 
 from rsltrace.guard.redirect import copy_of
 from rsltrace.replay.verification import limit_of
@@ -25,8 +24,6 @@ from rsltrace.trace.reader import RUN, Trace
 from rsltrace.trace.words.events import counted, output_text
 from rsltrace.trace.writer import TraceWriter
 
-# What is known of a run's events: all of them from its trace, or those that have run so far.
-
 _ROW_BYTES = 8 + EVENT_REST.size
 _ROWS_AT_ONCE = 4096
 # Not those that a node's guard redirects: they are called in the middle of a run.
@@ -35,37 +32,8 @@ _pwrite = copy_of(os.pwrite)  # type: ignore[arg-type]
 _fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 
 
-class History(Protocol):
-    """The events of a run, by index."""
-
-    trace: Trace | None
-    ended: Stop | None
-    """Why the run goes no further than ``limit``, where that is known beforehand."""
-
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        """What is open for it, and meant to be shared by all processes of a session."""
-
-    @property
-    def limit(self) -> int | None:
-        """How many events there are at most, None if nobody knows."""
-
-    @property
-    def known(self) -> int:
-        """How many events are known so far."""
-
-    def hashes(self, first: int) -> Iterator[int]:
-        """Yield the chain hashes of the events from ``first`` on, as far as they are known."""
-
-    def learn(self, index: int, rest: bytes, chain_hash: int) -> bool:
-        """Take note of an event that has not been there before; False if there can be none."""
-
-    def row(self, index: int) -> tuple[bytes, int]:
-        """Return an event, packed, and its chain hash. Raises IndexError."""
-
-
 class TraceHistory:
-    """The events of a trace: a run that has been recorded."""
+    """The events of a trace. ``ended`` says why the run goes no further than ``limit`` events."""
 
     def __init__(self, trace: Trace) -> None:
         self.trace: Trace | None = trace
@@ -73,9 +41,7 @@ class TraceHistory:
         count, self.ended = limit_of(trace, None)
         self._limit = count if count >= 0 else trace.event_count
 
-    @property
-    def descriptors(self) -> tuple[int, ...]:
-        return ()
+    descriptors: tuple[int, ...] = ()
 
     @property
     def limit(self) -> int | None:
@@ -83,16 +49,20 @@ class TraceHistory:
 
     @property
     def known(self) -> int:
+        """How many events are known so far."""
         return self._limit
 
     def hashes(self, first: int) -> Iterator[int]:
+        """Yield the chain hashes of the known events from ``first`` on."""
         for rows in self._trace.events(first):
             yield from rows["chain_hash"].tolist()
 
     def learn(self, index: int, rest: bytes, chain_hash: int) -> bool:
+        """Add an event; return False if the history is complete."""
         return False
 
     def row(self, index: int) -> tuple[bytes, int]:
+        """Return an event, packed, and its chain hash. Raises IndexError."""
         event = self._trace.event(index)
         rest = EVENT_REST.pack(
             event.index,
@@ -123,7 +93,6 @@ class RunHistory:
 
     @property
     def descriptors(self) -> tuple[int, ...]:
-        """What is open for it, and meant to be shared."""
         return (self._number,)
 
     @property
@@ -154,6 +123,8 @@ class RunHistory:
         return data[8:], int.from_bytes(data[:8], "little")
 
 
+EventHistory = TraceHistory | RunHistory
+
 Payload = tuple[int, bytes]
 """The channel of a message, and its canonical CDR."""
 
@@ -161,15 +132,16 @@ _ENOUGH = 1 << 62
 DID_MAX = 100
 
 
-class Ledger(TraceWriter):
-    """Stands in for the writer of a trace. ``on_difference`` is called when an event differs.
+class EventLedger(TraceWriter):
+    """The trace writer of a debugged run: keeps the last event and compares each one.
 
-    ``entities`` and ``channels`` (topic and type) are those so far, by id. Of the last event there
-    are ``rest`` (packed), ``chain_hash``, ``outputs`` (packed), ``payloads``, ``details`` and
-    ``findings``. ``events`` is how many have ended.
+    ``on_difference`` is called when an event differs from its first run. ``entities`` and
+    ``channels`` (topic and type) are by id. ``rest`` (packed), ``chain_hash``, ``outputs``
+    (packed), ``payloads``, ``details`` and ``findings`` are those of the last event, ``events`` is
+    the number of events.
     """
 
-    def __init__(self, history: History, *, ends_at_size_after: int | None = None) -> None:
+    def __init__(self, history: EventHistory, *, ends_at_size_after: int | None = None) -> None:
         # Nothing of the writer's own: there is no file.
         self.history = history
         self.events = 0
@@ -199,7 +171,6 @@ class Ledger(TraceWriter):
         self._sequences_under_way.append(sequence)
 
     def add_event(self, rest: bytes, chain_hash: int) -> None:
-        """Take the event that has ended, and compare it with what it was before."""
         outputs = self.outputs
         self.outputs, self._outputs_under_way = self._outputs_under_way, outputs
         outputs.clear()
@@ -217,19 +188,17 @@ class Ledger(TraceWriter):
         self.events = index + 1
         known = next(self._known, None)
         if known is None:
-            known = self._on_new_ground(index, rest, chain_hash)
+            known = self._learn(index, rest, chain_hash)
         if known != chain_hash:
             self.on_difference()
 
-    def _on_new_ground(self, index: int, rest: bytes, chain_hash: int) -> int | None:
-        """Have the history learn an event that it does not know."""
+    def _learn(self, index: int, rest: bytes, chain_hash: int) -> int | None:
+        """Add an event that the history does not know yet."""
         self._known = self.history.hashes(index)  # another process may have been here meanwhile
         known = next(self._known, None)
         if known is None and self.history.learn(index, rest, chain_hash):
             return chain_hash
         return known
-
-    # -- what is kept for one event ----------------------------------------------------------------
 
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
         """Keep a message until the next event has ended."""
@@ -237,23 +206,17 @@ class Ledger(TraceWriter):
         return len(self._payloads_under_way) - 1
 
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
-        """Keep a text."""
         self._payloads_under_way.append(text)
         return len(self._payloads_under_way) - 1
 
     def add_finding(self, finding: Finding, stamp_ns: int) -> int:
-        """Keep a finding."""
         self._findings_under_way.append(finding)
         return 0
 
     def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
-        """Keep nothing: whoever wants to know asks the node."""
         return 0
 
-    # -- what is kept ------------------------------------------------------------------------------
-
     def add_entity(self, entity: Entity) -> int:
-        """Keep an entity."""
         self.entities[entity.id] = entity
         return 0
 
@@ -266,7 +229,6 @@ class Ledger(TraceWriter):
         qos_yaml: str = "",
         type_hash: str = "",
     ) -> int:
-        """Return the id of a topic's channel."""
         key = (topic, type_name)
         found = self._ids.get(key)
         if found is None:
@@ -288,27 +250,23 @@ class Ledger(TraceWriter):
 
     @property
     def event_count(self) -> int:
-        """How many events have ended."""
         return self.events
 
     @property
     def size(self) -> int:
-        """What ends a run that ends with the size of its trace: there, and not before."""
+        """Enough to end a run that ends by trace size, where the recorded one ended."""
         after = self._ends_at_size_after
         return _ENOUGH if after is not None and self.events >= after else 0
 
     @property
     def output_hash(self) -> int:
-        """The hash of the outputs of the last event."""
         return int(EVENT_REST.unpack(self.rest)[4]) if self.rest else 0
 
-    # -- in words ----------------------------------------------------------------------------------
-
     def event(self) -> dict[str, Any] | None:
-        """Return the last event as an answer has it, None before the first."""
+        """Return the last event as an answer, None before the first."""
         if not self.rest:
             return None
-        event = described(self.rest, self.chain_hash, self.entities)
+        event = event_values(self.rest, self.chain_hash, self.entities)
         event["did"] = list(islice(counted(map(self._output_text, self.outputs)), DID_MAX))
         return event
 
@@ -327,8 +285,8 @@ class Ledger(TraceWriter):
             yield kind, entity, content_hash, kept
 
 
-def described(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
-    """Return a packed event as an answer has it."""
+def event_values(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
+    """Return a packed event as an answer."""
     index, stamp, cause, _, _, state, entity_id, cause_output, outputs, kind, flags = (
         EVENT_REST.unpack(rest)
     )
