@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from rsltrace.cli.main import cli
 from rsltrace.trace.model.finding import waits_of
-from tests.doors.test_mains import main_spec
+from tests.adapters.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 
