@@ -20,7 +20,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
-from rsltrace.adapters.rclpy.executors import pump
+from rsltrace.adapters.rclpy.executors import executor_driver as pump
 from rsltrace.adapters.rclpy.executors.standby import Standby
 from rsltrace.errors import LivelockError
 

@@ -11,7 +11,7 @@ from rsltrace.adapters.rclpy.handles.logs import Logs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.hints import hint_for
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, mailbox_of
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import class_of
 from rsltrace.errors import JobError, RsltraceError, RunError, nearest

@@ -6,8 +6,8 @@ from greenlet import getcurrent
 
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.starts import entry_of, policy_of
+from rsltrace.adapters.rclpy.stacks.entry_starts import entry_of, policy_of
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.trace.model.finding import Policy
 
 

@@ -23,17 +23,18 @@ from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
 from rsltrace.adapters.rclpy.stacks.asyncio_loops import simulated_event_loops
-from rsltrace.adapters.rclpy.stacks.blocked_groups import note_waits
-from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked
-from rsltrace.adapters.rclpy.stacks.exit_handlers import own_exit_handlers
-from rsltrace.adapters.rclpy.stacks.forked_child import forked_children_end
+from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked, simulated_waiting
+from rsltrace.adapters.rclpy.stacks.endless_waits import note_waits
+from rsltrace.adapters.rclpy.stacks.entry_starts import Construction, Starts
 from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
-from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs
-from rsltrace.adapters.rclpy.stacks.process_exit import own_process_ends, own_signal_handlers
+from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs, own_exit_handlers
+from rsltrace.adapters.rclpy.stacks.process_exit import (
+    forked_children_end,
+    own_process_ends,
+    own_signal_handlers,
+)
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_waiting
-from rsltrace.adapters.rclpy.stacks.starts import Construction, Starts
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.adapters.rclpy.stacks.threads import cooperative_threads
 from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
 from rsltrace.errors import DeadlockError, JobError, RunError

@@ -18,23 +18,21 @@ from rsltrace.adapters.rclpy.boundary.early_init import check_process
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable, set_invalid_handle
-from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
 from rsltrace.adapters.rclpy.handles.lifecycle import StateMachineHandle
 from rsltrace.adapters.rclpy.handles.logs import Logs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
-from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
+from rsltrace.adapters.rclpy.handles.pubsub import EventHandle, PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of
 from rsltrace.adapters.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
     TypeDescriptionServiceHandle,
 )
-from rsltrace.adapters.rclpy.handles.timers import RosTimerHandle, TimerHandle
+from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types

@@ -29,17 +29,15 @@ from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.boundary.boundary import Boundary
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
-from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
 from rsltrace.adapters.rclpy.handles.lifecycle import StateMachineHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
+from rsltrace.adapters.rclpy.handles.pubsub import EventHandle, PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
     TypeDescriptionServiceHandle,
 )
-from rsltrace.adapters.rclpy.handles.timers import TimerHandle
+from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.guard.guard import engage

@@ -13,10 +13,9 @@ from rsltrace.adapters.rclpy.handles.wait_set import (
     deactivate_node,
     sync_woken,
 )
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import FutureWake, SimEvent, wait
 from rsltrace.adapters.rclpy.stacks.coroutines import Resume
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.sim_event import FutureWake, SimEvent
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
 from rsltrace.trace.model.texts import patience_ns
 

@@ -22,7 +22,7 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent

@@ -16,11 +16,11 @@ from pathlib import PurePath
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from rsltrace.adapters.rclpy.executors.pump import pump_of
+from rsltrace.adapters.rclpy.executors.executor_driver import pump_of
 from rsltrace.adapters.rclpy.handles.wait_set import sync_woken
 from rsltrace.adapters.rclpy.stacks.blocking_calls import lose_patience
 from rsltrace.adapters.rclpy.stacks.coroutines import Resume
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.interface import file_of

@@ -11,7 +11,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
+from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
 
 
 class _Now:

@@ -13,7 +13,7 @@ from greenlet import getcurrent
 
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.event import OutputKind
 

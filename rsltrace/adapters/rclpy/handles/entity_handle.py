@@ -9,7 +9,7 @@ from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, Runnable, callback_name
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.stacks.entry_starts import policy_of
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.starts import policy_of
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.event import Asker
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types

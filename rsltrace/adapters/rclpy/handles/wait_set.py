@@ -16,7 +16,7 @@ from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
+from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.trace.model.event import NO_EVENT, EventKind

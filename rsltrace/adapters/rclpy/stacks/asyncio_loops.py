@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, simulated_stacks, wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.guard.recorded.polls import RecordedPoll
 
 _NS_PER_S = 1_000_000_000

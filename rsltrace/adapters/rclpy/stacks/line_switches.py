@@ -25,7 +25,7 @@ from greenlet import getcurrent
 from rsltrace.adapters.rclpy.stacks.blocking_calls import getpid, wait
 from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive, is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import mailbox_of
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.errors import EXIT_RUN, RunError
 from rsltrace.guard.callers import KINDS, USER, is_in

@@ -18,9 +18,8 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
+from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait, world_exists
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.errors import UnsupportedError
 from rsltrace.trace.model.texts import patience_ns
 

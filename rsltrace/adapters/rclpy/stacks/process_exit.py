@@ -12,18 +12,18 @@ import os
 import signal
 import sys
 import threading
+from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, getpid
+from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, getpid, simulated_stacks
 from rsltrace.adapters.rclpy.stacks.mains import end_program, interrupt, shut_down
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.process_ids import meant_id
@@ -36,6 +36,7 @@ from rsltrace.simulation.middleware.events.failure import (
     text_of,
     user_traceback,
 )
+from rsltrace.terminal import tell
 from rsltrace.trace.model.event import OutputKind
 
 # Signal handlers that nodes set: each main keeps its own, as a process does, and ours stay.
@@ -285,3 +286,42 @@ def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
     abandon(getcurrent())
     stacks.runners.next().switch()
     raise AssertionError("nobody goes back to a stack that was left")
+
+
+# A process that a node forks is not part of the run: it ends where it would come back into it.
+#
+# Natively it would go on as a second copy of every node. Here the run is its parent's alone, and
+# so is the trace; what a child does within the callback that forked it is its own affair.
+
+_worlds: list[Stacks] = []
+
+
+@contextmanager
+def forked_children_end(stacks: Stacks) -> Iterator[None]:
+    """Let what is forked within the ``with`` block end with the event that forked it."""
+    _worlds.append(stacks)
+    try:
+        yield
+    finally:
+        _worlds.remove(stacks)
+
+
+def _in_child() -> None:
+    for stacks in _worlds:
+        if stacks.event.handle is not None and stacks.runners.thread == get_ident():
+            stacks.dispatcher.record(None)
+            stacks.event.on_end = lambda stacks=stacks: _end(stacks)
+
+
+def _end(stacks: Stacks) -> None:
+    who = stacks.event.handle.describe() if stacks.event.handle is not None else "a node"
+    with suppress(Exception):
+        sys.stdout.flush()
+        tell(
+            f"rsltrace: note: a process that {who} forked came back into the run, and was ended; "
+            "the run is its parent's"
+        )
+    os._exit(1)
+
+
+os.register_at_fork(after_in_child=_in_child)

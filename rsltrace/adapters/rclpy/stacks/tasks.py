@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.trace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)

@@ -28,11 +28,10 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait
+from rsltrace.adapters.rclpy.stacks.entry_starts import Construction
 from rsltrace.adapters.rclpy.stacks.locks import LockOfPools, SimLock, SimRLock
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.starts import Construction
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks, Wait
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.libraries import present_import

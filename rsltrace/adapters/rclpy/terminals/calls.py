@@ -13,10 +13,9 @@ from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait
 from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import exchange

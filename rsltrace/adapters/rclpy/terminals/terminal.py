@@ -20,7 +20,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Typed
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.guard.redirect import copy_of
 
 _END = b"\x04"

@@ -142,7 +142,9 @@ def test_others_that_are_replaced_are_told(simulate: Any, monkeypatch: pytest.Mo
     monkeypatch.setattr(Executor, "_take_timer", take)
     (note,) = told(simulate(lambda: Busy([]), duration=1.5))
     line = take.__code__.co_firstlineno
-    assert note.startswith(f"tests/adapters/test_exchanged_functions.py:{line}: Executor._take_timer")
+    assert note.startswith(
+        f"tests/adapters/test_replaced_functions.py:{line}: Executor._take_timer"
+    )
     assert "is never called" in note
     assert "await_or_execute" in note
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Entry, StartRule
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks
 from rsltrace.simulation.loop.loop import Release
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.events.event import Event, OutsideEvent

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.simulation.loop.ordered import OrderedLoop, Workers
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity

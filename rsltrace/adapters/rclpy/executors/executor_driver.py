@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.handles.wait_set import activate_node
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
 from rsltrace.adapters.rclpy.stacks.callback_groups import begin, is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.middleware.graph import Graph
