@@ -209,7 +209,7 @@ def test_who_spins_a_node_again_and_again_looks_once(
 ) -> None:
     """``spin_once`` adds its node each time; to look takes longer than all the rest of it."""
     looks: list[Any] = []
-    monkeypatch.setattr(user_executors, "note_exchanged", lambda *args: looks.append(args))
+    monkeypatch.setattr(user_executors, "note_replaced_functions", lambda *args: looks.append(args))
 
     def program() -> None:
         rclpy.init()

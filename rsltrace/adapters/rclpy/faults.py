@@ -14,10 +14,10 @@ from typing import Any, Protocol, cast
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, Spinner
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, SpinningExecutor
 from rsltrace.adapters.rclpy.stacks.mains import crash_program
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
@@ -34,22 +34,22 @@ from rsltrace.trace.model.texts import format_seconds
 # there for it waits, its timers are late, and its calls return when it goes on.
 
 
-class Victims:
+class FaultedNodes:
     """``nodes`` (handles) of one process: a ``program`` of its own, or the host of what an
     ``entry`` has made."""
 
     def __init__(
-        self, stacks: Stacks, nodes: list[Any], program: Program, entry: Entry | None
+        self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: Entry | None
     ) -> None:
         self._stacks = stacks
         self._nodes = nodes
         self._program = None if program is stacks.programs.host else program
         self._entry = entry
         self._running: list[Any] = []
-        self._spinning: list[tuple[Mailbox, Spinner]] = []
+        self._spinning: list[tuple[Mailbox, SpinningExecutor]] = []
 
     @property
-    def are_gone(self) -> bool:
+    def are_destroyed(self) -> bool:
         """Whether they have crashed, or were destroyed."""
         return all(node.destroyed for node in self._nodes)
 
@@ -58,14 +58,14 @@ class Victims:
         self._keep_what_comes()
         for node in self._nodes:
             if node.mailbox is not None:
-                if node.mailbox.pump is not None:
-                    self._spinning.append((node.mailbox, node.mailbox.pump))
-                    node.mailbox.pump = None
+                if node.mailbox.driver is not None:
+                    self._spinning.append((node.mailbox, node.mailbox.driver))
+                    node.mailbox.driver = None
             elif node.wrapper is not None:
                 self._running.append(node.wrapper)
                 self._stacks.executor.remove_node(node.wrapper)
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Let them go on: what has come meanwhile is ready now."""
         for node in self._running:
             if not node.handle.destroyed:
@@ -74,12 +74,12 @@ class Victims:
         for holder in holders:
             held, holder.held = holder.held, None
             self._stacks.loop.tasks.extend(held or ())
-        for mailbox, pump in self._spinning:
+        for mailbox, driver in self._spinning:
             if not mailbox.closed:
-                mailbox.pump = pump
-                pump.wake()
+                mailbox.driver = driver
+                driver.wake()
 
-    def vanish(self) -> None:
+    def crash(self) -> None:
         """Take them out of the run for ever, as a process's death does."""
         self._keep_what_comes()
         stacks = self._stacks
@@ -108,7 +108,7 @@ class Victims:
         for node in self._nodes:
             node.held = []
 
-    def _is_ours(self, blocked: Wait) -> bool:
+    def _is_ours(self, blocked: BlockedCall) -> bool:
         if self._program is not None:
             return blocked.program is self._program
         return blocked.event[2] in self._nodes or (
@@ -151,7 +151,7 @@ class NodeFaults(EventObserver):
 
     def __init__(self, world: World, faults: Sequence[NodeFault], start_ns: int) -> None:
         self.world = world
-        self._strikes = [_Strike(self, fault) for fault in faults]
+        self._strikes = [_ScheduledFault(self, fault) for fault in faults]
         self._counts: dict[str, int] = {}
         by_event = [strike for strike in self._strikes if strike.fault.event is not None]
         self._by_event = sorted(by_event, key=lambda strike: -(strike.fault.event or 0))
@@ -185,14 +185,14 @@ class NodeFaults(EventObserver):
                 strike.come()
 
 
-class _Strike:
+class _ScheduledFault:
     """One fault. The loop dispatches it when its time has come."""
 
     def __init__(self, faults: NodeFaults, fault: NodeFault) -> None:
         self._world = faults.world
         self.fault = fault
         self.missed = "it has not come to that"
-        self._victims: Victims | None = None
+        self._faulted: FaultedNodes | None = None
 
     def come(self) -> None:
         """Strike next, before anything else that is ready."""
@@ -201,10 +201,10 @@ class _Strike:
 
     def dispatch(self) -> None:
         """Strike, as one event; or let those go on again that hang."""
-        if self._victims is not None:
-            victims, self._victims = self._victims, None
-            if not victims.are_gone:
-                self._event(self._node(), Draw.GOES_ON, 0, victims.let_go)
+        if self._faulted is not None:
+            faulted, self._faulted = self._faulted, None
+            if not faulted.are_destroyed:
+                self._event(self._node(), Draw.GOES_ON, 0, faulted.release)
             return
         node = self._node()
         if node is None:
@@ -216,11 +216,9 @@ class _Strike:
         self._event(node, _DRAWS[self.fault.kind], for_ns, lambda: self._strike(node))
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(None, self.describe())
 
     def describe(self) -> str:
-        """Name it for people."""
         return f"{self.fault.kind} of {self.fault.node}"
 
     def _node(self) -> Participant | None:
@@ -253,14 +251,14 @@ class _Strike:
                 raise self._cannot("it is in a process of its own; crash and restart are possible")
             cast("RealProcess", node.process).crash()
             return
-        victims = Victims(world.stacks, self._nodes(node, entry), node.process, entry)
+        faulted = FaultedNodes(world.stacks, self._nodes(node, entry), node.process, entry)
         if fault.kind == "hang":
-            victims.hold()
+            faulted.hold()
             if fault.for_ns is not None:
-                self._victims = victims
+                self._faulted = faulted
                 world.domain.loop.schedule(world.domain.loop.now_ns + fault.for_ns, self.come)
             return
-        victims.vanish()
+        faulted.crash()
         if node.process is not world.stacks.programs.host:
             crash_program(world.stacks, node.process)
             if fault.kind == "restart":

@@ -7,14 +7,14 @@ from greenlet import getcurrent
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.entry_starts import entry_of, policy_of
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.trace.model.finding import Policy
 
 
 class GuardContext:
     """Answers for one world."""
 
-    def __init__(self, stacks: Stacks, clocks: NodeClocks | None) -> None:
+    def __init__(self, stacks: Runtime, clocks: NodeClocks | None) -> None:
         self._stacks = stacks
         self._clocks = clocks
         self.direct = (stacks.loop, stacks.event) if clocks is None else None

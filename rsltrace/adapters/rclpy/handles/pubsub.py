@@ -73,11 +73,9 @@ class PublisherHandle(EntityHandle, Publisher):
         self._serialize = self._canonical = refusal
 
     def get_topic_name(self) -> str:
-        """Return the resolved topic."""
         return self.topic
 
     def get_subscription_count(self) -> int:
-        """Count the connected subscriptions."""
         self.node.require_up("failed to get subscription count")
         return len(self.subscriptions)
 
@@ -128,7 +126,6 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         graph.add_subscription(self)
 
     def dispatch(self) -> None:
-        """Take the oldest message and run the callback with a copy of its own."""
         if not self.may_run():
             return
         wrapper = self.wrapper
@@ -180,7 +177,6 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         return message, _message_info(delivery)
 
     def get_topic_name(self) -> str:
-        """Return the resolved topic."""
         return self.topic
 
     def is_cft_enabled(self) -> bool:
@@ -202,7 +198,6 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         raise self._real.RCLError("content filter topic is not enabled")
 
     def get_publisher_count(self) -> int:
-        """Count the connected publishers."""
         return len(self.publishers)
 
     trace_name = Subscription.trace_name
@@ -268,7 +263,6 @@ class EventHandle(QosEvent, EntityHandle):
             alarm()
 
     def dispatch(self) -> None:
-        """Run the callback with the status."""
         if self.mailbox_keeps():
             return
         wrapper = self.wrapper

@@ -9,7 +9,7 @@ from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of, qos_of
-from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, Functions
+from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, FunctionRecorder
 from rsltrace.adapters.rclpy.stacks.tasks import (
     executor_of,
     is_awaited,
@@ -18,7 +18,7 @@ from rsltrace.adapters.rclpy.stacks.tasks import (
 )
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import service_type
-from rsltrace.adapters.rclpy.wire.type_descriptions import answer
+from rsltrace.adapters.rclpy.wire.type_descriptions import answer_request
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.services import (
     CLIENT,
@@ -55,7 +55,6 @@ class ServiceEvents:
         self._contents = state == _CONTENTS
 
     def publish(self, event_type: int, request_id: RequestId, message: Any) -> None:
-        """Tell of one request or response."""
         from builtin_interfaces.msg import Time
         from service_msgs.msg import ServiceEventInfo
 
@@ -79,7 +78,9 @@ class ServiceEvents:
             self.publisher.destroy_when_not_in_use()
 
 
-def reconfigured(events: ServiceEvents | None, end: Any, clock: Any, qos: Any, state: Any) -> Any:
+def updated_service_events(
+    events: ServiceEvents | None, end: Any, clock: Any, qos: Any, state: Any
+) -> Any:
     """Return what ``end`` (a service or client) publishes its events with from now on, if at all.
 
     As in rcl, switching off destroys the publisher, and one that is there keeps clock and QoS.
@@ -108,8 +109,7 @@ class ServiceEndHandle(ReceiverHandle, ServiceEnd):
         return node.stacks.domain.transport, node, service, service_type(srv_type), qos_of(qos)
 
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
-        """Publish what is sent and received from now on, or no longer."""
-        self._service_events = reconfigured(self._service_events, self, clock, qos, state)
+        self._service_events = updated_service_events(self._service_events, self, clock, qos, state)
 
     def _tell(self, event_type: int, request_id: RequestId, message: Any) -> None:
         """Publish a service event, if introspection is on."""
@@ -135,16 +135,13 @@ class ServiceHandle(ServiceEndHandle, Service):
 
     @property
     def name(self) -> str:
-        """The resolved service name."""
         return self.service
 
     @property
     def qos(self) -> dict[str, Any]:
-        """The QoS profile as rclpy's lifecycle nodes ask for it."""
         return profile_of(self.profile)
 
     def dispatch(self) -> None:
-        """Take the oldest request, run the callback and send what it returns."""
         if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
@@ -200,7 +197,6 @@ class ServiceHandle(ServiceEndHandle, Service):
         return request, header
 
     def service_send_response(self, response: Any, request_id: RequestId) -> None:
-        """Send a response to the client that asked."""
         self.respond(self._response.serialize(response), request_id)
         if self._service_events is not None:
             self._tell(RESPONSE_SENT, request_id, response)
@@ -214,16 +210,14 @@ class ClientHandle(ServiceEndHandle, Client):
     def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
         Client.__init__(self, *self._prepare(node, srv_type, name, qos))
         self._sites = CallSites(node.dispatcher, self.entity_id)
-        self._functions = Functions(node.dispatcher)
+        self._functions = FunctionRecorder(node.dispatcher)
         node.stacks.domain.graph.add_client(self)
 
     @property
     def service_name(self) -> str:
-        """The resolved service name."""
         return self.service
 
     def service_server_is_available(self) -> bool:
-        """Return whether a server is there now."""
         self.node.require_up("failed to check service availability")
         return bool(self.servers())
 
@@ -248,7 +242,6 @@ class ClientHandle(ServiceEndHandle, Client):
         return header, response
 
     def dispatch(self) -> None:
-        """Take the oldest response and complete its future."""
         if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
@@ -301,11 +294,9 @@ class TypeDescriptionServiceHandle:
         self.impl = ServiceHandle(node, GetTypeDescription, "~/get_type_description", profile)
 
     def handle_request(self, request: Any, response_type: Any, node: Any) -> Any:
-        """Describe an interface that one of the node's endpoints uses."""
-        return answer(request, response_type, _interfaces_of(self._graph, node))
+        return answer_request(request, response_type, _interfaces_of(self._graph, node))
 
     def destroy_when_not_in_use(self) -> None:
-        """Destroy the service, unless the node has done so already."""
         self.impl.destroy_when_not_in_use()
 
 

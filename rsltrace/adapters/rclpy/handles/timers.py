@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.adapters.rclpy.handles.clock import ClockHandle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
 from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.simulation.middleware.timer import TIMER, Timer
 from rsltrace.trace.model.entity import EntityKind
@@ -22,7 +22,7 @@ class TimerHandle(EntityHandle, Timer):
 
     lists = "timers"
 
-    def __init__(self, real: Any, stacks: Stacks, period_ns: int, autostart: bool) -> None:
+    def __init__(self, real: Any, stacks: Runtime, period_ns: int, autostart: bool) -> None:
         if period_ns < 0:
             raise real.RCLError("timer period must be non-negative")
         self.stacks = stacks
@@ -39,7 +39,6 @@ class TimerHandle(EntityHandle, Timer):
         self.dispatcher.loop.timers.remove(self.state)
 
     def dispatch(self) -> None:
-        """Run the callback of a timer that is due, and move it to its next deadline."""
         wrapper = self.wrapper
         dispatcher = self.dispatcher
         loop = dispatcher.loop
@@ -110,11 +109,9 @@ class TimerHandle(EntityHandle, Timer):
         return {"expected_call_time": expected_ns, "actual_call_time": self.dispatcher.loop.now_ns}
 
     def cancel_timer(self) -> None:
-        """Stop; ``reset_timer`` starts again."""
         self.cancel()
 
     def reset_timer(self) -> None:
-        """Start a new period now."""
         self.reset()
 
     def change_timer_period(self, period_ns: int) -> None:
@@ -124,15 +121,12 @@ class TimerHandle(EntityHandle, Timer):
         self.set_period(period_ns)
 
     def get_timer_period(self) -> int:
-        """Return the period in nanoseconds."""
         return self.state.period_ns
 
     def is_timer_ready(self) -> bool:
-        """Return whether the timer is due."""
         return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
 
     def is_timer_canceled(self) -> bool:
-        """Return whether the timer is cancelled."""
         return self.state.canceled
 
     def time_until_next_call(self) -> int | None:
@@ -142,7 +136,6 @@ class TimerHandle(EntityHandle, Timer):
         return self.state.deadline_ns - self.dispatcher.loop.now_ns
 
     def time_since_last_call(self) -> int:
-        """Return nanoseconds since the last call, or since creation."""
         return self.dispatcher.loop.now_ns - self.state.last_call_ns
 
 
@@ -169,7 +162,7 @@ class RosTimerHandle(TimerHandle):
     """A timer by a clock's own time while that is driven, by simulated time otherwise."""
 
     def __init__(
-        self, real: Any, stacks: Stacks, clock: ClockHandle, period_ns: int, autostart: bool
+        self, real: Any, stacks: Runtime, clock: ClockHandle, period_ns: int, autostart: bool
     ) -> None:
         self._clock = clock
         self._credit_ns = 0
@@ -214,7 +207,6 @@ class RosTimerHandle(TimerHandle):
             self.dispatcher.loop.ready.append(self)
 
     def dispatch(self) -> None:
-        """Run the callback if the timer is still due by its clock."""
         if not self._clock.is_driven:
             super().dispatch()
             return
@@ -244,7 +236,6 @@ class RosTimerHandle(TimerHandle):
     # -- what rclpy calls ------------------------------------------------------------------------
 
     def call_timer(self) -> None:
-        """Account for a call made by hand."""
         if not self._clock.is_driven:
             super().call_timer()
             return
@@ -261,15 +252,12 @@ class RosTimerHandle(TimerHandle):
             self.activate()
 
     def is_timer_ready(self) -> bool:
-        """Return whether the timer is due."""
         return not self.state.canceled and self.state.deadline_ns <= self._clock.now_ns()
 
     def time_until_next_call(self) -> int | None:
-        """Return nanoseconds to the deadline (negative: overdue), None if cancelled."""
         return None if self.state.canceled else self.state.deadline_ns - self._clock.now_ns()
 
     def time_since_last_call(self) -> int:
-        """Return nanoseconds since the last call, or since creation."""
         return self._clock.now_ns() - self.state.last_call_ns
 
     def _destroy(self) -> None:
@@ -294,7 +282,7 @@ class GuardConditionHandle(EntityHandle):
     kind = EntityKind.GUARD_CONDITION
     lists = "guards"
 
-    def __init__(self, stacks: Stacks) -> None:
+    def __init__(self, stacks: Runtime) -> None:
         self.stacks = stacks
         super().__init__(stacks.dispatcher, None)
         self._triggered = False
@@ -303,7 +291,6 @@ class GuardConditionHandle(EntityHandle):
         self.alarms: tuple[Alarm, ...] = ()
 
     def trigger_guard_condition(self) -> None:
-        """Make the callback ready."""
         if not self._triggered:
             self._triggered = True
             if self.active:

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, simulated_stacks, wait
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.recorded.polls import RecordedPoll
 
 _NS_PER_S = 1_000_000_000
@@ -28,10 +28,10 @@ class SimSelector:
     outside of the run and what comes is recorded.
     """
 
-    def __init__(self, stacks: Stacks, real: Any) -> None:
+    def __init__(self, stacks: Runtime, real: Any) -> None:
         self._stacks = stacks
         self._real = real
-        self._blocked: Wait | None = None
+        self._blocked: BlockedCall | None = None
         self._rounds = 0
 
     def __getattr__(self, name: str) -> Any:
@@ -44,7 +44,7 @@ class SimSelector:
         self._rounds = self._rounds + 1 if polls else 0
         if found or (polls and not self._costs_time()):
             return found
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is not self._stacks:
             return self._real.select(timeout)
         poller = getattr(self._real, "_selector", None)
@@ -78,17 +78,16 @@ class SimSelector:
         rounds = self._rounds
         return rounds > _FREE_ROUNDS and rounds % _ROUNDS_PER_POLL == 0
 
-    def _keep(self, blocked: Wait) -> None:
+    def _keep(self, blocked: BlockedCall) -> None:
         self._blocked = blocked
 
     def wake(self) -> None:
-        """Let the loop look again."""
         if self._blocked is not None:
             self._blocked.release()
 
 
 @contextmanager
-def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
+def simulated_event_loops(stacks: Runtime) -> Iterator[None]:
     """Have asyncio loops that are made within the ``with`` block keep simulated time."""
     base: Any = asyncio.BaseEventLoop
     selecting: Any = asyncio.selector_events.BaseSelectorEventLoop
@@ -96,13 +95,13 @@ def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
     real_write = selecting._write_to_self
 
     def time(self: Any) -> float:
-        if isinstance(getattr(self, "_selector", None), SimSelector) and simulated_stacks():
+        if isinstance(getattr(self, "_selector", None), SimSelector) and calling_runtime():
             return stacks.loop.now_ns / _NS_PER_S
         return float(real_time(self))
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real_init(self, *args, **kwargs)
-        if simulated_stacks() is stacks:
+        if calling_runtime() is stacks:
             self._selector = SimSelector(stacks, self._selector)
             # In seconds since 1970 a float cannot tell 100 ns apart; a timer that is due by less
             # than asyncio can see would never run, and time would never go on.

@@ -23,7 +23,7 @@ from typing import Any, NoReturn
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks import callback_groups as groups
-from rsltrace.adapters.rclpy.stacks.runtime import Patience, RunEnded, Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Patience, RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
@@ -47,10 +47,10 @@ _abandoned: list[greenlet] = []
 
 
 def wait(
-    stacks: Stacks,
+    stacks: Runtime,
     what: object,
     *,
-    until: Callable[[Wait], None] | None = None,
+    until: Callable[[BlockedCall], None] | None = None,
     for_ns: int | None = None,
     quiet: bool = False,
     patient: Patience = False,
@@ -68,13 +68,13 @@ def wait(
     """
     _check_may_wait(stacks, what)
     group = _hold_group(stacks)
-    blocked = Wait(stacks.runners, what, group, quiet=quiet, patient=patient)
+    blocked = BlockedCall(stacks.runners, what, group, quiet=quiet, patient=patient)
     if until is not None:
         until(blocked)
     if for_ns is not None:
         blocked.deadline_ns = stacks.loop.now_ns + stacks.ending.grace_ns + max(for_ns, 0)
         stacks.loop.schedule(blocked.deadline_ns, blocked.time_out)
-    _end_stretch(stacks)
+    _end_event_part(stacks)
     stacks.runners.blocked[blocked] = None
     stacks.event.on_end = None
     stacks.programs.leave()
@@ -99,7 +99,7 @@ def wait(
     return not blocked.timed_out
 
 
-def _check_may_wait(stacks: Stacks, what: object) -> None:
+def _check_may_wait(stacks: Runtime, what: object) -> None:
     """Refuse where there is no stack that can be set aside, and when the run is over."""
     if get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         place = "thread" if getpid() == stacks.runners.process else "process"
@@ -117,7 +117,7 @@ def _check_may_wait(stacks: Stacks, what: object) -> None:
         )
 
 
-def _end_stretch(stacks: Stacks) -> None:
+def _end_event_part(stacks: Runtime) -> None:
     """Record the event under way as one that will go on, unless it is quiet and said nothing."""
     event = stacks.event
     if event.quiet and not stacks.dispatcher.has_outputs():
@@ -129,12 +129,12 @@ def _end_stretch(stacks: Stacks) -> None:
 
 
 @contextmanager
-def set_aside(stacks: Stacks) -> Iterator[None]:
+def suspended_event(stacks: Runtime) -> Iterator[None]:
     """Let other events run on this stack, between two parts of the event under way."""
     event, programs, dispatcher = stacks.event, stacks.programs, stacks.dispatcher
     whose = event.handle, event.entity, event.node
     constructing, on_end = programs.constructing, event.on_end
-    _end_stretch(stacks)
+    _end_event_part(stacks)
     event.on_end = None
     try:
         yield
@@ -150,9 +150,9 @@ def set_aside(stacks: Stacks) -> Iterator[None]:
             observer.resumed()
 
 
-def _refuse(stacks: Stacks) -> NoReturn:
+def _refuse(stacks: Runtime) -> NoReturn:
     """Do not wait any more, the run is over."""
-    lose_patience(stacks)
+    count_refused_wait(stacks)
     raise RunEnded
 
 
@@ -161,7 +161,7 @@ def abandon(stack: greenlet) -> None:
     _abandoned.append(stack)
 
 
-def lose_patience(stacks: Stacks) -> None:
+def count_refused_wait(stacks: Runtime) -> None:
     """Count that somebody goes on although the run is over; in the end, leave it where it is."""
     stacks.ending.refused += 1
     if stacks.ending.refused > _PATIENCE and getcurrent() is not stacks.runners.main:
@@ -173,7 +173,7 @@ def lose_patience(stacks: Stacks) -> None:
         stacks.runners.main.switch()
 
 
-def _hold_group(stacks: Stacks) -> object:
+def _hold_group(stacks: Runtime) -> object:
     """Keep the callback's group busy while it is blocked, as an executor would; return it."""
     event = stacks.event
     wrapper: Any = getattr(event.handle, "wrapper", None)
@@ -189,7 +189,7 @@ def _hold_group(stacks: Stacks) -> object:
     return group
 
 
-def end_blocked(stacks: Stacks) -> None:
+def end_blocked(stacks: Runtime) -> None:
     """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
     stacks.ending.unwinding = True
     stacks.loop.halt()
@@ -209,29 +209,25 @@ def end_blocked(stacks: Stacks) -> None:
 class SimEvent:
     """Stands in for ``threading.Event`` where rclpy waits for what a callback will set."""
 
-    def __init__(self, stacks: Stacks, what: str = "an event to be set") -> None:
+    def __init__(self, stacks: Runtime, what: str = "an event to be set") -> None:
         self._stacks = stacks
         self._what = what
         self._set = False
-        self._waits: list[Wait] = []
+        self._waits: list[BlockedCall] = []
 
     def is_set(self) -> bool:
-        """Return whether the event is set."""
         return self._set
 
     def set(self) -> None:
-        """Set the event and wake everybody who waits for it."""
         self._set = True
         waits, self._waits = self._waits, []
         for blocked in waits:
             blocked.wake()
 
     def clear(self) -> None:
-        """Reset the event."""
         self._set = False
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Wait in simulated time until the event is set; return whether it is."""
         return self.wait_ns(None if timeout is None else patience_ns(timeout))
 
     def wait_ns(self, timeout_ns: int | None) -> bool:
@@ -242,7 +238,7 @@ class SimEvent:
         return self._set
 
 
-class FutureWake:
+class EventSetter:
     """The done callback of a future that sets an event at once, without becoming a task."""
 
     def __init__(self, event: SimEvent) -> None:
@@ -261,12 +257,12 @@ _RATE = (
     "meanwhile, in another thread"
 )
 _real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
-_world: list[Stacks] = []
+_runtimes: list[Runtime] = []
 
 
-def simulated_stacks() -> Stacks | None:
+def calling_runtime() -> Runtime | None:
     """Return the world in which the calling code runs: a node's, not that of who drives it."""
-    stacks = _world[-1] if _world else None
+    stacks = _runtimes[-1] if _runtimes else None
     if stacks is None or get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         return None
     return stacks if stacks.event.handle is not None or stacks.programs.importing else None
@@ -274,7 +270,7 @@ def simulated_stacks() -> Stacks | None:
 
 def world_exists() -> bool:
     """Return whether a run is under way, here or in the process that this one was forked from."""
-    return bool(_world)
+    return bool(_runtimes)
 
 
 def _sleep(seconds: float) -> None:
@@ -282,7 +278,7 @@ def _sleep(seconds: float) -> None:
     library = present_import()
     if library is not None:
         library.passed_ns += int(seconds * 1_000_000_000)
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None or stacks.event.handle is None or library is not None:
         _real_sleep(seconds)
         return
@@ -302,7 +298,7 @@ def _sleep(seconds: float) -> None:
 
 
 @contextmanager
-def simulated_waiting(stacks: Stacks, seed: int) -> Iterator[None]:
+def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
     """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
     import rclpy.action.client
     import rclpy.client
@@ -326,11 +322,11 @@ def simulated_waiting(stacks: Stacks, seed: int) -> Iterator[None]:
     for module, name, value in replaced:
         setattr(module, name, value)
     turned = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
-    _world.append(stacks)
+    _runtimes.append(stacks)
     try:
         yield
     finally:
-        _world.remove(stacks)
+        _runtimes.remove(stacks)
         turned.restore()
         for module, name, value in saved:
             setattr(module, name, value)
@@ -348,7 +344,7 @@ def _goal_ids(event: Event, seed: int) -> Callable[[], uuid.UUID]:
     return uuid4
 
 
-def _threading(stacks: Stacks, what: str) -> SimpleNamespace:
+def _threading(stacks: Runtime, what: str) -> SimpleNamespace:
     return SimpleNamespace(
         Event=partial(SimEvent, stacks, what), Lock=threading.Lock, RLock=threading.RLock
     )

@@ -53,7 +53,9 @@ class CallbackGroups:
         :raises RunError: if a method of the group raised.
         """
         group = wrapper.callback_group
-        if _asked(group, "can_execute", wrapper) and _asked(group, "beginning_execution", wrapper):
+        if _call_group_method(group, "can_execute", wrapper) and _call_group_method(
+            group, "beginning_execution", wrapper
+        ):
             self._event.on_end = lambda: self.end(group, wrapper)
             return True
         self.park(group, handle, retry)
@@ -81,7 +83,7 @@ class CallbackGroups:
 
     def _lets_any(self, group: object) -> bool:
         parked: list[Any] = [handle for handle, _, _ in self.parked[group]]
-        return any(_asked(group, "can_execute", handle.wrapper) for handle in parked)
+        return any(_call_group_method(group, "can_execute", handle.wrapper) for handle in parked)
 
     def end(self, group: Any, wrapper: Any) -> None:
         """Mark the end of a callback, and let the events run that waited for its group, before
@@ -89,7 +91,7 @@ class CallbackGroups:
         if group is None:
             return
         if is_custom(group):
-            _asked(group, "ending_execution", wrapper)
+            _call_group_method(group, "ending_execution", wrapper)
         else:
             group.ending_execution(wrapper)
         self._retry(group)
@@ -106,7 +108,7 @@ class CallbackGroups:
 def is_busy(group: Any, wrapper: Any) -> bool:
     """Return whether ``group`` forbids to run ``wrapper``'s callback now."""
     if is_custom(group):
-        return not _asked(group, "can_execute", wrapper)
+        return not _call_group_method(group, "can_execute", wrapper)
     active = getattr(group, "_active_entity", group)  # a mutually exclusive group has one
     if active is None:
         return False
@@ -139,7 +141,7 @@ def _has_methods_of_its_own(kind: type) -> bool:
 _METHODS = ("can_execute", "beginning_execution", "ending_execution")
 
 
-def _asked(group: Any, method: str, wrapper: Any) -> Any:
+def _call_group_method(group: Any, method: str, wrapper: Any) -> Any:
     try:
         return getattr(group, method)(wrapper)
     except Exception as error:
@@ -155,6 +157,6 @@ def begin(group: Any, wrapper: Any) -> None:
         group.beginning_execution(wrapper)
 
 
-def exclusive(group: Any) -> object | None:
+def exclusive_group(group: Any) -> object | None:
     """Return a group if it lets only one callback run at a time."""
     return group if hasattr(group, "_active_entity") else None

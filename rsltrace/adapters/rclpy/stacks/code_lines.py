@@ -52,7 +52,7 @@ class CallSites:
         if looks <= _LOOKS_FIRST or is_due:
             self._look(sys._getframe(3), running)
         if looks == _LOOKS_FIRST and (recorder := self._dispatcher.recorder) is not None:
-            _record(self._dispatcher, self._entity, recorder.outputs, "", "")
+            _record_line(self._dispatcher, self._entity, recorder.outputs, "", "")
 
     def _look(self, frame: FrameType, running: int) -> None:
         recorder = self._dispatcher.recorder
@@ -64,13 +64,15 @@ class CallSites:
         if key not in self._told and len(self._told) < _PLACES_MAX:
             self._told.add(key)
             output = recorder.outputs
-            _tell(self._dispatcher, self._entity, code, found.f_globals, found.f_lineno, output)
+            _record_code(
+                self._dispatcher, self._entity, code, found.f_globals, found.f_lineno, output
+            )
 
 
 _address = object.__hash__  # as id(), but no audit hook is told of it; nor of __code__, if need be
 
 
-class Functions:
+class FunctionRecorder:
     """The functions of the user's that events run beside the callbacks of their entities."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
@@ -104,24 +106,24 @@ class Functions:
                 if plain.__closure__ is None:  # found at once, and keeps nothing alive
                     self._known[entity, _address(plain)] = plain
             if found is not None and is_user_file(found[0].co_filename):
-                self._tell(entity, *found)
+                self._record_function(entity, *found)
                 return
 
-    def _tell(self, entity: int, code: CodeType, names: Any) -> None:
+    def _record_function(self, entity: int, code: CodeType, names: Any) -> None:
         if (entity, code) not in self._told and len(self._told) < _PLACES_MAX:
             self._told.add((entity, code))
-            _tell(self._dispatcher, entity, code, names, code.co_firstlineno, NO_SEQUENCE)
+            _record_code(self._dispatcher, entity, code, names, code.co_firstlineno, NO_SEQUENCE)
 
 
-def _tell(
+def _record_code(
     dispatcher: Dispatcher, entity: int, code: CodeType, names: Any, line: int, output: int
 ) -> None:
     if code.co_filename[:1] != "<":
         name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
-        _record(dispatcher, entity, output, f"{file_of(code, names)}:{line}", name)
+        _record_line(dispatcher, entity, output, f"{file_of(code, names)}:{line}", name)
 
 
-def _record(dispatcher: Dispatcher, entity: int, output: int, place: str, name: str) -> None:
+def _record_line(dispatcher: Dispatcher, entity: int, output: int, place: str, name: str) -> None:
     recorder = dispatcher.recorder
     if recorder is not None:
         told = CodeLine(recorder.index, entity, output, place, name)

@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
-from rsltrace.adapters.rclpy.stacks.code_lines import Functions
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
+from rsltrace.adapters.rclpy.stacks.code_lines import FunctionRecorder
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, describe_awaited
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import Runnable
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
@@ -28,7 +28,7 @@ class Coroutines:
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
         self.suspended: dict[TaskRun, None] = {}
-        self.functions = Functions(domain.dispatcher)
+        self.functions = FunctionRecorder(domain.dispatcher)
         self._polled: list[TaskRun] = []
         self._polls = 0
         self._stage: tuple[int, int] | None = None
@@ -99,7 +99,6 @@ class TaskRun:
         self._awaited: Any = None
 
     def dispatch(self) -> None:
-        """Run the task's next stretch."""
         if self.node is not None and self.node.held is not None:
             self.node.held.append(self)
             return
@@ -127,11 +126,9 @@ class TaskRun:
         return _run_oldest_first()
 
     def describe(self) -> str:
-        """Name the task and where it came from."""
         return self.label()
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy."""
         node = self.node
         return Runnable(
             "task",
@@ -152,7 +149,9 @@ class TaskRun:
         """Say what a suspended task waits for, and where in the code."""
         frame = getattr(self.task._handler, "cr_frame", None)
         where = f" at {frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
-        return f"{self.label()} waits{where} for {awaited(self.domain.graph, self._awaited)}"
+        return (
+            f"{self.label()} waits{where} for {describe_awaited(self.domain.graph, self._awaited)}"
+        )
 
     def _step(self) -> None:
         coroutines = self._coroutines
@@ -175,7 +174,7 @@ class TaskRun:
         if self._awaited is None:
             coroutines.poll_later(self)
         else:
-            self._awaited.add_done_callback(Resume(self))
+            self._awaited.add_done_callback(ResumeTask(self))
 
     def _end(self) -> None:
         self._coroutines.suspended.pop(self, None)
@@ -192,7 +191,7 @@ def _run_oldest_first() -> bool:
     return looks is None or "reversed(tasks)" not in inspect.getsource(looks)
 
 
-class Resume:
+class ResumeTask:
     """The done callback that puts a suspended task back among the tasks."""
 
     def __init__(self, run: TaskRun) -> None:

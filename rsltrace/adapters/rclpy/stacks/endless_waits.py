@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.simulation.loop.ordered import OrderedLoop, Workers
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity
@@ -24,7 +24,7 @@ _LONG_NS = 1_000_000_000
 _NAMED_MAX = 4
 
 
-def note_waits(stacks: Stacks, outcome: Outcome) -> None:
+def note_waits(stacks: Runtime, outcome: Outcome) -> None:
     """Say who still waits, at the end of a run, in a call that no passing of time ends, and what
     that keeps from running."""
     starved = _starved(stacks)
@@ -55,7 +55,7 @@ def note_waits(stacks: Stacks, outcome: Outcome) -> None:
             outcome.notes.append(f"waited for {lasted}: {text}")
 
 
-def _starved(stacks: Stacks) -> dict[Workers | None, list[Candidate]]:
+def _starved(stacks: Runtime) -> dict[Workers | None, list[Candidate]]:
     """Return what is ready and has no worker, by simulated executor."""
     found: dict[Workers | None, list[Candidate]] = {}
     if isinstance(stacks.loop, OrderedLoop):
@@ -64,13 +64,13 @@ def _starved(stacks: Stacks) -> dict[Workers | None, list[Candidate]]:
     return found
 
 
-def _workers(stacks: Stacks, handle: Any) -> Workers | None:
+def _workers(stacks: Runtime, handle: Any) -> Workers | None:
     """Return the simulated executor that the callbacks of a handle run on, None if on none."""
     loop, is_entity = stacks.loop, isinstance(handle, DomainEntity)
     return loop.place(handle).workers if is_entity and isinstance(loop, OrderedLoop) else None
 
 
-def _held_in_groups(stacks: Stacks, outcome: Outcome) -> list[Wait | TaskRun]:
+def _held_in_groups(stacks: Runtime, outcome: Outcome) -> list[BlockedCall | TaskRun]:
     """Say of every callback group that has been busy for long who waits for it, and why; return
     who keeps them busy."""
     holders = []
@@ -97,7 +97,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
-def _holder(stacks: Stacks, group: object) -> Wait | TaskRun | None:
+def _holder(stacks: Runtime, group: object) -> BlockedCall | TaskRun | None:
     """Return the callback that keeps a group busy, unless it only waits for time to pass."""
     for blocked in stacks.runners.blocked:
         if blocked.group is group:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Entry, StartRule
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.loop.loop import Release
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.events.event import Event, OutsideEvent
@@ -19,7 +19,7 @@ from rsltrace.trace.model.finding import Policy
 # Events in which the code of a job's entry runs: its constructor, its main, its threads.
 
 
-class Construction(OutsideEvent):
+class ConstructionEvent(OutsideEvent):
     """An event that is no entity's callback; ``entry`` is what is being constructed, or None."""
 
     def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
@@ -43,26 +43,26 @@ def entry_of(event: Event) -> Entry | None:
 STARTS = 4
 """The operation of a TASK output: what comes of it is that an entry starts."""
 
-Construct = Callable[[Entry, tuple[int, int]], bool]
+ConstructEntry = Callable[[Entry, tuple[int, int]], bool]
 """Constructs an entry, given the event and output that made it start; False: that ended the run."""
 
 
-class Starts:
+class EntryStarts:
     """The entries that wait for their start. ``failed`` is the one whose construction has ended
     the run."""
 
-    def __init__(self, stacks: Stacks, construct: Construct) -> None:
+    def __init__(self, stacks: Runtime, construct: ConstructEntry) -> None:
         self.stacks = stacks
         self.construct = construct
         self.failed: Entry | None = None
         self.start_ns: int | None = None
-        self._waiting: list[LaterStart] = []
+        self._waiting: list[DelayedStart] = []
 
     def add(self, entry: Entry) -> None:
         """Let an entry wait for what its rule says. Before the first one is constructed."""
         rule = entry.start_after
         assert rule is not None
-        later = LaterStart(self, entry, rule)
+        later = DelayedStart(self, entry, rule)
         self._waiting.append(later)
         domain, programs = self.stacks.domain, self.stacks.programs
         programs.to_come.append(entry.key)
@@ -74,7 +74,7 @@ class Starts:
 
     def add_at(self, entry: Entry, time_ns: int) -> None:
         """Let an entry start at a time, whatever its rule says."""
-        later = LaterStart(self, entry, StartRule())
+        later = DelayedStart(self, entry, StartRule())
         self._waiting.append(later)
         self.stacks.programs.to_come.append(entry.key)
         self.stacks.loop.schedule_release(time_ns, _release, later)
@@ -85,7 +85,7 @@ class Starts:
         for later in self._waiting:
             later.look()
 
-    def gone(self, later: LaterStart) -> None:
+    def gone(self, later: DelayedStart) -> None:
         """Take note that one has started."""
         self._waiting.remove(later)
         self.stacks.programs.to_come.remove(later.entry.key)
@@ -96,10 +96,10 @@ class Starts:
             yield later.entry.key, list(later.unmet)
 
 
-class LaterStart:
+class DelayedStart:
     """One entry that waits for its start. The loop dispatches it once, to begin."""
 
-    def __init__(self, starts: Starts, entry: Entry, rule: StartRule) -> None:
+    def __init__(self, starts: EntryStarts, entry: Entry, rule: StartRule) -> None:
         self.entry = entry
         self._starts = starts
         self._rule = rule
@@ -140,20 +140,17 @@ class LaterStart:
             loop.schedule_release(time_ns, _release, self)
 
     def dispatch(self) -> None:
-        """Construct the entry, as one event."""
         self._starts.gone(self)
         if not self._starts.construct(self.entry, self._cause):
             self._starts.failed = self.entry
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(None, self.describe())
 
     def describe(self) -> str:
-        """Name it for people."""
         return f"the start of {self.entry.name}"
 
 
-def _release(release: Release) -> LaterStart:
-    later: LaterStart = release[4]
+def _release(release: Release) -> DelayedStart:
+    later: DelayedStart = release[4]
     return later

@@ -23,9 +23,9 @@ from typing import Any
 from greenlet import getcurrent
 
 from rsltrace.adapters.rclpy.stacks.blocking_calls import getpid, wait
-from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive, is_busy, is_custom
+from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive_group, is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import mailbox_of
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.errors import EXIT_RUN, RunError
 from rsltrace.guard.callers import KINDS, USER, is_in
@@ -38,13 +38,13 @@ from rsltrace.trace.model.event import CodeLine, Draw, encode_draw
 
 _OURS = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(__file__)))) + os.sep
 _CALLS_BACK = os.path.join(_OURS, "simulation", "middleware", "events", "dispatcher.py")
-_DOOR = os.path.join(_OURS, "adapters", "rclpy", "")
+_ADAPTER = os.path.join(_OURS, "adapters", "rclpy", "")
 _IN_BETWEEN = (
-    *(os.path.join(_DOOR, name, "") for name in ("handles", "executors", "actions", "stacks")),
+    *(os.path.join(_ADAPTER, name, "") for name in ("handles", "executors", "actions", "stacks")),
     os.path.join(_OURS, "run", "plans", "main_programs.py"),
 )
 """What may lie between a callback and whoever calls it."""
-_ASKS = os.path.join(_DOOR, "stacks", "callback_groups.py")
+_CALLBACK_GROUPS = os.path.join(_ADAPTER, "stacks", "callback_groups.py")
 _INTERFACES = ("msg", "srv", "action")
 _TOOLS = range(5, -1, -1)
 _NAME = "rsltrace: switches between threads"
@@ -56,7 +56,7 @@ class LineSwitches:
     ``packages`` are those of the job's nodes, which are the user's even where they are installed.
     """
 
-    def __init__(self, stacks: Stacks, loop: OrderedLoop, packages: frozenset[str]) -> None:
+    def __init__(self, stacks: Runtime, loop: OrderedLoop, packages: frozenset[str]) -> None:
         self._stacks = stacks
         self._loop = loop
         self._packages = packages
@@ -131,13 +131,13 @@ class LineSwitches:
         event = self._event
         process = self._process(self._stacks.programs.present, event.node)
         wrapper: Any = getattr(event.handle, "wrapper", None)
-        group = exclusive(getattr(wrapper, "callback_group", None))
+        group = exclusive_group(getattr(wrapper, "callback_group", None))
         return [one for one in places if self._overlaps(one.candidate.item, process, group)]
 
     def _overlaps(self, item: Any, process: object, group: object | None) -> bool:
         """Return whether an item could run natively while a callback of a process does that keeps a
         mutually exclusive group (or None) busy."""
-        if isinstance(item, Wait):
+        if isinstance(item, BlockedCall):
             return process is not None and self._process(item.program, item.event[2]) is process
         if isinstance(item, SimThread):
             return process is not None and self._process(item.program, item.node) is process
@@ -152,8 +152,8 @@ class LineSwitches:
         mailbox = mailbox_of(item)
         if mailbox is None:
             return True
-        pump: Any = mailbox.pump
-        return pump is not None and bool(pump.waits or pump.standby)
+        driver: Any = mailbox.driver
+        return driver is not None and bool(driver.waits or driver.standby)
 
     def _process(self, program: object, node: Any) -> object | None:
         """Return what would be the process natively: a program, or one entry of the host's nodes,
@@ -174,7 +174,9 @@ def _is_callback(frame: FrameType) -> bool:
             return True
         if code.co_name in ("__del__", "<module>") or file.startswith("<frozen importlib"):
             return False
-        if file == _ASKS or (file.startswith(_OURS) and not file.startswith(_IN_BETWEEN)):
+        if file == _CALLBACK_GROUPS or (
+            file.startswith(_OURS) and not file.startswith(_IN_BETWEEN)
+        ):
             return False
         above = above.f_back
     return False
@@ -182,7 +184,7 @@ def _is_callback(frame: FrameType) -> bool:
 
 @contextmanager
 def switches_at_lines(
-    stacks: Stacks, loop: OrderedLoop, packages: frozenset[str]
+    stacks: Runtime, loop: OrderedLoop, packages: frozenset[str]
 ) -> Iterator[None]:
     """Ask at every line of user code who goes on, within the ``with`` block."""
     from weakref import WeakKeyDictionary
@@ -195,7 +197,7 @@ def switches_at_lines(
 
 
 @contextmanager
-def _monitored(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
+def _monitored(stacks: Runtime, switches: LineSwitches) -> Iterator[None]:
     monitoring: Any = sys.monitoring  # type: ignore[attr-defined,unused-ignore]
     tool = next((one for one in _TOOLS if monitoring.get_tool(one) is None), None)
     if tool is None:
@@ -225,7 +227,7 @@ def _monitored(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
 
 
 @contextmanager
-def _traced(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
+def _traced(stacks: Runtime, switches: LineSwitches) -> Iterator[None]:
     before = sys.gettrace()
 
     def on_line(frame: FrameType, what: str, argument: object) -> Any:
@@ -236,7 +238,7 @@ def _traced(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
     def on_call(frame: FrameType, what: str, argument: object) -> Any:
         return on_line if switches.owns(frame) else None
 
-    tracing = _Tracing(on_call)
+    tracing = _TraceSetter(on_call)
     stacks.dispatcher.add_observer(tracing)
     try:
         yield
@@ -245,7 +247,7 @@ def _traced(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
         sys.settrace(before)
 
 
-class _Tracing(EventObserver):
+class _TraceSetter(EventObserver):
     """Traces each event anew: whether a stack is traced is kept with it."""
 
     order = ObserverOrder.LINE_SWITCHES

@@ -18,8 +18,8 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait, world_exists
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait, world_exists
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.trace.model.texts import patience_ns
 
@@ -51,14 +51,14 @@ class SimLock:
     __slots__ = ("__weakref__", "_called", "_owner", "_taken", "_waits")
 
     def __new__(cls) -> Any:
-        return _thread.allocate_lock() if simulated_stacks() is None else object.__new__(cls)
+        return _thread.allocate_lock() if calling_runtime() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._taken = False
         self._owner: greenlet | None = None
-        self._waits: deque[tuple[Wait, bool]] = deque()
+        self._waits: deque[tuple[BlockedCall, bool]] = deque()
         """Who waits, and whether it has been overtaken."""
-        self._called: Wait | None = None
+        self._called: BlockedCall | None = None
         """Who was woken by a release and has not come yet."""
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
@@ -76,7 +76,7 @@ class SimLock:
         return self._wait(timeout)
 
     def _wait(self, timeout: float) -> bool:
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is None and getcurrent is _no_stack:
             return True  # nobody else is left who could have it
         if stacks is None:
@@ -89,7 +89,7 @@ class SimLock:
         overtaken = False
         while True:
             for_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
-            what = _Holder(stacks, self._owner, for_work=in_condition)
+            what = _LockHolder(stacks, self._owner, for_work=in_condition)
             if not self._turn(stacks, what, for_ns, overtaken=overtaken):
                 return False
             if overtaken or not self._taken:  # left taken for us, or free
@@ -98,11 +98,13 @@ class SimLock:
                 return True
             overtaken = True
 
-    def _turn(self, stacks: Stacks, what: _Holder, for_ns: int | None, *, overtaken: bool) -> bool:
+    def _turn(
+        self, stacks: Runtime, what: _LockHolder, for_ns: int | None, *, overtaken: bool
+    ) -> bool:
         """Wait until a release calls; return whether one did before the time was up."""
-        mine: list[Wait] = []
+        mine: list[BlockedCall] = []
 
-        def join(blocked: Wait) -> None:
+        def join(blocked: BlockedCall) -> None:
             mine.append(blocked)
             (self._waits.appendleft if overtaken else self._waits.append)((blocked, overtaken))
 
@@ -134,7 +136,6 @@ class SimLock:
                 blocked.wake()
 
     def locked(self) -> bool:
-        """Return whether somebody has the lock."""
         return self._taken
 
     def is_mine(self) -> bool:
@@ -151,7 +152,7 @@ class SimLock:
         self.__init__()  # type: ignore[misc]
 
 
-class LockOfPools:
+class PoolLock:
     """Stands in for the lock that all thread pools of a process share (``concurrent.futures``).
 
     A pool starts a worker while it has it, and the worker runs first: it may well want it, too.
@@ -164,7 +165,7 @@ class LockOfPools:
         self._own.__init__()  # type: ignore[misc]
 
     def __enter__(self) -> bool:
-        return bool((self._real if simulated_stacks() is None else self._own).acquire())
+        return bool((self._real if calling_runtime() is None else self._own).acquire())
 
     def __exit__(self, *exc: object) -> None:
         (self._own if self._own.is_mine() else self._real).release()
@@ -176,7 +177,7 @@ class SimRLock:
     __slots__ = ("__weakref__", "_count", "_lock", "_owner")
 
     def __new__(cls) -> Any:
-        return _real_rlock() if simulated_stacks() is None else object.__new__(cls)
+        return _real_rlock() if calling_runtime() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._lock = SimLock()
@@ -283,10 +284,10 @@ def _become_real() -> None:
 os.register_at_fork(after_in_child=_become_real)
 
 
-class _Holder:
+class _LockHolder:
     """Says who has a lock, when somebody asks: for the report of a deadlock."""
 
-    def __init__(self, stacks: Stacks, owner: greenlet | None, *, for_work: bool) -> None:
+    def __init__(self, stacks: Runtime, owner: greenlet | None, *, for_work: bool) -> None:
         self._stacks = stacks
         self._owner = owner
         self._me = getcurrent()
@@ -317,4 +318,4 @@ class _Holder:
         return "a lock that nobody will release"
 
 
-__all__ = ["LockOfPools", "SimLock", "SimRLock"]
+__all__ = ["PoolLock", "SimLock", "SimRLock"]

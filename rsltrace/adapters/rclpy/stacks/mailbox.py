@@ -23,7 +23,7 @@ def servers_text(servers: int) -> str:
     return f"{servers} server{'' if servers == 1 else 's'}"
 
 
-def awaited(graph: Graph, future: object) -> str:
+def describe_awaited(graph: Graph, future: object) -> str:
     """Say what would complete a future: the service it is a request to, if it is one."""
     if future is None:
         return "something that is not an rclpy Future"
@@ -46,7 +46,7 @@ def awaited(graph: Graph, future: object) -> str:
     return "a Future that nobody completes"
 
 
-def called_service(graph: Graph, frame: FrameType | None) -> str:
+def describe_service_call(graph: Graph, frame: FrameType | None) -> str:
     """Say which service a stack waits for in ``Client.call``; empty if it is not there."""
     from rclpy.client import Client
 
@@ -59,20 +59,20 @@ def called_service(graph: Graph, frame: FrameType | None) -> str:
     return ""
 
 
-class Runs(Protocol):
+class CallbackRunner(Protocol):
     """A stack that spins."""
 
     def runs(self, mailbox: Mailbox, item: Dispatchable) -> bool:
         """Run what is ready at once, if that is possible."""
 
 
-class Spinner(Protocol):
+class SpinningExecutor(Protocol):
     """The executor that empties a mailbox while it spins."""
 
     executor: Any
 
     @property
-    def standby(self) -> Runs | None:
+    def standby(self) -> CallbackRunner | None:
         """The stack that spins, if it can be given what is ready."""
 
     def wake(self) -> None:
@@ -84,7 +84,7 @@ class Mailbox:
 
     def __init__(self, loop: EventLoop) -> None:
         self._next_place = loop.next_place
-        self.pump: Spinner | None = None
+        self.driver: SpinningExecutor | None = None
         """The executor that has the node now."""
         self.closed = False
         """Whether the process the node lived in has ended: nothing of it runs any more."""
@@ -100,15 +100,15 @@ class Mailbox:
         if self.admitted is item:
             self.admitted = None
             return False
-        pump = self.pump
-        if pump is not None and pump.standby is not None and pump.standby.runs(self, item):
+        driver = self.driver
+        if driver is not None and driver.standby is not None and driver.standby.runs(self, item):
             return True
         if leave is not None:
             leave()
         if not self.closed:
             self.entries.append((self._next_place(), item))
-            if pump is not None:
-                pump.wake()
+            if driver is not None:
+                driver.wake()
         return True
 
     def run(self, item: Dispatchable) -> None:
@@ -120,7 +120,7 @@ class Mailbox:
     def close(self) -> None:
         """Run nothing any more."""
         self.closed = True
-        self.pump = None
+        self.driver = None
         self.entries.clear()
 
 

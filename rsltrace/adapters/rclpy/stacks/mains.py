@@ -16,10 +16,10 @@ from typing import Any
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.callback_errors import exit_status
-from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.entry_starts import Construction
-from rsltrace.adapters.rclpy.stacks.program import Handler, Program
-from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime
+from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent
+from rsltrace.adapters.rclpy.stacks.program import ExitHandler, SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.failure import text_of
@@ -30,12 +30,12 @@ from rsltrace.trace.model.texts import format_seconds
 
 
 @contextmanager
-def own_exit_handlers(stacks: Stacks) -> Iterator[None]:
+def own_exit_handlers(stacks: Runtime) -> Iterator[None]:
     """Keep the exit handlers of mains apart from the process's within the ``with`` block."""
     real_register, real_unregister = atexit.register, atexit.unregister
 
-    def of_main() -> list[Handler] | None:
-        if simulated_stacks() is stacks and not stacks.programs.is_hosted:
+    def of_main() -> list[ExitHandler] | None:
+        if calling_runtime() is stacks and not stacks.programs.is_hosted:
             return stacks.programs.present.exit_handlers
         return None
 
@@ -60,7 +60,7 @@ def own_exit_handlers(stacks: Stacks) -> Iterator[None]:
         atexit.register, atexit.unregister = real_register, real_unregister
 
 
-def run_exit_handlers(program: Program) -> None:
+def run_exit_handlers(program: SimulatedProgram) -> None:
     """Run what a main has registered, the last first, as Python does."""
     while program.exit_handlers:
         function, args, kwargs = program.exit_handlers.pop()
@@ -72,7 +72,9 @@ _INTERRUPTED = 130
 """What a shell shows of a process that SIGINT, and so ``KeyboardInterrupt``, has ended."""
 
 
-def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO_EVENT, 0)) -> None:
+def begin_program(
+    stacks: Runtime, program: SimulatedProgram, cause: tuple[int, int] = (NO_EVENT, 0)
+) -> None:
     """Run a main until it ends or blocks for the first time, as one event; ``cause`` is the event
     and output that it follows from."""
     entities = stacks.domain.entities
@@ -82,7 +84,7 @@ def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO
 
     def body() -> None:
         program.enter()
-        event = Construction(program.describe, program.entry)
+        event = ConstructionEvent(program.describe, program.entry)
         stacks.dispatcher.run_outside(
             event,
             EventKind.CONSTRUCT,
@@ -99,7 +101,7 @@ def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO
     program.stack.switch()
 
 
-def _run(stacks: Stacks, program: Program) -> None:
+def _run(stacks: Runtime, program: SimulatedProgram) -> None:
     assert program.entry is not None
     error: BaseException | None = None
     stacks.programs.tell("started", program.entry.key)
@@ -116,7 +118,7 @@ def _run(stacks: Stacks, program: Program) -> None:
     end_program(stacks, program, error)
 
 
-def end_program(stacks: Stacks, program: Program, error: BaseException | None) -> None:
+def end_program(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> None:
     """Do what the end of a process does, within the last event of its main.
 
     An exception that nobody caught is raised again: it fails the run, except while that ends.
@@ -124,7 +126,7 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
     notes = stacks.domain.outcome.notes
     program.ended = True
     _stop_threads(stacks, program)
-    failed = _judge(stacks, program, error)
+    failed = _note_main_end(stacks, program, error)
     idle = [node.fully_qualified_name for node in _nodes(stacks, program) if node.wrapper is None]
     at = format_seconds(stacks.loop.now_ns)
     ending = stacks.ending
@@ -134,14 +136,14 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
             notes.append(f"{program.label} ended at {at} s without ever spinning{never}")
         else:
             notes.append(f"{program.label} ended at {at} s")
-    _vanish(stacks, program)
+    _destroy_nodes(stacks, program)
     if failed:
         assert error is not None
         raise error
     _has_ended(stacks, program)
 
 
-def _has_ended(stacks: Stacks, program: Program) -> None:
+def _has_ended(stacks: Runtime, program: SimulatedProgram) -> None:
     """Tell of the end of a process; with the last one the run may be over."""
     programs = stacks.programs
     assert program.entry is not None
@@ -154,7 +156,7 @@ def _has_ended(stacks: Stacks, program: Program) -> None:
         stacks.loop.stop(Stop(_EVERY_MAIN_ENDED))
 
 
-def crash_program(stacks: Stacks, program: Program) -> None:
+def crash_program(stacks: Runtime, program: SimulatedProgram) -> None:
     """Let a process be gone in the event under way; nothing of it runs any more (``Victims``)."""
     for context in program.contexts:
         context.end()
@@ -164,7 +166,9 @@ def crash_program(stacks: Stacks, program: Program) -> None:
     _has_ended(stacks, program)
 
 
-def _finish_process(stacks: Stacks, program: Program, error: BaseException | None) -> None:
+def _finish_process(
+    stacks: Runtime, program: SimulatedProgram, error: BaseException | None
+) -> None:
     """Do what Python does when main is over: wait for its threads, run its exit handlers.
 
     A main that fails ends the run at once instead.
@@ -174,7 +178,7 @@ def _finish_process(stacks: Stacks, program: Program, error: BaseException | Non
         run_exit_handlers(program)
 
 
-def _wait_for_threads(stacks: Stacks, program: Program) -> None:
+def _wait_for_threads(stacks: Runtime, program: SimulatedProgram) -> None:
     """Wait for all threads that are no daemons, as a process does when its main has returned; they
     may start more of them meanwhile."""
     with contextlib.suppress(RunEnded, KeyboardInterrupt):
@@ -189,7 +193,7 @@ def _wait_for_threads(stacks: Stacks, program: Program) -> None:
                     thread.join(None)
 
 
-def _stop_threads(stacks: Stacks, program: Program) -> None:
+def _stop_threads(stacks: Runtime, program: SimulatedProgram) -> None:
     """Unwind the threads that are left: they end with their process."""
     for blocked in list(stacks.runners.blocked):
         if blocked.program is program:
@@ -197,7 +201,7 @@ def _stop_threads(stacks: Stacks, program: Program) -> None:
             blocked.release()
 
 
-def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> bool:
+def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> bool:
     """Take note of how main ended; return whether that fails the run."""
     if error is None or isinstance(error, RunEnded):
         return False
@@ -226,11 +230,11 @@ def _is_external_shutdown(error: BaseException) -> bool:
     return isinstance(error, ExternalShutdownException)
 
 
-def _nodes(stacks: Stacks, program: Program) -> list[Any]:
+def _nodes(stacks: Runtime, program: SimulatedProgram) -> list[Any]:
     return [node for node in stacks.domain.graph.nodes if node.process is program]
 
 
-def _vanish(stacks: Stacks, program: Program) -> None:
+def _destroy_nodes(stacks: Runtime, program: SimulatedProgram) -> None:
     """Take a process's nodes out of the graph, as its end does."""
     for context in program.contexts:
         context.end()
@@ -242,7 +246,7 @@ def _vanish(stacks: Stacks, program: Program) -> None:
         node.destroy()
 
 
-def end_programs(stacks: Stacks) -> None:
+def end_programs(stacks: Runtime) -> None:
     """Tell every main that is still there to end, and let it."""
     if stacks.ending.closing or not stacks.programs.all:
         return
@@ -254,7 +258,7 @@ def end_programs(stacks: Stacks) -> None:
             _let_run(stacks, program)
 
 
-def interrupt(stacks: Stacks, program: Program) -> None:
+def interrupt(stacks: Runtime, program: SimulatedProgram) -> None:
     """Do what SIGINT does to a process; the call that its main is in raises ``KeyboardInterrupt``
     (who is in no call has to raise it)."""
     shut_down(stacks, program)
@@ -264,7 +268,7 @@ def interrupt(stacks: Stacks, program: Program) -> None:
         blocked.release()
 
 
-def shut_down(stacks: Stacks, program: Program) -> None:
+def shut_down(stacks: Runtime, program: SimulatedProgram) -> None:
     """Shut a process's contexts down from outside, as rclpy's handler of signals does."""
     for context in program.contexts:
         context.end()
@@ -273,7 +277,7 @@ def shut_down(stacks: Stacks, program: Program) -> None:
             other.release()
 
 
-def _let_run(stacks: Stacks, program: Program) -> None:
+def _let_run(stacks: Runtime, program: SimulatedProgram) -> None:
     """Let a program end that has been told to, as long as ros2 launch leaves it.
 
     Time stands still meanwhile: who sleeps goes on when nobody else can.
@@ -282,7 +286,7 @@ def _let_run(stacks: Stacks, program: Program) -> None:
     stacks.ending.grace_ns = 0
     while not program.ended:
         item = loop.tasks.popleft() if loop.tasks else loop.ready.popleft() if loop.ready else None
-        if isinstance(item, Wait):
+        if isinstance(item, BlockedCall):
             stacks.runners.waiting.append(getcurrent())
             item.stack.switch()
         elif isinstance(item, SimThread):

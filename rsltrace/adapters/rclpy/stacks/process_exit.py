@@ -21,9 +21,9 @@ from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, getpid, simulated_stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, calling_runtime, getpid
 from rsltrace.adapters.rclpy.stacks.mains import end_program, interrupt, shut_down
-from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.process_ids import meant_id
@@ -50,7 +50,7 @@ _SIGNALS_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signa
 _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 
 
-class _Handler:
+class _SignalHandler:
     """A node's signal handler, which may interrupt anything."""
 
     def __init__(self, domain: Domain, handler: Callable[[int, FrameType | None], Any]) -> None:
@@ -83,20 +83,20 @@ def _is_in_user_code(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
+def own_signal_handlers(stacks: Runtime) -> Iterator[None]:
     """Keep the signal handlers of nodes apart from the process's within the ``with`` block."""
     before: dict[int, Any] = {}
 
     def set_handler(number: Any, handler: Any, /) -> Any:
-        if simulated_stacks() is not stacks:
+        if calling_runtime() is not stacks:
             return real_set(number, handler)
         if getcurrent() in stacks.threads.by_stack:
             raise ValueError("signal only works in main thread of the main interpreter")
         if number not in _SIGNALS_ENDING:
-            given = _Handler(stacks.domain, handler) if callable(handler) else handler
+            given = _SignalHandler(stacks.domain, handler) if callable(handler) else handler
             replaced = real_set(number, given)
             before.setdefault(number, replaced)
-            return _own(replaced)
+            return _node_handler(replaced)
         if not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN):
             raise TypeError(
                 "signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object"
@@ -106,13 +106,13 @@ def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
         return replaced
 
     def get_handler(number: Any, /) -> Any:
-        if simulated_stacks() is stacks and number in stacks.programs.present.signal_handlers:
+        if calling_runtime() is stacks and number in stacks.programs.present.signal_handlers:
             return stacks.programs.present.signal_handlers[int(number)]
-        return _own(real_get(number))
+        return _node_handler(real_get(number))
 
     def set_wakeup(fd: int, /, **options: Any) -> Any:
         """Asyncio wants a byte of every signal for its loop; those that end a run are not its."""
-        return -1 if simulated_stacks() is stacks else real_wakeup(fd, **options)
+        return -1 if calling_runtime() is stacks else real_wakeup(fd, **options)
 
     with ExitStack() as stack:
         stack.callback(_put_back, before)
@@ -132,8 +132,8 @@ def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
         yield
 
 
-def _own(handler: Any) -> Any:
-    return handler.handler if isinstance(handler, _Handler) else handler
+def _node_handler(handler: Any) -> Any:
+    return handler.handler if isinstance(handler, _SignalHandler) else handler
 
 
 def _end_timers(armed: set[int]) -> None:
@@ -157,7 +157,7 @@ _real: dict[str, Callable[..., Any]] = {}
 
 
 @contextmanager
-def own_process_ends(stacks: Stacks) -> Iterator[None]:
+def own_process_ends(stacks: Runtime) -> Iterator[None]:
     """Let nodes end their process, and not ours, within the ``with`` block."""
     targets: list[tuple[Any, Callable[..., Any]]] = [
         (os._exit, _exit),
@@ -179,39 +179,39 @@ def own_process_ends(stacks: Stacks) -> Iterator[None]:
 
 
 def _exit(status: int) -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None:
         _real["_exit"](status)
     else:
-        _leave(stacks, f"os._exit({status})", status & 0xFF)
+        _end_process(stacks, f"os._exit({status})", status & 0xFF)
 
 
 def _abort() -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None:
         _real["abort"]()
     else:
-        _leave(stacks, "os.abort()", 128 + signal.SIGABRT)
+        _end_process(stacks, "os.abort()", 128 + signal.SIGABRT)
 
 
 def _kill(pid: int, number: int, /) -> None:
     pid = meant_id(pid)
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None or pid != getpid() or not _signalled(stacks, number, "os.kill"):
         _real["kill"](pid, number)
 
 
 def _raise_signal(signalnum: int) -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None or not _signalled(stacks, signalnum, "signal.raise_signal"):
         _real["raise_signal"](signalnum)
 
 
-def _signalled(stacks: Stacks, number: int, call: str) -> bool:
+def _signalled(stacks: Runtime, number: int, call: str) -> bool:
     """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
     handler = stacks.programs.present.signal_handlers.get(number)
     if number in _DEADLY or handler == signal.SIG_DFL:
-        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+        _end_process(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     if handler is None:
         return _signalled_by_default(stacks, number, call)
     if callable(handler):
@@ -219,7 +219,7 @@ def _signalled(stacks: Stacks, number: int, call: str) -> bool:
     return True
 
 
-def _signalled_by_default(stacks: Stacks, number: int, call: str) -> bool:
+def _signalled_by_default(stacks: Runtime, number: int, call: str) -> bool:
     """Do what Python and rclpy do about a signal for which a main has set no handler."""
     program = stacks.programs.present
     if program is stacks.programs.host or number not in _ENDING:
@@ -231,7 +231,7 @@ def _signalled_by_default(stacks: Stacks, number: int, call: str) -> bool:
     elif number == signal.SIGTERM and any(context.ok() for context in program.contexts):
         shut_down(stacks, program)
     else:
-        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+        _end_process(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     return True
 
 
@@ -246,20 +246,20 @@ def _execve(path: Any, argv: Any, env: Any) -> None:
 
 
 def _refuse(call: str) -> None:
-    if _calling() is not None:
+    if _calling_node_runtime() is not None:
         raise UnsupportedError(
             f"{call} would put another program in the place of this process, in which all nodes of "
             "the run are: end the node instead (sys.exit), or start the program with subprocess"
         )
 
 
-def _calling() -> Stacks | None:
+def _calling_node_runtime() -> Runtime | None:
     """Return the world whose node calls, or None if the process is to do what it is told."""
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     return stacks if stacks is not None and stacks.event.handle is not None else None
 
 
-def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
+def _end_process(stacks: Runtime, call: str, status: int) -> NoReturn:
     """End the process of the calling code: the program, or the run."""
     handle = stacks.event.handle
     assert handle is not None
@@ -293,27 +293,27 @@ def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
 # Natively it would go on as a second copy of every node. Here the run is its parent's alone, and
 # so is the trace; what a child does within the callback that forked it is its own affair.
 
-_worlds: list[Stacks] = []
+_runtimes: list[Runtime] = []
 
 
 @contextmanager
-def forked_children_end(stacks: Stacks) -> Iterator[None]:
+def forked_children_end(stacks: Runtime) -> Iterator[None]:
     """Let what is forked within the ``with`` block end with the event that forked it."""
-    _worlds.append(stacks)
+    _runtimes.append(stacks)
     try:
         yield
     finally:
-        _worlds.remove(stacks)
+        _runtimes.remove(stacks)
 
 
 def _in_child() -> None:
-    for stacks in _worlds:
+    for stacks in _runtimes:
         if stacks.event.handle is not None and stacks.runners.thread == get_ident():
             stacks.dispatcher.record(None)
             stacks.event.on_end = lambda stacks=stacks: _end(stacks)
 
 
-def _end(stacks: Stacks) -> None:
+def _end(stacks: Runtime) -> None:
     who = stacks.event.handle.describe() if stacks.event.handle is not None else "a node"
     with suppress(Exception):
         sys.stdout.flush()

@@ -26,11 +26,11 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 _FAILURES_MAX = 16
 """A main may go on after each of a million exceptions; what ends it is one of the last."""
 
-Handler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
+ExitHandler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
 """What ``atexit.register`` was given."""
 
 
-class Context(Protocol):
+class ProgramContext(Protocol):
     """A context that a program has initialized."""
 
     def ok(self) -> bool:
@@ -40,7 +40,7 @@ class Context(Protocol):
         """Shut down from outside, as a signal does."""
 
 
-class Programs:
+class SimulatedPrograms:
     """The processes in the simulation. ``present`` is the one whose code runs, ``host`` that of the
     nodes which the job constructs, ``all`` are those with a main.
 
@@ -52,18 +52,18 @@ class Programs:
 
     def __init__(self) -> None:
         self.places = _places()
-        self.host = Program(self)
+        self.host = SimulatedProgram(self)
         self.present = self.host
-        self.all: list[Program] = []
+        self.all: list[SimulatedProgram] = []
         self.constructing: Entry | None = None
         self.importing = False
-        self.main_context: Context | None = None
+        self.main_context: ProgramContext | None = None
         self.fed = False
         self.to_come: list[str] = []
         self.listeners: list[Callable[[str, str], None]] = []
-        self.stdin_of: Callable[[Program], Any] = lambda program: sys.stdin
+        self.stdin_of: Callable[[SimulatedProgram], Any] = lambda program: sys.stdin
         """Returns the ``sys.stdin`` that a program begins with."""
-        self.on_enter: Callable[[Program], None] | None = None
+        self.on_enter: Callable[[SimulatedProgram], None] | None = None
         """Told which program's code is going to run, if somebody has to know."""
 
     def tell(self, what: str, key: str) -> None:
@@ -71,7 +71,7 @@ class Programs:
         for listener in self.listeners:
             listener(what, key)
 
-    def on_stack(self, stack: greenlet) -> Program | None:
+    def on_stack(self, stack: greenlet) -> SimulatedProgram | None:
         """Return the program whose main runs on a stack, if it is one's."""
         return next((program for program in self.all if program.stack is stack), None)
 
@@ -86,10 +86,10 @@ class Programs:
             self.host.enter()
 
 
-class Program:
+class SimulatedProgram:
     """A process in the simulation: one main, or the host of the nodes a job constructs."""
 
-    def __init__(self, programs: Programs, entry: Entry | None = None) -> None:
+    def __init__(self, programs: SimulatedPrograms, entry: Entry | None = None) -> None:
         self._programs = programs
         self.entry = entry
         self.name = "the run" if entry is None else entry.name
@@ -103,10 +103,10 @@ class Program:
         self.entity_id = 0
         self.begun_ns: int | None = None
         self.announced = True
-        self.contexts: list[Context] = []
+        self.contexts: list[ProgramContext] = []
         self.failures: deque[Raised] = deque(maxlen=_FAILURES_MAX)
         """What callbacks have raised out of a spin of this program, most recent last."""
-        self.exit_handlers: list[Handler] = []
+        self.exit_handlers: list[ExitHandler] = []
         self.signal_handlers: dict[int, object] = {}
         self.stack: greenlet | None = None
         self.spun = False
@@ -161,7 +161,6 @@ class Program:
     # -- its life --------------------------------------------------------------------------------
 
     def describe(self) -> str:
-        """Name the program for people."""
         return self.name
 
     def settle(self) -> bool:
@@ -169,7 +168,6 @@ class Program:
         return True
 
     def entity(self) -> Entity:
-        """Return the main as the trace describes it."""
         source = "" if self.entry is None else source_of(self.entry.make)
         detail: dict[str, object] = {"source": source} if source else {}
         return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, detail)

@@ -22,8 +22,8 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks.callback_groups import CallbackGroups
 from rsltrace.adapters.rclpy.stacks.coroutines import Coroutines
-from rsltrace.adapters.rclpy.stacks.mailbox import called_service
-from rsltrace.adapters.rclpy.stacks.program import Program, Programs
+from rsltrace.adapters.rclpy.stacks.mailbox import describe_service_call
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram, SimulatedPrograms
 from rsltrace.errors import EXIT_RUN
 from rsltrace.guard.callers import is_telling
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
@@ -42,14 +42,14 @@ class RunEnded(BaseException):
     """Raised in a blocked call when the run ends, so that ``finally`` blocks run."""
 
 
-class Runners:
+class LoopStacks:
     """The stacks of one run. ``waiting`` are those that wait to run the loop again, ``main`` is the
     one that began. What happens in another ``process`` or real ``thread`` is not simulated."""
 
     def __init__(
         self,
         domain: Domain,
-        programs: Programs,
+        programs: SimulatedPrograms,
         groups: CallbackGroups,
         run: Callable[[], None],
     ) -> None:
@@ -58,7 +58,7 @@ class Runners:
         self.groups = groups
         self.process = os.getpid()
         self.thread = get_ident()
-        self.blocked: dict[Wait, None] = {}
+        self.blocked: dict[BlockedCall, None] = {}
         self.main: greenlet | None = None
         self.waiting: list[greenlet] = []
         self.error: BaseException | None = None
@@ -105,11 +105,11 @@ class Runners:
         getcurrent().parent = self.waiting.pop()
 
 
-class Wait:
+class BlockedCall:
     """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
 
     def __init__(
-        self, runners: Runners, what: object, group: object, *, quiet: bool, patient: Patience
+        self, runners: LoopStacks, what: object, group: object, *, quiet: bool, patient: Patience
     ) -> None:
         domain, programs = runners.domain, runners.programs
         event = domain.event
@@ -235,7 +235,6 @@ class Wait:
         return Runnable("resume", "", self.entity_id, thread=thread)
 
     def describe(self) -> str:
-        """Name the callback that waits."""
         return self.event[0].describe() if self.event[0] is not None else "the run"
 
     def waits_for(self) -> str:
@@ -251,20 +250,20 @@ class Wait:
                 "subscription it waits for a callback group of its own"
             )
         graph = self._runners.domain.graph
-        what = called_service(graph, self.stack.gr_frame) or self.what
+        what = describe_service_call(graph, self.stack.gr_frame) or self.what
         return f"{self.describe()} waits for {what}{hint}{where}"
 
 
 # The call stacks of user code in one run: who blocks, who is suspended, whose process it is.
 
 
-class Thread(Protocol):
+class UserThread(Protocol):
     """A thread that user code has started."""
 
     ident: int
     daemon: bool
     ended: bool
-    program: Program
+    program: SimulatedProgram
     node: Any
     thread: Any
 
@@ -278,12 +277,12 @@ class Thread(Protocol):
         """Take note that it has ended."""
 
 
-class Threads:
+class UserThreads:
     """The threads of user code that have not ended, and the stacks they run on."""
 
     def __init__(self) -> None:
-        self.alive: dict[Thread, None] = {}
-        self.by_stack: dict[greenlet, Thread] = {}
+        self.alive: dict[UserThread, None] = {}
+        self.by_stack: dict[greenlet, UserThread] = {}
         self.count = 0
 
     def runs_on(self, stack: greenlet) -> bool:
@@ -292,7 +291,7 @@ class Threads:
 
 
 @dataclass(slots=True)
-class Ending:
+class RunEnding:
     """How far the end of a run is. ``closing``: mains are told to end, and do. ``unwinding``:
     nothing waits any more, blocked calls raise ``RunEnded``. ``stuck`` says who still waited when
     nothing could happen any more.
@@ -309,7 +308,7 @@ class Ending:
     refused: int = 0
 
 
-class Stacks:
+class Runtime:
     """What the stacks of user code have to do with: each value has one job, see its class.
 
     ``executor`` is the rclpy Executor of the nodes that the job constructs.
@@ -320,12 +319,12 @@ class Stacks:
         self.loop = domain.loop
         self.dispatcher = domain.dispatcher
         self.event = domain.event
-        self.ending = Ending()
+        self.ending = RunEnding()
         self.groups = CallbackGroups(domain)
-        self.programs = Programs()
-        self.threads = Threads()
+        self.programs = SimulatedPrograms()
+        self.threads = UserThreads()
         self.coroutines = Coroutines(domain)
-        self.runners = Runners(domain, self.programs, self.groups, self._take_over)
+        self.runners = LoopStacks(domain, self.programs, self.groups, self._take_over)
         self.executor: Any = None
         self.runs_callbacks: Any = None
         """What user code has put in place of rclpy's ``await_or_execute``, if it has."""

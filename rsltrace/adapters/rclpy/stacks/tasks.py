@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.trace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)
@@ -32,21 +32,21 @@ def is_coroutine_function(callback: object) -> bool:
     return known
 
 
-def is_awaited(stacks: Stacks, callback: object) -> bool:
+def is_awaited(stacks: Runtime, callback: object) -> bool:
     """Return whether a callback is run as a coroutine: it is one, or user code has its own way."""
     return stacks.runs_callbacks is not None or is_coroutine_function(callback)
 
 
-def executor_of(stacks: Stacks, handle: Any) -> Any:
+def executor_of(stacks: Runtime, handle: Any) -> Any:
     """Return the executor that runs a handle's node: the user's own, or the run's."""
     mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
-    if mailbox is not None and mailbox.pump is not None:
-        return mailbox.pump.executor
+    if mailbox is not None and mailbox.driver is not None:
+        return mailbox.driver.executor
     return stacks.executor
 
 
 def start_callback(
-    stacks: Stacks,
+    stacks: Runtime,
     handle: Any,
     kind: int,
     callback: Callable[..., Any],
@@ -60,7 +60,7 @@ def start_callback(
 
 
 def start_coroutine(
-    stacks: Stacks,
+    stacks: Runtime,
     handle: Any,
     kind: int,
     callback: Callable[..., Any],
@@ -94,7 +94,7 @@ def start_coroutine(
 
 
 def create_task(
-    stacks: Stacks,
+    stacks: Runtime,
     callback: Any,
     args: tuple[Any, ...],
     kwargs: dict[str, Any],

@@ -28,10 +28,10 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait
-from rsltrace.adapters.rclpy.stacks.entry_starts import Construction
-from rsltrace.adapters.rclpy.stacks.locks import LockOfPools, SimLock, SimRLock
-from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent
+from rsltrace.adapters.rclpy.stacks.locks import PoolLock, SimLock, SimRLock
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.libraries import present_import
@@ -58,7 +58,7 @@ class SimThread:
 
     def __init__(
         self,
-        stacks: Stacks,
+        stacks: Runtime,
         body: Callable[[], object],
         name: str,
         *,
@@ -79,8 +79,8 @@ class SimThread:
         self.entity_id = stacks.domain.entities.new_id()
         stacks.domain.entities.pending.append(self)
         self._body: Callable[[], object] | None = body
-        self._joining: list[Wait] = []
-        self._starting: Wait | None = None
+        self._joining: list[BlockedCall] = []
+        self._starting: BlockedCall | None = None
         self._cause = (
             stacks.loop.events,
             stacks.dispatcher.note(OutputKind.TASK, self.entity_id, 3),
@@ -105,7 +105,7 @@ class SimThread:
     # -- the loop's view -------------------------------------------------------------------------
 
     def _goes_on_later(self, task: object) -> bool:
-        return isinstance(task, Wait) and task.program is self.program
+        return isinstance(task, BlockedCall) and task.program is self.program
 
     def dispatch(self) -> None:
         """Run the thread until it ends or blocks for the first time, as one event."""
@@ -130,7 +130,7 @@ class SimThread:
             self.program.enter()
         cause_event, cause_output = self._cause
         stacks.dispatcher.execute(
-            Construction(self.describe, self.program.entry),
+            ConstructionEvent(self.describe, self.program.entry),
             self.entity_id,
             self.node,
             int(EventKind.TASK),
@@ -169,7 +169,7 @@ class SimThread:
         if stacks.event.handle is None or stacks.ending.unwinding or self.program.ended:
             return
 
-        def begun(blocked: Wait) -> None:
+        def begun(blocked: BlockedCall) -> None:
             self._starting = blocked
 
         wait(stacks, f"thread {self.name} to begin", until=begun, quiet=True)
@@ -192,7 +192,6 @@ class SimThread:
                 pool.shutdown(wait=False)
 
     def describe(self) -> str:
-        """Name the thread for people."""
         where = self.program.name if self.node is None else self.node.fully_qualified_name
         return f"{where}: thread {self.name}"
 
@@ -216,17 +215,14 @@ class SimThread:
         return any(blocked.is_patient() for blocked in own)
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(self.node, self.describe())
 
     # -- the trace -------------------------------------------------------------------------------
 
     def settle(self) -> bool:
-        """Return whether the owner is known."""
         return True
 
     def entity(self) -> Entity:
-        """Return the thread as the trace describes it."""
         node = self.node.entity_id if self.node is not None else 0
         now_ns = self.stacks.loop.now_ns
         source = source_of(
@@ -240,7 +236,7 @@ class SimThread:
 
 
 def _start(self: Any) -> None:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None or not getattr(self, "_initialized", False):
         _real["start"](self)
         return
@@ -279,7 +275,7 @@ def _start_late(timer: Any, frame: FrameType | None = None) -> None:
         begin()
 
 
-def _begin(stacks: Stacks, self: Any) -> None:
+def _begin(stacks: Runtime, self: Any) -> None:
     def body() -> None:
         try:
             self.run()
@@ -323,7 +319,7 @@ def _mark_stopped(thread: Any) -> None:
 def _join(self: Any, timeout: float | None = None) -> None:
     _start_late(self)
     thread: SimThread | None = self.__dict__.get("_rsltrace")
-    if thread is None or simulated_stacks() is not thread.stacks:
+    if thread is None or calling_runtime() is not thread.stacks:
         if thread is None:
             _real["join"](self, timeout)
         return
@@ -340,7 +336,7 @@ def _is_alive(self: Any) -> bool:
 
 
 def _get_ident() -> int:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is not None and stacks.threads.by_stack:
         thread = stacks.threads.by_stack.get(getcurrent())
         if thread is not None:
@@ -351,7 +347,7 @@ def _get_ident() -> int:
 def _start_new_thread(
     function: Callable[..., object], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> int:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None:
         return _real_start_new_thread(function, args, kwargs or {})
     name = getattr(function, "__qualname__", "function")
@@ -360,7 +356,7 @@ def _start_new_thread(
 
 
 @contextmanager
-def cooperative_threads(stacks: Stacks) -> Iterator[None]:
+def cooperative_threads(stacks: Runtime) -> Iterator[None]:
     """Make the threads that user code starts cooperative ones within the ``with`` block."""
 
     def now() -> float:
@@ -386,7 +382,7 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (
             futures_thread,
             "_global_shutdown_lock",
-            LockOfPools(futures_thread._global_shutdown_lock),
+            PoolLock(futures_thread._global_shutdown_lock),
         ),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
@@ -429,7 +425,7 @@ def _number(stack: ExitStack, cls: Any) -> None:
     real_init = cls.__init__
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
-        if simulated_stacks() is not None:
+        if calling_runtime() is not None:
             self._rsltrace_number = number()
         real_init(self, *args, **kwargs)
 

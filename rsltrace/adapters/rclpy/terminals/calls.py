@@ -13,9 +13,9 @@ from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import simulated_stacks, wait
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import exchange
@@ -38,42 +38,39 @@ class NoTerminal:
 
     @property
     def buffer(self) -> NoTerminal:
-        """The stream of bytes below."""
         return NoTerminal(self._real.buffer)
 
     def read(self, *arguments: Any) -> Any:
         """Read all, or so much."""
-        refuse("sys.stdin.read()")
+        refuse_reading("sys.stdin.read()")
         return self._real.read(*arguments)
 
     def readline(self, *arguments: Any) -> Any:
-        """Read a line."""
-        refuse("sys.stdin.readline()")
+        refuse_reading("sys.stdin.readline()")
         return self._real.readline(*arguments)
 
     def readlines(self, *arguments: Any) -> Any:
-        """Read all lines."""
-        refuse("sys.stdin.readlines()")
+        refuse_reading("sys.stdin.readlines()")
         return self._real.readlines(*arguments)
 
     def __iter__(self) -> Iterator[Any]:
-        refuse("for line in sys.stdin")
+        refuse_reading("for line in sys.stdin")
         return iter(self._real)
 
     def __next__(self) -> Any:
-        refuse("next(sys.stdin)")
+        refuse_reading("next(sys.stdin)")
         return next(self._real)
 
 
-def refuse(call: str) -> None:
+def refuse_reading(call: str) -> None:
     """Raise ``UnsupportedError`` if a node's code reads (and no debugger in it)."""
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None or stacks.event.handle is None or _is_debugged(sys._getframe(2)):
         return
     _fail(stacks, call)
 
 
-def _fail(stacks: Stacks, call: str) -> NoReturn:
+def _fail(stacks: Runtime, call: str) -> NoReturn:
     program = stacks.programs.present
     if program.entry is None:
         raise UnsupportedError(
@@ -101,16 +98,16 @@ _NS_PER_MS = 1_000_000
 _FOR_EVER = -1
 _NO_KEY = -1
 
-Asking = Callable[[], "Terminal | None"]
+TerminalOfCaller = Callable[[], "Terminal | None"]
 """Returns the terminal of the main whose code runs."""
 
 
-Showing = Callable[[Terminal, bool], None]
+ShowTerminal = Callable[[Terminal, bool], None]
 """Makes a terminal the main's standard output, or no longer."""
 
 
 @contextmanager
-def simulated_curses(asking: Asking, show: Showing) -> Iterator[None]:
+def simulated_curses(asking: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
     """Let windows of curses wait in simulated time within the ``with`` block."""
     try:
         import _curses
@@ -135,11 +132,13 @@ def simulated_curses(asking: Asking, show: Showing) -> Iterator[None]:
         yield
 
 
-def _beginning(asking: Asking, show: Showing, real: Callable[..., Any]) -> Callable[..., Any]:
+def _beginning(
+    asking: TerminalOfCaller, show: ShowTerminal, real: Callable[..., Any]
+) -> Callable[..., Any]:
     def begin(*arguments: Any, **options: Any) -> Any:
         terminal = asking()
         if terminal is None:
-            refuse(f"curses.{real.__name__}()")
+            refuse_reading(f"curses.{real.__name__}()")
         else:
             show(terminal, True)
         return real(*arguments, **options)
@@ -147,7 +146,9 @@ def _beginning(asking: Asking, show: Showing, real: Callable[..., Any]) -> Calla
     return begin
 
 
-def _ending(asking: Asking, show: Showing, real: Callable[[], Any]) -> Callable[[], Any]:
+def _ending(
+    asking: TerminalOfCaller, show: ShowTerminal, real: Callable[[], Any]
+) -> Callable[[], Any]:
     def end() -> Any:
         try:
             return real()
@@ -160,7 +161,7 @@ def _ending(asking: Asking, show: Showing, real: Callable[[], Any]) -> Callable[
     return end
 
 
-def _drained(asking: Asking, real: Any) -> Any:
+def _drained(asking: TerminalOfCaller, real: Any) -> Any:
     """Let something be shown, which is for nobody to see."""
 
     def shown(*arguments: Any) -> Any:
@@ -173,14 +174,14 @@ def _drained(asking: Asking, real: Any) -> Any:
 
 
 def _reading(
-    asking: Asking, limits_ms: dict[int, int], all_ms: list[int], limit: Any, real: Any
+    asking: TerminalOfCaller, limits_ms: dict[int, int], all_ms: list[int], limit: Any, real: Any
 ) -> Any:
     name = real.__name__
 
     def read(self: Any, *arguments: Any) -> Any:
         terminal = asking()
         if terminal is None:
-            refuse(f"curses: {name}()")
+            refuse_reading(f"curses: {name}()")
             return real(self, *arguments)
         terminal.drain()
         limit_ms = limits_ms.get(id(self), all_ms[0])
@@ -241,12 +242,12 @@ class Terminals:
     """The terminals of a run's mains. While a main runs, its terminal is descriptor 0 (and 1, for
     curses)."""
 
-    def __init__(self, stacks: Stacks) -> None:
+    def __init__(self, stacks: Runtime) -> None:
         self._stacks = stacks
         self._stdin = sys.stdin
         self._real: dict[int, int] = {}
         self._at: dict[int, Terminal | None] = {}
-        self._all: dict[Program, Terminal] = {}
+        self._all: dict[SimulatedProgram, Terminal] = {}
         stacks.programs.stdin_of = self.stdin_of
 
     @property
@@ -254,7 +255,7 @@ class Terminals:
         """The terminal of the main that runs, if it has one."""
         return self._all.get(self._stacks.programs.present)
 
-    def make(self, programs: Sequence[Program], start_ns: int) -> None:
+    def make(self, programs: Sequence[SimulatedProgram], start_ns: int) -> None:
         """Give mains their terminals; the times of what is typed count from ``start_ns``."""
         for program in programs:
             assert program.entry is not None
@@ -262,12 +263,12 @@ class Terminals:
                 self._all[program] = Terminal(self._stacks, program.entry.stdin, start_ns)
                 self._stacks.programs.on_enter = self._enter
 
-    def hand_over(self, program: Program, successor: Program) -> None:
+    def hand_over(self, program: SimulatedProgram, successor: SimulatedProgram) -> None:
         """Let a main that is started again have the terminal of the one before."""
         if program in self._all:
             self._all[successor] = self._all[program]
 
-    def stdin_of(self, program: Program) -> Any:
+    def stdin_of(self, program: SimulatedProgram) -> Any:
         """Return the ``sys.stdin`` of a main."""
         terminal = self._all.get(program)
         return NoTerminal(self._stdin) if terminal is None else terminal.stream
@@ -277,7 +278,7 @@ class Terminals:
         terminal.has_screen = has_screen
         self._enter(self._stacks.programs.present)
 
-    def _enter(self, program: Program) -> None:
+    def _enter(self, program: SimulatedProgram) -> None:
         terminal = self._all.get(program)
         self._put(0, terminal)
         self._put(1, terminal if terminal is not None and terminal.has_screen else None)
@@ -310,7 +311,7 @@ class Terminals:
 
 
 @contextmanager
-def simulated_terminals(stacks: Stacks) -> Iterator[Terminals]:
+def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
     """Let mains read from terminals of their own, and nobody from that of rsltrace."""
     terminals = Terminals(stacks)
     real_stdin = sys.stdin
@@ -321,23 +322,25 @@ def simulated_terminals(stacks: Stacks) -> Iterator[Terminals]:
         redirect(stack, builtins.input, _inputs)
         redirect(stack, os.read, lambda real: _reads(terminals, real))
         redirect(stack, select.select, lambda real: _selects(terminals, real))
-        stack.enter_context(simulated_curses(lambda: _asking(terminals), terminals.show))
+        stack.enter_context(
+            simulated_curses(lambda: _terminal_of_caller(terminals), terminals.show)
+        )
         yield terminals
 
 
-def _asking(terminals: Terminals) -> Terminal | None:
+def _terminal_of_caller(terminals: Terminals) -> Terminal | None:
     """Return the terminal of whoever asks, if it is a main's code that does."""
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     return None if stacks is None or stacks.event.handle is None else terminals.present
 
 
 def _inputs(real: Callable[..., str]) -> Callable[..., str]:
     def input_(prompt: object = "", /) -> str:
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is None or stacks.event.handle is None:
             return real(prompt)
         if isinstance(sys.stdin, NoTerminal):
-            refuse("input()")
+            refuse_reading("input()")
             return real(prompt)
         shown_on = sys.stdout  # the node's own words, as all that it prints
         shown_on.write(str(prompt))
@@ -353,10 +356,10 @@ def _inputs(real: Callable[..., str]) -> Callable[..., str]:
 def _reads(terminals: Terminals, real: Callable[[int, int], bytes]) -> Callable[..., bytes]:
     def read(fd: int, size: int, /) -> bytes:
         if fd == 0:
-            terminal = _asking(terminals)
+            terminal = _terminal_of_caller(terminals)
             if terminal is not None:
                 return terminal.read(size)
-            refuse("os.read(0)")
+            refuse_reading("os.read(0)")
         return real(fd, size)
 
     return read
@@ -366,7 +369,7 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
     def ready(
         reads: Any, writes: Any, others: Any, timeout: float | None = None, /
     ) -> tuple[list[Any], list[Any], list[Any]]:
-        terminal = _asking(terminals)
+        terminal = _terminal_of_caller(terminals)
         waited_for = list(reads) if terminal is not None else []
         if terminal is None or not any(_is_stdin(one) for one in waited_for):
             return real(reads, writes, others, timeout)  # type: ignore[no-any-return]

@@ -20,7 +20,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Typed
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runtime import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.redirect import copy_of
 
 _END = b"\x04"
@@ -40,7 +40,7 @@ class Terminal:
     """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. While ``has_screen``,
     what the main prints goes there, too (curses)."""
 
-    def __init__(self, stacks: Stacks, typed: Sequence[Typed], start_ns: int) -> None:
+    def __init__(self, stacks: Runtime, typed: Sequence[Typed], start_ns: int) -> None:
         self._stacks = stacks
         self._typed = deque(typed)
         self._start_ns = start_ns
@@ -48,7 +48,7 @@ class Terminal:
         os.set_blocking(self._keyboard, False)
         fcntl.ioctl(self.fd, termios.TIOCSWINSZ, struct.pack("HHHH", *_SIZE, 0, 0))
         self.has_screen = False
-        self._waiting: list[Wait] = []
+        self._waiting: list[BlockedCall] = []
         self._at_end = False
         self._looked_ns = -1
         self.stream = io.TextIOWrapper(io.BufferedReader(_Input(self)), encoding="utf-8")
@@ -166,15 +166,12 @@ class _Input(io.RawIOBase):
         self._terminal = terminal
 
     def fileno(self) -> int:
-        """Return the number of standard input."""
         return 0
 
     def isatty(self) -> bool:
-        """Return that it is a terminal."""
         return True
 
     def readable(self) -> bool:
-        """Return that one can read from it."""
         return True
 
     def readinto(self, buffer: Any, /) -> int | None:

@@ -43,10 +43,10 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     START,
     Array,
     FieldType,
+    FixedValue,
     Item,
+    KnownOffset,
     Message,
-    Part,
-    Place,
     Primitive,
     Sequence,
     Text,
@@ -56,7 +56,7 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     lay_out,
     steady,
 )
-from rsltrace.adapters.rclpy.wire.source_text import Source, packer
+from rsltrace.adapters.rclpy.wire.source_text import FunctionSource, packer
 
 _LARGE = 4096
 """Sequences of more bytes than this are copied once, by way of a memoryview."""
@@ -89,7 +89,7 @@ class _Reader:
 
     def __init__(self, spec: Message) -> None:
         self.spec = spec
-        self.source = Source(
+        self.source = FunctionSource(
             {
                 "unpack_wide": unpack_wide,
                 "large": _large_array,
@@ -122,13 +122,13 @@ class _Reader:
 
     def message(self, spec: Message) -> _Tree:
         if not spec.fields:
-            self.run.append(Part("x", 1, 1))
+            self.run.append(FixedValue("x", 1, 1))
         return _Tree(spec, [self.value(field.type) for field in spec.fields])
 
     def value(self, type_: FieldType) -> str | _Tree:
         if isinstance(type_, Primitive):
             conversion = "{0} = {0}.decode('ascii')" if type_.name == "char" else ""
-            return self.put(Part(type_.code, type_.size, type_.size), conversion)
+            return self.put(FixedValue(type_.code, type_.size, type_.size), conversion)
         if isinstance(type_, Text):
             return self.text(type_)
         if isinstance(type_, Message):
@@ -138,7 +138,7 @@ class _Reader:
         return self.sequence(type_)
 
     def text(self, type_: Text) -> str:
-        number = self.put(Part("I", 4, 4))
+        number = self.put(FixedValue("I", 4, 4))
         self.flush()
         value, end = self.source.variable("v"), self.source.variable("e")
         here = self.offset()
@@ -161,11 +161,13 @@ class _Reader:
             return self.loop(item, str(length), steady(item, self.place))
         size = item.size * length
         if not item.typecode:
-            return self.put(Part(f"{size}s", size, 1), "{0} = " + _LISTS[item.name].format("{0}"))
+            return self.put(
+                FixedValue(f"{size}s", size, 1), "{0} = " + _LISTS[item.name].format("{0}")
+            )
         fill = self.source.constant(packer(f"{size}s").pack_into)
         data = self.source.variable("b")
         value = self.source.variable("v")
-        self.run.append(Part(f"{size}s", size, item.size))
+        self.run.append(FixedValue(f"{size}s", size, item.size))
         dtype = self.source.constant(item.dtype)
         # Twice as quick as frombuffer and copy, for the few numbers that arrays mostly hold.
         lines = (f"{value} = empty({length}, {dtype})", f"{fill}({value}, 0, {data})")
@@ -174,7 +176,7 @@ class _Reader:
 
     def sequence(self, type_: Sequence) -> str:
         item = type_.item
-        number = self.put(Part("I", 4, 4))
+        number = self.put(FixedValue("I", 4, 4))
         self.flush()
         if isinstance(item, Primitive):
             place = after_items(item, self.place)
@@ -226,7 +228,7 @@ class _Reader:
         self.source.line(f"{end} = {start} + {size}")
         self.source.line(f"if {end} > end: raise Unusual")
 
-    def loop(self, item: Item, number: str, place: Place) -> str:
+    def loop(self, item: Item, number: str, place: KnownOffset) -> str:
         """Read items of any size one by one; ``place`` holds at the start of every turn."""
         values, add = self.new_list()
         self.settle(place)
@@ -258,7 +260,7 @@ class _Reader:
 
     # -- bytes --------------------------------------------------------------------------------
 
-    def put(self, part: Part, conversion: str = "") -> str:
+    def put(self, part: FixedValue, conversion: str = "") -> str:
         name = self.source.variable("v")
         self.run.append(part)
         lines = (conversion.format(name),) if conversion else ()
@@ -276,11 +278,11 @@ class _Reader:
             return f"{self.offset()} + {size - 1} & -{size}"
         return f"({self.offset()} + 3 & -8) + 4"
 
-    def jump(self, base: str, place: Place) -> None:
+    def jump(self, base: str, place: KnownOffset) -> None:
         """Go on at the offset that the variable ``base`` holds."""
         self.base, self.ahead, self.place = base, 0, place
 
-    def settle(self, place: Place) -> None:
+    def settle(self, place: KnownOffset) -> None:
         """Put the offset into ``p`` and forget all else but ``place``, at the edges of a loop."""
         assert self.place.joined(place) == place, "a loop's invariant does not hold"
         if self.offset() != "p":

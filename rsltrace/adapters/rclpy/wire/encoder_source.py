@@ -40,10 +40,10 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     START,
     Array,
     FieldType,
+    FixedValue,
     Item,
+    KnownOffset,
     Message,
-    Part,
-    Place,
     Primitive,
     Sequence,
     Text,
@@ -51,7 +51,7 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     lay_out,
     steady,
 )
-from rsltrace.adapters.rclpy.wire.source_text import Source, packer
+from rsltrace.adapters.rclpy.wire.source_text import FunctionSource, packer
 
 _ONLY_BOOL = frozenset({bool})
 
@@ -67,7 +67,7 @@ class _Writer:
 
     def __init__(self, spec: Message) -> None:
         self.spec = spec
-        self.source = Source(
+        self.source = FunctionSource(
             {
                 "encode": str.encode,
                 "pack_wide": pack_wide,
@@ -78,7 +78,7 @@ class _Writer:
         )
         self.place = START
         self.ahead = 0
-        self.run: list[Part] = []
+        self.run: list[FixedValue] = []
         self.arguments: list[str] = []
         self.checks: list[str] = []
         self.parts: list[str] = []
@@ -107,7 +107,7 @@ class _Writer:
 
     def message(self, spec: Message, name: str) -> None:
         if not spec.fields:
-            self.put(Part("x", 1, 1))
+            self.put(FixedValue("x", 1, 1))
         for field in spec.fields:
             value = self.source.variable("v")
             self.source.line(f"{value} = {name}.{field.slot}")
@@ -133,24 +133,24 @@ class _Writer:
             self.checks.append(f"type({value}) is bool")
         elif type_.name != "octet":  # struct itself insists on bytes of length 1
             self.checks.append(f"isinstance({value}, {'float' if type_.code in 'fd' else 'int'})")
-        self.put(Part(type_.code, type_.size, type_.size), value)
+        self.put(FixedValue(type_.code, type_.size, type_.size), value)
 
     def text(self, type_: Text, value: str) -> None:
         data = self.source.variable("b")
         if type_.wide:
             self.source.line(f"{data} = pack_wide({value})")
-            self.put(Part("I", 4, 4), f"len({data}) // 4")
+            self.put(FixedValue("I", 4, 4), f"len({data}) // 4")
             self.flush()
             self.emit(data)
             self.move(f"len({data})", 4)
             return
         self.source.line(f"{data} = encode({value})")
         self.checks.append(f"0 not in {data}")
-        self.put(Part("I", 4, 4), f"len({data}) + 1")
+        self.put(FixedValue("I", 4, 4), f"len({data}) + 1")
         self.flush()
         self.emit(data)
         self.move(f"len({data})", 1)
-        self.put(Part("x", 1, 1))  # the NUL; it joins what follows
+        self.put(FixedValue("x", 1, 1))  # the NUL; it joins what follows
 
     def array(self, type_: Array, value: str) -> None:
         item, length = type_.item, type_.length
@@ -162,12 +162,12 @@ class _Writer:
                 f"len({value}) == {length}",
             ]
             size = item.size * length
-            self.put(Part(f"{size}s", size, item.size), f"{value}.tobytes()")
+            self.put(FixedValue(f"{size}s", size, item.size), f"{value}.tobytes()")
             return
         self.need_list(value)
         self.source.line(f"if len({value}) != {length}: raise Unusual")
         if isinstance(item, Primitive):
-            self.put(Part(f"{length}s", length, 1), self.flags(item, value))
+            self.put(FixedValue(f"{length}s", length, 1), self.flags(item, value))
         else:
             self.flush()
             self.loop(item, value, steady(item, self.place))
@@ -186,7 +186,7 @@ class _Writer:
             self.need_list(value)
         if type_.bound is not None:
             self.checks.append(f"len({value}) <= {type_.bound}")
-        self.put(Part("I", 4, 4), f"len({value})")
+        self.put(FixedValue("I", 4, 4), f"len({value})")
         self.flush()
         if isinstance(item, Primitive) and item.size < 8:
             self.emit(value if numbers else self.flags(item, value), bulk=True)
@@ -225,7 +225,7 @@ class _Writer:
         self.ahead = 0
         self.place = place.joined(START)
 
-    def loop(self, item: Item, sequence: str, place: Place) -> None:
+    def loop(self, item: Item, sequence: str, place: KnownOffset) -> None:
         """Write a loop over items, at whose every turn ``place`` holds."""
         if not self.begun:
             self.emit(repr(HEADER))
@@ -259,7 +259,7 @@ class _Writer:
 
     # -- bytes --------------------------------------------------------------------------------
 
-    def put(self, part: Part, argument: str | None = None) -> None:
+    def put(self, part: FixedValue, argument: str | None = None) -> None:
         self.run.append(part)
         if argument is not None:
             self.arguments.append(argument)
@@ -333,7 +333,7 @@ class _Writer:
             self.source.shift(f"p += {self.ahead % 8}{f' + {size}' if size else ''}")
         self.ahead = 0
 
-    def settle(self, place: Place) -> None:
+    def settle(self, place: KnownOffset) -> None:
         """Forget all about the position but ``place``, at the edges of a loop."""
         assert self.place.joined(place) == place, "a loop's invariant does not hold"
         if place.modulus < 8:

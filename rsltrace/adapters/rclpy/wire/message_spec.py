@@ -68,7 +68,7 @@ class Sequence:
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class FieldSpec:
     """A field of a message; ``slot`` is the attribute behind its property."""
 
     name: str
@@ -87,7 +87,7 @@ class Message:
     type_name: str
     python_name: str
     cls: type
-    fields: tuple[Field, ...]
+    fields: tuple[FieldSpec, ...]
     check_fields: bool | None
 
 
@@ -130,7 +130,7 @@ def message_spec(cls: type) -> Message:
     fields = []
     for field_name, slot_type in zip(names, slot_types, strict=True):
         try:
-            fields.append(Field(field_name, f"_{field_name}", _field_type(slot_type)))
+            fields.append(FieldSpec(field_name, f"_{field_name}", _field_type(slot_type)))
         except TypeError as error:
             raise TypeError(f"{name}: field {field_name!r}: {error}") from None
     return Message(
@@ -181,42 +181,42 @@ def _item(slot_type: Any) -> Item:
 # of it is known (a multiple of 4, say) to lay the rest out beforehand.
 
 
-class Place(NamedTuple):
+class KnownOffset(NamedTuple):
     """All that is known about a position: it is ``rest`` modulo ``modulus`` (1, 2, 4 or 8)."""
 
     modulus: int
     rest: int
 
-    def moved(self, size: int) -> Place:
+    def moved(self, size: int) -> KnownOffset:
         """The place ``size`` bytes further on."""
-        return Place(self.modulus, (self.rest + size) % self.modulus)
+        return KnownOffset(self.modulus, (self.rest + size) % self.modulus)
 
-    def moved_by_multiple(self, unit: int) -> Place:
+    def moved_by_multiple(self, unit: int) -> KnownOffset:
         """The place some multiple of ``unit`` bytes further on."""
         return self.reduced(min(self.modulus, unit))
 
-    def aligned(self, size: int) -> Place:
+    def aligned(self, size: int) -> KnownOffset:
         """The place after padding to a multiple of ``size`` bytes."""
         if self.modulus < size:
-            return Place(size, 0)
+            return KnownOffset(size, 0)
         return self.moved(-self.rest % size)
 
-    def reduced(self, modulus: int) -> Place:
+    def reduced(self, modulus: int) -> KnownOffset:
         """The same place, knowing less."""
-        return Place(modulus, self.rest % modulus)
+        return KnownOffset(modulus, self.rest % modulus)
 
-    def joined(self, other: Place) -> Place:
+    def joined(self, other: KnownOffset) -> KnownOffset:
         """What is known when it is either of two places."""
         modulus = min(self.modulus, other.modulus)
         while (self.rest - other.rest) % modulus:
             modulus //= 2
-        return Place(modulus, self.rest % modulus)
+        return KnownOffset(modulus, self.rest % modulus)
 
 
-START = Place(8, 0)
+START = KnownOffset(8, 0)
 
 
-class Part(NamedTuple):
+class FixedValue(NamedTuple):
     """One item of a run of fixed-size values: its `struct` letters, bytes and alignment."""
 
     code: str
@@ -224,7 +224,7 @@ class Part(NamedTuple):
     alignment: int
 
 
-def lay_out(parts: list[Part], rest: int) -> tuple[str, int]:
+def lay_out(parts: list[FixedValue], rest: int) -> tuple[str, int]:
     """Return (`struct` format without byte order, bytes) of a run at ``rest`` modulo 8."""
     codes, position = [], rest
     for part in parts:
@@ -236,23 +236,23 @@ def lay_out(parts: list[Part], rest: int) -> tuple[str, int]:
     return "".join(codes), position - rest
 
 
-HEADER_PART = Part("I", 4, 1)
+HEADER_PART = FixedValue("I", 4, 1)
 HEADER_PLACE = START.moved(-4)
 """The encapsulation header as the first part of a run that begins with it."""
 
 
-def fixed_parts(type_: FieldType) -> list[Part] | None:
+def fixed_parts(type_: FieldType) -> list[FixedValue] | None:
     """Return a value as one run; None if its size varies or it holds an array of messages."""
     if isinstance(type_, Primitive):
-        return [Part(type_.code, type_.size, type_.size)]
+        return [FixedValue(type_.code, type_.size, type_.size)]
     if isinstance(type_, Array) and isinstance(type_.item, Primitive):
         size = type_.item.size * type_.length
-        return [Part(f"{size}s", size, type_.item.size)]
+        return [FixedValue(f"{size}s", size, type_.item.size)]
     if not isinstance(type_, Message):
         return None
     if not type_.fields:
-        return [Part("x", 1, 1)]
-    parts: list[Part] = []
+        return [FixedValue("x", 1, 1)]
+    parts: list[FixedValue] = []
     for field in type_.fields:
         inner = fixed_parts(field.type)
         if inner is None:
@@ -267,7 +267,7 @@ def fixed_size(spec: Message) -> int | None:
     return None if parts is None else lay_out([HEADER_PART, *parts], HEADER_PLACE.rest)[1]
 
 
-def after(type_: FieldType, place: Place) -> Place:
+def after(type_: FieldType, place: KnownOffset) -> KnownOffset:
     """Return where a value of this type ends that begins at ``place``."""
     if isinstance(type_, Primitive):
         return place.aligned(type_.size).moved(type_.size)
@@ -287,14 +287,14 @@ def after(type_: FieldType, place: Place) -> Place:
     return after_items(type_.item, place.aligned(4).moved(4))
 
 
-def after_items(item: FieldType, place: Place) -> Place:
+def after_items(item: FieldType, place: KnownOffset) -> KnownOffset:
     """Return where any number of items end that begin at ``place``; none need no alignment."""
     if isinstance(item, Primitive):
         return place.joined(place.aligned(item.size).moved_by_multiple(item.size))
     return steady(item, place)
 
 
-def steady(item: FieldType, place: Place) -> Place:
+def steady(item: FieldType, place: KnownOffset) -> KnownOffset:
     """Return what is known at the start of every turn of a loop over items that begins here."""
     while True:
         joined = place.joined(after(item, place))

@@ -37,7 +37,7 @@ class _Block:
     body: list[_Line | _Block] = field(default_factory=list)
 
 
-class Source:
+class FunctionSource:
     """The body of one function."""
 
     def __init__(self, constants: dict[str, Any]) -> None:

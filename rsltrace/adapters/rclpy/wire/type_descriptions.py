@@ -209,7 +209,7 @@ def _text(string: Any) -> str:
     return string_at(string.data, string.size).decode() if string.data else ""
 
 
-def answer(request: Any, response_type: Any, interfaces: Iterable[Any]) -> Any:
+def answer_request(request: Any, response_type: Any, interfaces: Iterable[Any]) -> Any:
     """Answer a GetTypeDescription request from the interfaces that a node uses, as rcl does."""
     from type_description_interfaces.msg import TypeSource
 
