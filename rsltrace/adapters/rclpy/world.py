@@ -323,7 +323,7 @@ class World:
 
 def _deadlock(waits: list[str]) -> str:
     lines = "\n".join(f"  {text}" for text in waits[:20])
-    return f"nothing can happen any more, but somebody waits:\n{lines}"
+    return f"deadlock: nothing can happen any more, and these calls still wait:\n{lines}"
 
 
 @contextmanager

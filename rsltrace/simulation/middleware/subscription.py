@@ -17,10 +17,13 @@ from rsltrace.trace.model.event import EventKind
 
 SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
 
-# A message on its way, as the loop's releases are: reception stamp (ns), order and place in the
-# loop's queue, who is called; then canonical CDR, index of the publishing event, which of its
-# outputs, content hash, publication stamp (ns), publication number.
 Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
+"""A message on its way. It is a plain tuple like the loop's releases, because one is made for each
+message and subscription, and the loop sorts them. Its positions have names; hot paths unpack it."""
+RECEIVED_NS, ORDER, PLACE, ARRIVE, DATA, EVENT, OUTPUT, DIGEST, SENT_NS, NUMBER = range(10)
+"""Reception stamp; order and place in the loop's queue, and the function that it calls; canonical
+CDR; index of the publishing event, which of its outputs, content hash; publication stamp and
+number."""
 
 
 class Subscription(Receiver):
@@ -31,7 +34,7 @@ class Subscription(Receiver):
     """
 
     kind = EntityKind.SUBSCRIPTION
-    origin = slice(5, 8)
+    origin = slice(EVENT, SENT_NS)
 
     def __init__(
         self,
@@ -66,7 +69,7 @@ class Subscription(Receiver):
         if not self.may_run():
             return
         assert self.callback is not None
-        data, *cause = self.queue.popleft()[4:8]
+        _, _, _, _, data, *cause, _, _ = self.queue.popleft()
         self.dispatcher.execute(
             self, self.entity_id, self.node, SUBSCRIPTION, self.callback, (data,), *cause
         )

@@ -45,8 +45,8 @@ class LogSink(Protocol):
 
 
 _GROUPS: weakref.WeakKeyDictionary[NodeHandle, list[weakref.ref[Any]]] = weakref.WeakKeyDictionary()
-"""The callback groups of nodes besides the default one, in the order of their use. Not an attribute:
-objects of a class share the names of at most thirty attributes."""
+"""The callback groups of nodes besides the default one, in the order of their use. Not an
+attribute: objects of a class share the names of at most thirty."""
 
 
 class NodeHandle(Destroyable, Participant):

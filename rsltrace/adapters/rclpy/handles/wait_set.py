@@ -192,7 +192,7 @@ _WATCH: dict[str, Callable[[Any, Alarm], Any]] = {
 
 
 # Waitables of user code (``node.add_waitable``) add their entities to a wait set once, and are
-# ready whenever one of these is. rclpy's own waitables (actions, QoS events) have their own handles.
+# ready whenever one of these is. rclpy's own (actions, QoS events) have handles instead.
 
 OWN_WAITABLES = ("_EventHandler__event", "_handle", "_client_handle")
 """Attributes by which rclpy's own waitables hold their handles."""

@@ -1,7 +1,7 @@
-"""Calls that block become simulated waiting: time passes, other callbacks run, then they return.
+"""Blocking calls wait in simulated time: other callbacks run, then the call returns.
 
-In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RESUME`` event. How the
-stacks take turns is in ``runners.py``.
+In the trace a wait ends the event (flag ``SUSPENDED``); the rest is a ``RESUME`` event.
+``runtime.py`` switches the stacks. ``time.sleep`` and what rclpy waits with are replaced here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import uuid
 from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -27,22 +27,22 @@ from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Patience, RunEnd
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
-from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.redirect import Redirected, copy_of, replace_attribute
 from rsltrace.simulation.middleware.events.event import Event
 from rsltrace.trace.model.event import EventFlag, EventKind
 from rsltrace.trace.model.texts import patience_ns
 
 POLL_NS = 1_000_000
-"""What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
+"""The time that a second poll at one instant takes (a loop of ``spin_once(timeout_sec=0)``)."""
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
 _PATIENCE = 100
-"""How often a stack may go on to wait after the end of the run before it is left where it is."""
+"""How often a stack may wait after the end of the run before it is abandoned."""
 
-# Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
-# be collected: that would raise in them once more.
+# Stacks that ignore every exception (`while True: try: ... except: pass`). They must not be
+# collected, as that would raise in them once more.
 _abandoned: list[greenlet] = []
 
 
@@ -56,12 +56,12 @@ def wait(
     patient: Patience = False,
     serve: Callable[..., bool] | None = None,
 ) -> bool:
-    """Block the present callback in simulated time; return whether it was woken (not timed out).
+    """Block the current callback in simulated time; return whether it was woken (not timed out).
 
-    ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
-    wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
-    something comes of it. A ``patient`` one may last for ever. ``serve`` runs on this stack what is
-    given to it meanwhile, and returns whether the wait is over by that.
+    ``until`` gets the BlockedCall and has its ``wake`` called later. ``what`` completes the text
+    "… waits for". A ``quiet`` wait has a RESUME event only if that has outputs. A ``patient`` one
+    may last for ever. ``serve`` runs a callback on this stack meanwhile, and returns whether the
+    wait is over.
 
     :raises RunEnded: when the run ends before the wait does.
     :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
@@ -100,25 +100,25 @@ def wait(
 
 
 def _check_may_wait(stacks: Runtime, what: object) -> None:
-    """Refuse where there is no stack that can be set aside, and when the run is over."""
+    """Raise an error where no stack can wait, and when the run is over."""
     if get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         place = "thread" if getpid() == stacks.runners.process else "process"
         raise UnsupportedError(
             f"a {place} that a node has started waits for {what}, which takes simulated time: only "
-            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
-            f"there, or let a callback wait and hand the result to the {place}"
+            "callbacks, constructors and tasks can wait; use call_async with add_done_callback, "
+            f"or let a callback wait and pass the result to the {place}"
         )
     if stacks.ending.unwinding or stacks.programs.present.ended:
         _refuse(stacks)
     if stacks.event.handle is None:
         raise UnsupportedError(
-            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
-            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
+            f"code outside of all callbacks cannot wait for {what}: a stop function only reads; "
+            "with a Simulation, use sim.call(…), or run the simulation until then"
         )
 
 
 def _end_event_part(stacks: Runtime) -> None:
-    """Record the event under way as one that will go on, unless it is quiet and said nothing."""
+    """Record the current event as SUSPENDED, unless it is quiet and has no outputs."""
     event = stacks.event
     if event.quiet and not stacks.dispatcher.has_outputs():
         event.quiet = False
@@ -130,7 +130,7 @@ def _end_event_part(stacks: Runtime) -> None:
 
 @contextmanager
 def suspended_event(stacks: Runtime) -> Iterator[None]:
-    """Let other events run on this stack, between two parts of the event under way."""
+    """Let other events run on this stack between two parts of the current event."""
     event, programs, dispatcher = stacks.event, stacks.programs, stacks.dispatcher
     whose = event.handle, event.entity, event.node
     constructing, on_end = programs.constructing, event.on_end
@@ -151,18 +151,17 @@ def suspended_event(stacks: Runtime) -> Iterator[None]:
 
 
 def _refuse(stacks: Runtime) -> NoReturn:
-    """Do not wait any more, the run is over."""
     count_refused_wait(stacks)
     raise RunEnded
 
 
 def abandon(stack: greenlet) -> None:
-    """Leave a stack where it is, for ever: nothing is raised in it, nothing in it is collected."""
+    """Keep a stack for ever: nothing is raised in it, and nothing in it is collected."""
     _abandoned.append(stack)
 
 
 def count_refused_wait(stacks: Runtime) -> None:
-    """Count that somebody goes on although the run is over; in the end, leave it where it is."""
+    """Count the waits of a stack that goes on although the run is over; abandon it in the end."""
     stacks.ending.refused += 1
     if stacks.ending.refused > _PATIENCE and getcurrent() is not stacks.runners.main:
         stacks.ending.refused = 0
@@ -174,7 +173,7 @@ def count_refused_wait(stacks: Runtime) -> None:
 
 
 def _hold_group(stacks: Runtime) -> object:
-    """Keep the callback's group busy while it is blocked, as an executor would; return it."""
+    """Keep the group of a blocked callback busy, as an executor does; return it."""
     event = stacks.event
     wrapper: Any = getattr(event.handle, "wrapper", None)
     group = getattr(wrapper, "callback_group", None)
@@ -190,7 +189,7 @@ def _hold_group(stacks: Runtime) -> object:
 
 
 def end_blocked(stacks: Runtime) -> None:
-    """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
+    """Unwind every blocked call at the end of a run: ``finally`` blocks run."""
     stacks.ending.unwinding = True
     stacks.loop.halt()
     here = getcurrent()
@@ -203,11 +202,8 @@ def end_blocked(stacks: Runtime) -> None:
     stacks.runners.waiting.clear()
 
 
-# What rclpy waits with, on simulated time: events, and futures that set one.
-
-
 class SimEvent:
-    """Stands in for ``threading.Event`` where rclpy waits for what a callback will set."""
+    """Stands in for ``threading.Event`` in rclpy."""
 
     def __init__(self, stacks: Runtime, what: str = "an event to be set") -> None:
         self._stacks = stacks
@@ -231,7 +227,7 @@ class SimEvent:
         return self.wait_ns(None if timeout is None else patience_ns(timeout))
 
     def wait_ns(self, timeout_ns: int | None) -> bool:
-        """Do ``wait`` with a timeout in nanoseconds."""
+        """Wait with a timeout in nanoseconds."""
         if not self._set:
             wait(self._stacks, self._what, until=self._waits.append, for_ns=timeout_ns)
             self._waits = [blocked for blocked in self._waits if blocked.waiting]
@@ -239,7 +235,7 @@ class SimEvent:
 
 
 class EventSetter:
-    """The done callback of a future that sets an event at once, without becoming a task."""
+    """A future's done callback that sets an event at once, without becoming a task."""
 
     def __init__(self, event: SimEvent) -> None:
         self._event = event
@@ -247,8 +243,6 @@ class EventSetter:
     def __call__(self, future: Any) -> None:
         self._event.set()
 
-
-# For the time of a run ``time.sleep`` is simulated, and so are the modules rclpy waits with.
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
@@ -261,7 +255,8 @@ _runtimes: list[Runtime] = []
 
 
 def calling_runtime() -> Runtime | None:
-    """Return the world in which the calling code runs: a node's, not that of who drives it."""
+    """Return the runtime of the calling code; None outside of nodes, in real threads and in other
+    processes."""
     stacks = _runtimes[-1] if _runtimes else None
     if stacks is None or get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         return None
@@ -269,12 +264,12 @@ def calling_runtime() -> Runtime | None:
 
 
 def world_exists() -> bool:
-    """Return whether a run is under way, here or in the process that this one was forked from."""
+    """Return whether there is a run, here or in the process that forked this one."""
     return bool(_runtimes)
 
 
 def _sleep(seconds: float) -> None:
-    """Stand in for ``time.sleep`` while a run lasts."""
+    """Replace ``time.sleep`` during a run."""
     library = present_import()
     if library is not None:
         library.passed_ns += int(seconds * 1_000_000_000)
@@ -290,8 +285,8 @@ def _sleep(seconds: float) -> None:
         return
     for_ns = patience_ns(seconds)
     if stacks.ending.unwinding and stacks.ending.shutdown_ns < _SHUTDOWN_NS:
-        # Time stands still, but destroy_node and ``finally`` shall have their say: as much as
-        # ros2 launch leaves a node between SIGINT and SIGKILL.
+        # Time stands still, but destroy_node and ``finally`` may sleep as long as ros2 launch
+        # waits between SIGINT and SIGKILL.
         stacks.ending.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
         return
     wait(stacks, f"{seconds} s to pass", for_ns=for_ns)
@@ -299,7 +294,7 @@ def _sleep(seconds: float) -> None:
 
 @contextmanager
 def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
-    """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
+    """Simulate ``time.sleep`` and the modules that rclpy waits with, within the ``with`` block."""
     import rclpy.action.client
     import rclpy.client
     import rclpy.node
@@ -318,22 +313,18 @@ def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
         (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
         (rclpy.action.client, "uuid", SimpleNamespace(uuid4=_goal_ids(stacks.event, seed))),
     ]
-    saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
-    for module, name, value in replaced:
-        setattr(module, name, value)
-    turned = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
-    _runtimes.append(stacks)
-    try:
+    with ExitStack() as stack:
+        for module, name, value in replaced:
+            replace_attribute(stack, module, name, value)
+        redirected = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
+        stack.callback(redirected.restore)
+        _runtimes.append(stacks)
+        stack.callback(_runtimes.remove, stacks)
         yield
-    finally:
-        _runtimes.remove(stacks)
-        turned.restore()
-        for module, name, value in saved:
-            setattr(module, name, value)
 
 
 def _goal_ids(event: Event, seed: int) -> Callable[[], uuid.UUID]:
-    """Return what makes random UUIDs from a stream of the present node: goals need ids."""
+    """Return a ``uuid4`` that draws goal ids from a random stream of the current node."""
     streams: dict[str, random.Random] = {}
 
     def uuid4() -> uuid.UUID:

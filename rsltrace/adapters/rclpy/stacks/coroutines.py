@@ -1,7 +1,7 @@
 """Coroutines of user code: started once, resumed when the future they await is done.
 
-rclpy's executors poll suspended coroutines. Here only one that awaits something else than an rclpy
-Future is polled, once after everything else at that time has run.
+rclpy's executors poll suspended coroutines. Here a coroutine is polled only if it awaits something
+other than an rclpy Future, once after everything else at that time has run.
 """
 
 from __future__ import annotations
@@ -35,17 +35,16 @@ class Coroutines:
         self._polling = False
 
     def poll_later(self, run: TaskRun) -> None:
-        """Give a coroutine one more try when nothing else is ready."""
+        """Resume a coroutine when nothing else is ready."""
         self._polled.append(run)
         if not self._polling:
             self._polling = True
             self.domain.loop.idle.append(self._poll)
 
     def _poll(self) -> bool:
-        """Give coroutines that await something else one more try; True if there were any.
+        """Resume the polled coroutines; return whether there were any.
 
-        Once per stretch of other work: those that yield again wait until something else has
-        happened.
+        Those that yield again wait until something else has happened.
         """
         loop = self.domain.loop
         stage = (loop.now_ns, loop.events - self._polls)
@@ -61,11 +60,8 @@ class Coroutines:
 
 
 class TaskRun:
-    """One rclpy Task under way: started once, resumed as often as it awaits.
-
-    ``called`` is what it runs, and with which arguments. ``cause_event``, ``cause_output`` and
-    ``input_hash`` belong to the next dispatch.
-    """
+    """An rclpy Task that was started. ``called`` is its function with arguments; ``cause_event``,
+    ``cause_output`` and ``input_hash`` are those of its next event."""
 
     def __init__(
         self,
@@ -90,7 +86,7 @@ class TaskRun:
         self.kind = kind
         self.label = label
         self.number = self.domain.loop.next_place()
-        """Its place in the order in which tasks are made."""
+        """Its place in the order of all tasks."""
         self.cause_event = self.domain.loop.events
         self.cause_output = 0
         self.input_hash = 0
@@ -122,7 +118,7 @@ class TaskRun:
 
     @property
     def oldest_first(self) -> bool:
-        """Whether rclpy's executors run the oldest task first, as those after Jazzy do."""
+        """Whether this rclpy runs the oldest task first, as releases after Jazzy do."""
         return _run_oldest_first()
 
     def describe(self) -> str:
@@ -142,11 +138,11 @@ class TaskRun:
         )
 
     def execution_name(self) -> tuple[str, str]:
-        """Return (kind, name) by which execution times are given."""
+        """Return the kind and name by which execution times are configured."""
         return "task", ""
 
     def waits_for(self) -> str:
-        """Say what a suspended task waits for, and where in the code."""
+        """Describe what a suspended task waits for, and where in the code."""
         frame = getattr(self.task._handler, "cr_frame", None)
         where = f" at {frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
         return (

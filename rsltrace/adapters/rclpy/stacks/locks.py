@@ -1,8 +1,8 @@
-"""Locks for threads that are none: who finds one taken waits in simulated time.
+"""Locks of simulated threads: waiting for one takes simulated time.
 
-``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks;
-with these in their place all of them work. A lock that is free costs no more than a flag. Outside
-of a run, and in real threads, real locks are made.
+``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks,
+which are replaced by these. A free lock costs no more than a flag. Outside of a run, and in real
+threads, real locks are made.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ _LAST: Any = object()
 
 
 def _no_stack() -> Any:
-    """Stand in for ``getcurrent`` while Python ends: greenlet is over by then, but objects of nodes
-    may still lock something when they go (``__del__``, handlers of ``logging``)."""
+    """Replace ``getcurrent`` while Python exits: greenlet is gone by then, but objects of nodes may
+    still lock something (``__del__``, handlers of ``logging``)."""
     return _LAST
 
 
@@ -44,8 +44,8 @@ def _forget_stacks() -> None:
 class SimLock:
     """Stands in for ``threading.Lock``.
 
-    As in CPython, a release wakes who has waited longest, and whoever runs may take the lock again
-    before that one comes. It then waits on, and is not overtaken a second time.
+    As in CPython, a release wakes the longest waiter, and the running thread may take the lock
+    before it does. The waiter then waits on, and is not overtaken a second time.
     """
 
     __slots__ = ("__weakref__", "_called", "_owner", "_taken", "_waits")
@@ -57,12 +57,11 @@ class SimLock:
         self._taken = False
         self._owner: greenlet | None = None
         self._waits: deque[tuple[BlockedCall, bool]] = deque()
-        """Who waits, and whether it has been overtaken."""
+        """The waiters, and whether each was overtaken."""
         self._called: BlockedCall | None = None
-        """Who was woken by a release and has not come yet."""
+        """The waiter that a release has woken and that has not run yet."""
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take the lock, waiting for it if need be; return whether it is ours now."""
         if not self._taken:
             self._taken = True
             self._owner = getcurrent()
@@ -78,7 +77,7 @@ class SimLock:
     def _wait(self, timeout: float) -> bool:
         stacks = calling_runtime()
         if stacks is None and getcurrent is _no_stack:
-            return True  # nobody else is left who could have it
+            return True  # no other thread is left
         if stacks is None:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
@@ -92,7 +91,7 @@ class SimLock:
             what = _LockHolder(stacks, self._owner, for_work=in_condition)
             if not self._turn(stacks, what, for_ns, overtaken=overtaken):
                 return False
-            if overtaken or not self._taken:  # left taken for us, or free
+            if overtaken or not self._taken:  # kept taken for this waiter, or free
                 self._taken = True
                 self._owner = getcurrent()
                 return True
@@ -101,7 +100,7 @@ class SimLock:
     def _turn(
         self, stacks: Runtime, what: _LockHolder, for_ns: int | None, *, overtaken: bool
     ) -> bool:
-        """Wait until a release calls; return whether one did before the time was up."""
+        """Wait until a release wakes this waiter; return False on a timeout."""
         mine: list[BlockedCall] = []
 
         def join(blocked: BlockedCall) -> None:
@@ -117,13 +116,12 @@ class SimLock:
                 self._called = None
             if not came:
                 self._waits = deque(one for one in self._waits if one[0].waiting)
-                if called and (overtaken or not self._taken):  # raised in: the next one may have it
+                if called and (overtaken or not self._taken):  # an exception: wake the next one
                     self._taken = True
                     self.release()
         return came
 
     def release(self) -> None:
-        """Give the lock up, and wake who has waited longest for it."""
         if not self._taken:
             raise RuntimeError("release unlocked lock")
         self._owner = None
@@ -139,7 +137,6 @@ class SimLock:
         return self._taken
 
     def is_mine(self) -> bool:
-        """Return whether the calling stack has the lock."""
         return self._taken and self._owner is getcurrent()
 
     def __enter__(self) -> bool:
@@ -153,10 +150,10 @@ class SimLock:
 
 
 class PoolLock:
-    """Stands in for the lock that all thread pools of a process share (``concurrent.futures``).
+    """Stands in for the lock that all thread pools share (``concurrent.futures``).
 
-    A pool starts a worker while it has it, and the worker runs first: it may well want it, too.
-    Real threads keep ``real``.
+    A pool holds it while it starts a worker, which runs first and may need it, too. Real threads
+    use ``real``.
     """
 
     def __init__(self, real: Any) -> None:
@@ -172,7 +169,7 @@ class PoolLock:
 
 
 class SimRLock:
-    """Stands in for ``threading.RLock``: whoever has it may take it again."""
+    """Stands in for ``threading.RLock``."""
 
     __slots__ = ("__weakref__", "_count", "_lock", "_owner")
 
@@ -185,7 +182,6 @@ class SimRLock:
         self._count = 0
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take the lock once more, waiting for it if somebody else has it."""
         me = getcurrent()
         if self._owner is me:
             self._count += 1
@@ -197,7 +193,6 @@ class SimRLock:
         return True
 
     def release(self) -> None:
-        """Give the lock up once."""
         if self._owner is not getcurrent():
             raise RuntimeError("cannot release un-acquired lock")
         self._count -= 1
@@ -211,7 +206,7 @@ class SimRLock:
     def __exit__(self, *exc: object) -> None:
         self.release()
 
-    # What Condition asks of a lock.
+    # Methods that Condition uses.
 
     def _is_owned(self) -> bool:
         return self._owner is getcurrent()
@@ -266,9 +261,9 @@ def _reinit(self: SimLock) -> None:
 
 
 def _become_real() -> None:
-    """Have the locks of the simulation lock real threads: a forked process has no others.
+    """Let the locks of the simulation lock real threads: a forked process has no others.
 
-    A condition keeps bound methods of its lock, so it is their code that is exchanged.
+    A condition keeps bound methods of its lock, so their code is replaced.
     """
     if world_exists():
         kind: Any = SimLock
@@ -285,7 +280,7 @@ os.register_at_fork(after_in_child=_become_real)
 
 
 class _LockHolder:
-    """Says who has a lock, when somebody asks: for the report of a deadlock."""
+    """Describes the holder of a lock, for the report of a deadlock."""
 
     def __init__(self, stacks: Runtime, owner: greenlet | None, *, for_work: bool) -> None:
         self._stacks = stacks
@@ -294,10 +289,8 @@ class _LockHolder:
         self._for_work = for_work
 
     def is_idle(self) -> bool:
-        """Say whether a thread waits for work (a queue, an event) that may never come.
-
-        So does a main that leaves the work to threads which spin.
-        """
+        """Return whether a thread waits for work (a queue, an event) that may never come, or a main
+        whose threads spin."""
         stacks = self._stacks
         if not self._for_work or stacks.threads.runs_on(self._me):
             return self._for_work
@@ -309,13 +302,10 @@ class _LockHolder:
 
     def __str__(self) -> str:
         if self._for_work:
-            return "somebody to wake it (an event, a condition, a queue, a future)"
+            return "an event, a condition, a queue or a future"
         if self._owner is self._me:
             return "a lock that it holds itself"
         for blocked in self._stacks.runners.blocked:
             if blocked.stack is self._owner:
                 return f"a lock that is held by {blocked.describe()}"
         return "a lock that nobody will release"
-
-
-__all__ = ["PoolLock", "SimLock", "SimRLock"]

@@ -1,8 +1,8 @@
-"""How a main begins and ends: by returning, by ``sys.exit``, by an exception, or with the run.
+"""Begin and end of mains: by returning, by ``sys.exit``, by an exception, or with the run.
 
-When the run is over, every main that still waits is told as ``ros2 launch`` tells a node: its
-contexts are shut down and the call that blocks raises ``KeyboardInterrupt``. What it does then
-(``finally`` blocks, joining threads) runs to its end, while simulated time stands still.
+When the run is over, waiting mains are interrupted as by ``ros2 launch``: contexts are shut down,
+and the blocking call raises ``KeyboardInterrupt``. ``finally`` blocks and joins of threads then run
+to their end, while simulated time stands still.
 """
 
 from __future__ import annotations
@@ -26,12 +26,10 @@ from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 
-# What a main registers with ``atexit`` runs when that main ends, not when rsltrace does.
-
 
 @contextmanager
 def own_exit_handlers(stacks: Runtime) -> Iterator[None]:
-    """Keep the exit handlers of mains apart from the process's within the ``with`` block."""
+    """Give each main its own ``atexit`` handlers, which run when it ends."""
     real_register, real_unregister = atexit.register, atexit.unregister
 
     def of_main() -> list[ExitHandler] | None:
@@ -61,7 +59,7 @@ def own_exit_handlers(stacks: Runtime) -> Iterator[None]:
 
 
 def run_exit_handlers(program: SimulatedProgram) -> None:
-    """Run what a main has registered, the last first, as Python does."""
+    """Run a main's exit handlers, the last first, as Python does."""
     while program.exit_handlers:
         function, args, kwargs = program.exit_handlers.pop()
         function(*args, **kwargs)
@@ -69,14 +67,13 @@ def run_exit_handlers(program: SimulatedProgram) -> None:
 
 _EVERY_MAIN_ENDED = "every main has ended"
 _INTERRUPTED = 130
-"""What a shell shows of a process that SIGINT, and so ``KeyboardInterrupt``, has ended."""
+"""The exit status of a process that SIGINT has ended."""
 
 
 def begin_program(
     stacks: Runtime, program: SimulatedProgram, cause: tuple[int, int] = (NO_EVENT, 0)
 ) -> None:
-    """Run a main until it ends or blocks for the first time, as one event; ``cause`` is the event
-    and output that it follows from."""
+    """Run a main until it ends or first blocks, as one event; ``cause``: its event and output."""
     entities = stacks.domain.entities
     program.begun_ns = stacks.loop.now_ns
     program.entity_id = entities.new_id()
@@ -119,9 +116,9 @@ def _run(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def end_program(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> None:
-    """Do what the end of a process does, within the last event of its main.
+    """End a process, within the last event of its main.
 
-    An exception that nobody caught is raised again: it fails the run, except while that ends.
+    An uncaught exception is raised again and fails the run, unless the run is ending.
     """
     notes = stacks.domain.outcome.notes
     program.ended = True
@@ -144,7 +141,7 @@ def end_program(stacks: Runtime, program: SimulatedProgram, error: BaseException
 
 
 def _has_ended(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Tell of the end of a process; with the last one the run may be over."""
+    """Announce the end of a process; with the last one the run may be over."""
     programs = stacks.programs
     assert program.entry is not None
     programs.tell("ended", program.entry.key)
@@ -157,7 +154,7 @@ def _has_ended(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def crash_program(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Let a process be gone in the event under way; nothing of it runs any more (``Victims``)."""
+    """End a process in the current event; ``FaultedNodes`` has stopped its nodes."""
     for context in program.contexts:
         context.end()
     program.ended = True
@@ -169,18 +166,14 @@ def crash_program(stacks: Runtime, program: SimulatedProgram) -> None:
 def _finish_process(
     stacks: Runtime, program: SimulatedProgram, error: BaseException | None
 ) -> None:
-    """Do what Python does when main is over: wait for its threads, run its exit handlers.
-
-    A main that fails ends the run at once instead.
-    """
+    """Wait for threads and run exit handlers, as Python does after main, unless main failed."""
     if error is None or isinstance(error, (SystemExit, KeyboardInterrupt)):
         _wait_for_threads(stacks, program)
         run_exit_handlers(program)
 
 
 def _wait_for_threads(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Wait for all threads that are no daemons, as a process does when its main has returned; they
-    may start more of them meanwhile."""
+    """Wait for all threads that are not daemons; they may start more meanwhile."""
     with contextlib.suppress(RunEnded, KeyboardInterrupt):
         while True:
             own = [t for t in stacks.threads.alive if t.program is program and not t.ended]
@@ -194,7 +187,7 @@ def _wait_for_threads(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def _stop_threads(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Unwind the threads that are left: they end with their process."""
+    """Unwind the remaining threads."""
     for blocked in list(stacks.runners.blocked):
         if blocked.program is program:
             blocked.error = RunEnded()
@@ -202,7 +195,7 @@ def _stop_threads(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> bool:
-    """Take note of how main ended; return whether that fails the run."""
+    """Note how a main ended; return whether that fails the run."""
     if error is None or isinstance(error, RunEnded):
         return False
     notes = stacks.domain.outcome.notes
@@ -219,7 +212,7 @@ def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseExcept
     if over:
         if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
             kind = type(error).__qualname__
-            notes.append(f"{program.label}, told to end, raised {kind}: {text_of(error)}")
+            notes.append(f"{program.label} raised {kind} at the end of the run: {text_of(error)}")
         return False
     return True
 
@@ -235,7 +228,7 @@ def _nodes(stacks: Runtime, program: SimulatedProgram) -> list[Any]:
 
 
 def _destroy_nodes(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Take a process's nodes out of the graph, as its end does."""
+    """Take a process's nodes out of the graph."""
     for context in program.contexts:
         context.end()
     for node in _nodes(stacks, program):
@@ -247,7 +240,7 @@ def _destroy_nodes(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def end_programs(stacks: Runtime) -> None:
-    """Tell every main that is still there to end, and let it."""
+    """Interrupt every main that still runs, and let it end."""
     if stacks.ending.closing or not stacks.programs.all:
         return
     stacks.ending.closing = True
@@ -259,8 +252,8 @@ def end_programs(stacks: Runtime) -> None:
 
 
 def interrupt(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Do what SIGINT does to a process; the call that its main is in raises ``KeyboardInterrupt``
-    (who is in no call has to raise it)."""
+    """Act as SIGINT on a process: the blocking call of its main raises ``KeyboardInterrupt``. (If
+    there is none, the caller raises it.)"""
     shut_down(stacks, program)
     blocked = next((one for one in stacks.runners.blocked if one.stack is program.stack), None)
     if blocked is not None:
@@ -269,7 +262,7 @@ def interrupt(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def shut_down(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Shut a process's contexts down from outside, as rclpy's handler of signals does."""
+    """Shut a process's contexts down, as rclpy's signal handler does."""
     for context in program.contexts:
         context.end()
     for other in list(stacks.runners.blocked):
@@ -278,9 +271,9 @@ def shut_down(stacks: Runtime, program: SimulatedProgram) -> None:
 
 
 def _let_run(stacks: Runtime, program: SimulatedProgram) -> None:
-    """Let a program end that has been told to, as long as ros2 launch leaves it.
+    """Let an interrupted program end, for as long as ros2 launch waits.
 
-    Time stands still meanwhile: who sleeps goes on when nobody else can.
+    Time stands still meanwhile: a sleep is over when nothing else can run.
     """
     loop = stacks.loop
     stacks.ending.grace_ns = 0

@@ -1,8 +1,8 @@
-"""``os._exit``, signals to oneself and the like end the process of a node, which is everybody's.
+"""``os._exit``, ``os.abort``, signals to the own process and the like, called by nodes.
 
-So for the time of a run they end what they would end natively: one main with its threads, or,
-called by a node that the job constructs, the run. As natively, no ``finally`` block and no exit
-handler runs: the stacks are left where they are. The trace is whole, and says who did it.
+During a run they end one main with its threads or, called by a node that the job constructs, the
+run. As natively, no ``finally`` block and no exit handler runs: the stacks are abandoned. The trace
+is complete, and names the caller.
 """
 
 from __future__ import annotations
@@ -39,19 +39,16 @@ from rsltrace.simulation.middleware.events.failure import (
 from rsltrace.terminal import tell
 from rsltrace.trace.model.event import OutputKind
 
-# Signal handlers that nodes set: each main keeps its own, as a process does, and ours stay.
-#
-# Ctrl-C, SIGTERM and SIGHUP end a run properly, whatever one of its nodes would do about them.
-# What a node sets for other signals (of an alarm, say) works, and is taken back when the run is
-# over, as are the alarms themselves. A handler that raises does so in the code of nodes alone:
-# what interrupts rsltrace itself ends the run.
+# Signal handlers: each main has its own, and rsltrace's stay in place. Ctrl-C, SIGTERM and SIGHUP
+# end a run, whatever handlers its nodes set. Handlers for other signals (alarms) work until the run
+# is over. A handler raises only in the code of nodes; if it interrupts rsltrace, it ends the run.
 
 _SIGNALS_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT))
 _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 
 
 class _SignalHandler:
-    """A node's signal handler, which may interrupt anything."""
+    """A node's signal handler; it may interrupt any code."""
 
     def __init__(self, domain: Domain, handler: Callable[[int, FrameType | None], Any]) -> None:
         self._domain = domain
@@ -60,7 +57,7 @@ class _SignalHandler:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         loop, outcome = self._domain.loop, self._domain.outcome
         if loop.stopped is not None:
-            return  # an alarm that rings faster than it is heard would never let the run end
+            return  # a fast alarm would never let the run end
         try:
             self.handler(number, frame)
         except BaseException as error:
@@ -73,7 +70,7 @@ class _SignalHandler:
 
 
 def _is_in_user_code(frame: FrameType | None) -> bool:
-    """Say whether an exception there would come out of a node's code, and not out of ours."""
+    """Return whether an exception in a frame would pass through a node's code first."""
     while frame is not None and not is_own_frame(frame):
         file = frame.f_code.co_filename
         if not file.startswith("<") and is_user_file(file):
@@ -84,7 +81,7 @@ def _is_in_user_code(frame: FrameType | None) -> bool:
 
 @contextmanager
 def own_signal_handlers(stacks: Runtime) -> Iterator[None]:
-    """Keep the signal handlers of nodes apart from the process's within the ``with`` block."""
+    """Give each main its own signal handlers within the ``with`` block."""
     before: dict[int, Any] = {}
 
     def set_handler(number: Any, handler: Any, /) -> Any:
@@ -111,7 +108,7 @@ def own_signal_handlers(stacks: Runtime) -> Iterator[None]:
         return _node_handler(real_get(number))
 
     def set_wakeup(fd: int, /, **options: Any) -> Any:
-        """Asyncio wants a byte of every signal for its loop; those that end a run are not its."""
+        """Ignore asyncio's descriptor: signals that end a run are not for its loop."""
         return -1 if calling_runtime() is stacks else real_wakeup(fd, **options)
 
     with ExitStack() as stack:
@@ -137,7 +134,7 @@ def _node_handler(handler: Any) -> Any:
 
 
 def _end_timers(armed: set[int]) -> None:
-    """End the alarms that nodes have set: nobody is left who would handle them."""
+    """End the alarms that nodes have set."""
     for timer in _TIMERS:
         if timer not in armed and signal.getitimer(timer)[0]:
             signal.setitimer(timer, 0)
@@ -153,12 +150,12 @@ def _put_back(handlers: dict[int, Any]) -> None:
 _DEADLY = (signal.SIGKILL, signal.SIGABRT)
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _real: dict[str, Callable[..., Any]] = {}
-"""What the functions did before the run, which may be the guard's doing."""
+"""The functions before the run (perhaps the guard's)."""
 
 
 @contextmanager
 def own_process_ends(stacks: Runtime) -> Iterator[None]:
-    """Let nodes end their process, and not ours, within the ``with`` block."""
+    """Let nodes end their simulated process only, within the ``with`` block."""
     targets: list[tuple[Any, Callable[..., Any]]] = [
         (os._exit, _exit),
         (os.abort, _abort),
@@ -208,7 +205,7 @@ def _raise_signal(signalnum: int) -> None:
 
 
 def _signalled(stacks: Runtime, number: int, call: str) -> bool:
-    """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
+    """Act as a signal to the own process; return False to send the real signal."""
     handler = stacks.programs.present.signal_handlers.get(number)
     if number in _DEADLY or handler == signal.SIG_DFL:
         _end_process(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
@@ -220,7 +217,7 @@ def _signalled(stacks: Runtime, number: int, call: str) -> bool:
 
 
 def _signalled_by_default(stacks: Runtime, number: int, call: str) -> bool:
-    """Do what Python and rclpy do about a signal for which a main has set no handler."""
+    """Act as Python and rclpy on a signal for which a main has no handler."""
     program = stacks.programs.present
     if program is stacks.programs.host or number not in _ENDING:
         return False
@@ -248,23 +245,23 @@ def _execve(path: Any, argv: Any, env: Any) -> None:
 def _refuse(call: str) -> None:
     if _calling_node_runtime() is not None:
         raise UnsupportedError(
-            f"{call} would put another program in the place of this process, in which all nodes of "
-            "the run are: end the node instead (sys.exit), or start the program with subprocess"
+            f"{call} would replace this process, in which all nodes of the run are: end the node "
+            "instead (sys.exit), or start the program with subprocess"
         )
 
 
 def _calling_node_runtime() -> Runtime | None:
-    """Return the world whose node calls, or None if the process is to do what it is told."""
+    """Return the runtime of the calling node, None if no node calls."""
     stacks = calling_runtime()
     return stacks if stacks is not None and stacks.event.handle is not None else None
 
 
 def _end_process(stacks: Runtime, call: str, status: int) -> NoReturn:
-    """End the process of the calling code: the program, or the run."""
+    """End the simulated process of the calling code, or the run."""
     handle = stacks.event.handle
     assert handle is not None
     if stacks.ending.unwinding or stacks.ending.closing or getcurrent() is stacks.runners.main:
-        raise RunEnded  # it is ending anyway, and somebody needs this stack
+        raise RunEnded  # it is ending anyway, and this stack is needed
     program = stacks.programs.present
     if program is stacks.programs.host:
         stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, status)
@@ -285,7 +282,7 @@ def _end_process(stacks: Runtime, call: str, status: int) -> NoReturn:
         _set_running_loop(None)
     abandon(getcurrent())
     stacks.runners.next().switch()
-    raise AssertionError("nobody goes back to a stack that was left")
+    raise AssertionError("an abandoned stack was resumed")
 
 
 # A process that a node forks is not part of the run: it ends where it would come back into it.
@@ -298,7 +295,7 @@ _runtimes: list[Runtime] = []
 
 @contextmanager
 def forked_children_end(stacks: Runtime) -> Iterator[None]:
-    """Let what is forked within the ``with`` block end with the event that forked it."""
+    """End forked processes with the event that forked them, within the ``with`` block."""
     _runtimes.append(stacks)
     try:
         yield
@@ -318,8 +315,8 @@ def _end(stacks: Runtime) -> None:
     with suppress(Exception):
         sys.stdout.flush()
         tell(
-            f"rsltrace: note: a process that {who} forked came back into the run, and was ended; "
-            "the run is its parent's"
+            f"rsltrace: note: ended a process that {who} forked: only the parent process runs the "
+            "simulation"
         )
     os._exit(1)
 
