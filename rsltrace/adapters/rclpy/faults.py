@@ -1,8 +1,8 @@
-"""Nodes that crash, hang or start again, because the job says so.
+"""Faults of nodes that the job asks for: crash, hang, restart.
 
-What goes wrong is the process that a node is in: natively it is that which dies or is stopped. Each
-entry of a job stands for one, whether its nodes are constructed by the job, made by a main, or in a
-real process. Each fault is an event of its own, before anything else that is ready.
+A fault affects the node's process. Each entry of a job stands for one, whether the job constructs
+its nodes, a main makes them, or they are in a real process. Each fault is an event of its own,
+before anything else that is ready.
 """
 
 from __future__ import annotations
@@ -27,16 +27,15 @@ from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import NO_EVENT, Draw, EventKind, encode_draw
 from rsltrace.trace.model.texts import format_seconds
 
-# The nodes of one process that crash or hang: what of them runs, and what keeps it from doing so.
-#
-# Natively a process that is killed runs nothing any more, no ``finally`` either, so blocked calls
-# are left where they are. One that hangs is stopped between two instructions of its own: what is
-# there for it waits, its timers are late, and its calls return when it goes on.
-
 
 class FaultedNodes:
-    """``nodes`` (handles) of one process: a ``program`` of its own, or the host of what an
-    ``entry`` has made."""
+    """The nodes (handles) of one process that crashes or hangs: a ``program``, or the nodes of an
+    ``entry`` in the host.
+
+    A process that is killed runs nothing any more, no ``finally`` either, so its blocked calls are
+    abandoned. One that hangs is stopped between two instructions: arrivals wait, timers are late,
+    and its calls return when it goes on.
+    """
 
     def __init__(
         self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: Entry | None
@@ -50,11 +49,10 @@ class FaultedNodes:
 
     @property
     def are_destroyed(self) -> bool:
-        """Whether they have crashed, or were destroyed."""
         return all(node.destroyed for node in self._nodes)
 
     def hold(self) -> None:
-        """Let nothing of them run up to ``let_go``."""
+        """Run nothing of them until ``release``."""
         self._keep_what_comes()
         for node in self._nodes:
             if node.mailbox is not None:
@@ -66,7 +64,7 @@ class FaultedNodes:
                 self._stacks.executor.remove_node(node.wrapper)
 
     def release(self) -> None:
-        """Let them go on: what has come meanwhile is ready now."""
+        """Let them go on: kept items are ready now."""
         for node in self._running:
             if not node.handle.destroyed:
                 self._stacks.executor.add_node(node)
@@ -80,7 +78,7 @@ class FaultedNodes:
                 driver.wake()
 
     def crash(self) -> None:
-        """Take them out of the run for ever, as a process's death does."""
+        """Remove them from the run, as a killed process."""
         self._keep_what_comes()
         stacks = self._stacks
         for blocked in [one for one in stacks.runners.blocked if self._is_ours(one)]:
@@ -102,7 +100,7 @@ class FaultedNodes:
             node.destroy()
 
     def _keep_what_comes(self) -> None:
-        """Keep whatever of theirs the loop dispatches from now on."""
+        """Keep their items that the loop dispatches from now on."""
         if self._program is not None:
             self._program.held = []
         for node in self._nodes:
@@ -120,19 +118,18 @@ _DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
 
 
 class RealProcess(Protocol):
-    """A process of its own in which nodes are."""
+    """A real process with nodes."""
 
     key: str
 
     def crash(self) -> None:
-        """Be gone at once, within the event under way."""
+        """End at once, within the current event."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeFault:
-    """What happens to a node: ``kind`` is ``crash``, ``hang`` or ``restart``; ``for_ns`` as in the
-    job. When: at a time, after an event, or after a message (from 1) of a topic. ``where`` names
-    its line in the job."""
+    """A fault of a node: ``kind`` is ``crash``, ``hang`` or ``restart``. It happens at a time,
+    after an event, or after a message (from 1) of a topic. ``where`` is its line in the job."""
 
     kind: str
     node: str
@@ -145,7 +142,7 @@ class NodeFault:
 
 
 class NodeFaults(EventObserver):
-    """The faults of one run that are about nodes. Armed before the first node is made."""
+    """The node faults of a run. Make it before the first node."""
 
     order = ObserverOrder.FAULTS
 
@@ -164,13 +161,12 @@ class NodeFaults(EventObserver):
             world.domain.watch(topic, self._sent)
 
     def missed(self) -> Iterator[tuple[str, str]]:
-        """Yield the place in the job of each fault that has not struck, and why."""
+        """Yield the place in the job of each fault that did not happen, and why."""
         for strike in self._strikes:
             if strike.missed:
                 yield strike.fault.where, strike.missed
 
     def after_event(self) -> None:
-        """See which faults follow the event."""
         events = self.world.domain.loop.events
         while self._by_event and events > (self._by_event[-1].fault.event or 0):
             self._by_event.pop().come()
@@ -186,21 +182,21 @@ class NodeFaults(EventObserver):
 
 
 class _ScheduledFault:
-    """One fault. The loop dispatches it when its time has come."""
+    """A fault that the loop dispatches at its time."""
 
     def __init__(self, faults: NodeFaults, fault: NodeFault) -> None:
         self._world = faults.world
         self.fault = fault
-        self.missed = "it has not come to that"
+        self.missed = "the run ended before it"
         self._faulted: FaultedNodes | None = None
 
     def come(self) -> None:
-        """Strike next, before anything else that is ready."""
+        """Dispatch it next, before anything else that is ready."""
         if self._world.domain.loop.stopped is None:
             self._world.domain.loop.tasks.append(self)
 
     def dispatch(self) -> None:
-        """Strike, as one event; or let those go on again that hang."""
+        """Apply the fault as one event, or end a hang."""
         if self._faulted is not None:
             faulted, self._faulted = self._faulted, None
             if not faulted.are_destroyed:
@@ -242,7 +238,7 @@ class _ScheduledFault:
         entry = self._entry(node)
         if fault.kind == "restart":
             if entry is None:
-                raise self._cannot("no entry of nodes: has made it, so it cannot be made anew")
+                raise self._cannot("no entry of nodes: has made it")
             world.starts.add_at(entry, world.domain.loop.now_ns + (fault.for_ns or 0))
         if not isinstance(node, NodeHandle):
             if node.process is None:
@@ -267,7 +263,7 @@ class _ScheduledFault:
             world.stacks.programs.tell("ended", entry.key)
 
     def _nodes(self, node: NodeHandle, entry: Entry | None) -> list[Any]:
-        """Return the nodes of the process that a node is in."""
+        """Return the nodes of a node's process."""
         own = [one for one in self._world.domain.graph.nodes if one.process is node.process]
         if node.process.entry is not None:
             return own
@@ -275,7 +271,6 @@ class _ScheduledFault:
         return [node] if entry is None else same
 
     def _entry(self, node: Participant) -> Entry | None:
-        """Return the entry of the job that stands for a node's process."""
         if not isinstance(node, NodeHandle):
             if node.process is None:
                 return None

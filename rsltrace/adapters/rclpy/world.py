@@ -28,7 +28,6 @@ from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent, Entry
 from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
 from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs, own_exit_handlers
 from rsltrace.adapters.rclpy.stacks.process_exit import (
-    forked_children_end,
     own_process_ends,
     own_signal_handlers,
 )
@@ -98,7 +97,6 @@ class World:
             stack.enter_context(simulated_event_loops(stacks))
             stack.enter_context(own_exit_handlers(stacks))
             stack.enter_context(own_process_ends(stacks))
-            stack.enter_context(forked_children_end(stacks))
             stack.enter_context(own_signal_handlers(stacks))
             self._terminals = stack.enter_context(simulated_terminals(stacks))
             rclpy.init(args=[])

@@ -251,21 +251,17 @@ _RATE = (
     "meanwhile, in another thread"
 )
 _real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
-_runtimes: list[Runtime] = []
+runtimes: list[Runtime] = []
+"""Those of the runs in this process, or in the process that forked it."""
 
 
 def calling_runtime() -> Runtime | None:
     """Return the runtime of the calling code; None outside of nodes, in real threads and in other
     processes."""
-    stacks = _runtimes[-1] if _runtimes else None
+    stacks = runtimes[-1] if runtimes else None
     if stacks is None or get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         return None
     return stacks if stacks.event.handle is not None or stacks.programs.importing else None
-
-
-def world_exists() -> bool:
-    """Return whether there is a run, here or in the process that forked this one."""
-    return bool(_runtimes)
 
 
 def _sleep(seconds: float) -> None:
@@ -318,8 +314,8 @@ def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
             replace_attribute(stack, module, name, value)
         redirected = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
         stack.callback(redirected.restore)
-        _runtimes.append(stacks)
-        stack.callback(_runtimes.remove, stacks)
+        runtimes.append(stacks)
+        stack.callback(runtimes.remove, stacks)
         yield
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait, world_exists
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, runtimes, wait
 from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.trace.model.texts import patience_ns
@@ -265,7 +265,7 @@ def _become_real() -> None:
 
     A condition keeps bound methods of its lock, so their code is replaced.
     """
-    if world_exists():
+    if runtimes:
         kind: Any = SimLock
         for name, real in (
             ("acquire", _acquire),

@@ -92,8 +92,11 @@ class Mailbox:
         """The item that was taken out and runs now."""
 
     def keeps(self, item: Dispatchable, leave: Callable[[], None] | None = None) -> bool:
-        """Keep an item that the loop dispatches (and call ``leave``), or run it at once on a spinning
-        stack. Return False if the executor has taken it, so that it runs now."""
+        """Keep an item that the loop dispatches (and call ``leave``), or run it on a spinning
+        stack.
+
+        Returns False if the executor has taken the item, so that it runs now.
+        """
         if self.admitted is item:
             self.admitted = None
             return False

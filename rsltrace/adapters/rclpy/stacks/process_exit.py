@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, calling_runtime, getpid
+from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, calling_runtime, getpid, runtimes
 from rsltrace.adapters.rclpy.stacks.mains import end_program, interrupt, shut_down
 from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
@@ -285,26 +285,12 @@ def _end_process(stacks: Runtime, call: str, status: int) -> NoReturn:
     raise AssertionError("an abandoned stack was resumed")
 
 
-# A process that a node forks is not part of the run: it ends where it would come back into it.
-#
-# Natively it would go on as a second copy of every node. Here the run is its parent's alone, and
-# so is the trace; what a child does within the callback that forked it is its own affair.
-
-_runtimes: list[Runtime] = []
-
-
-@contextmanager
-def forked_children_end(stacks: Runtime) -> Iterator[None]:
-    """End forked processes with the event that forked them, within the ``with`` block."""
-    _runtimes.append(stacks)
-    try:
-        yield
-    finally:
-        _runtimes.remove(stacks)
+# A process that a node forks ends with the callback that forked it: only the parent runs the
+# simulation and writes the trace. Natively it would go on as a second copy of every node.
 
 
 def _in_child() -> None:
-    for stacks in _runtimes:
+    for stacks in runtimes:
         if stacks.event.handle is not None and stacks.runners.thread == get_ident():
             stacks.dispatcher.record(None)
             stacks.event.on_end = lambda stacks=stacks: _end(stacks)

@@ -1,5 +1,4 @@
-"""Calls that read from a terminal: ``input``, ``os.read``, ``select``; and whose terminal is
-descriptor 0."""
+"""Replaces calls that read from a terminal: ``input``, ``os.read``, ``select``, curses."""
 
 from __future__ import annotations
 
@@ -22,13 +21,12 @@ from rsltrace.guard.frames import exchange
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.trace.model.texts import patience_ns
 
-# ``sys.stdin`` of those whom the job gives no terminal: reading from it is an error.
-
 _DEBUGGERS = ("bdb", "cmd", "code", "pdb", "IPython", "prompt_toolkit", "debugpy", "pydevd")
 
 
 class NoTerminal:
-    """Is the real stream to whoever drives the run, and to debuggers."""
+    """The ``sys.stdin`` of nodes without a terminal: reading is an error, except for debuggers and
+    code outside of nodes, which read the real stream."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -63,7 +61,7 @@ class NoTerminal:
 
 
 def refuse_reading(call: str) -> None:
-    """Raise ``UnsupportedError`` if a node's code reads (and no debugger in it)."""
+    """Raise ``UnsupportedError`` if a node's code reads, but no debugger."""
     stacks = calling_runtime()
     if stacks is None or stacks.event.handle is None or _is_debugged(sys._getframe(2)):
         return
@@ -74,12 +72,12 @@ def _fail(stacks: Runtime, call: str) -> NoReturn:
     program = stacks.programs.present
     if program.entry is None:
         raise UnsupportedError(
-            f"{call}: a 'node' of a job has no terminal to read from: make it a function that "
-            "spins it (main:), and give that entry what is typed: stdin: [...]"
+            f"{call}: a 'node' of a job has no terminal: write a function that spins it (main:), "
+            "and give that entry its input: stdin: [...]"
         )
     raise UnsupportedError(
-        f"{call}: {program.label} reads from its terminal, and the job does not say what is typed "
-        "there: give its entry a file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
+        f"{call}: {program.label} reads from its terminal, but its entry has no stdin: give it a "
+        "file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
     )
 
 
@@ -91,8 +89,6 @@ def _is_debugged(frame: FrameType | None) -> bool:
     return False
 
 
-# curses reads keys in C: who waits for one waits in simulated time before that.
-
 _READS = ("getch", "getkey", "get_wch", "getstr")
 _NS_PER_MS = 1_000_000
 _FOR_EVER = -1
@@ -103,12 +99,12 @@ TerminalOfCaller = Callable[[], "Terminal | None"]
 
 
 ShowTerminal = Callable[[Terminal, bool], None]
-"""Makes a terminal the main's standard output, or no longer."""
+"""Makes a terminal the main's standard output (True), or not (False)."""
 
 
 @contextmanager
 def simulated_curses(asking: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
-    """Let windows of curses wait in simulated time within the ``with`` block."""
+    """Let curses wait for keys in simulated time within the ``with`` block."""
     try:
         import _curses
     except ImportError:  # Python can be built without it
@@ -162,7 +158,7 @@ def _ending(
 
 
 def _drained(asking: TerminalOfCaller, real: Any) -> Any:
-    """Let something be shown, which is for nobody to see."""
+    """Discard what is shown."""
 
     def shown(*arguments: Any) -> Any:
         terminal = asking()
@@ -201,8 +197,7 @@ def _reading(
 
 
 def _taken_already(get: Callable[[], Any]) -> Any:
-    """Return a key that curses has read before (of an escape sequence that means nothing to it),
-    or None."""
+    """Return a key that curses has read before (of an unknown escape sequence), or None."""
     import _curses
 
     try:
@@ -239,7 +234,7 @@ _close = copy_of(os.close)  # type: ignore[arg-type]
 
 
 class Terminals:
-    """The terminals of a run's mains. While a main runs, its terminal is descriptor 0 (and 1, for
+    """The terminals of mains. While a main runs, its terminal is descriptor 0 (and 1, for
     curses)."""
 
     def __init__(self, stacks: Runtime) -> None:
@@ -252,11 +247,11 @@ class Terminals:
 
     @property
     def present(self) -> Terminal | None:
-        """The terminal of the main that runs, if it has one."""
+        """The terminal of the running main, if it has one."""
         return self._all.get(self._stacks.programs.present)
 
     def make(self, programs: Sequence[SimulatedProgram], start_ns: int) -> None:
-        """Give mains their terminals; the times of what is typed count from ``start_ns``."""
+        """Make the terminals of mains; times of input count from ``start_ns``."""
         for program in programs:
             assert program.entry is not None
             if program.entry.stdin is not None:
@@ -264,7 +259,7 @@ class Terminals:
                 self._stacks.programs.on_enter = self._enter
 
     def hand_over(self, program: SimulatedProgram, successor: SimulatedProgram) -> None:
-        """Let a main that is started again have the terminal of the one before."""
+        """Give the terminal of a main to the one that starts again."""
         if program in self._all:
             self._all[successor] = self._all[program]
 
@@ -274,7 +269,7 @@ class Terminals:
         return NoTerminal(self._stdin) if terminal is None else terminal.stream
 
     def show(self, terminal: Terminal, has_screen: bool) -> None:
-        """Let what the main that runs prints go to its terminal, or no longer."""
+        """Send the output of the running main to its terminal, or not."""
         terminal.has_screen = has_screen
         self._enter(self._stacks.programs.present)
 
@@ -284,7 +279,7 @@ class Terminals:
         self._put(1, terminal if terminal is not None and terminal.has_screen else None)
 
     def _put(self, number: int, terminal: Terminal | None) -> None:
-        """Make a terminal, or what was there before the run, a standard stream of the process."""
+        """Make a terminal (None: the original) a standard stream of the process."""
         if terminal is self._at.get(number):
             return
         if number not in self._real:
@@ -312,7 +307,7 @@ class Terminals:
 
 @contextmanager
 def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
-    """Let mains read from terminals of their own, and nobody from that of rsltrace."""
+    """Let mains read from their simulated terminals, and no node from the real one."""
     terminals = Terminals(stacks)
     real_stdin = sys.stdin
     with ExitStack() as stack:
@@ -329,7 +324,7 @@ def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
 
 
 def _terminal_of_caller(terminals: Terminals) -> Terminal | None:
-    """Return the terminal of whoever asks, if it is a main's code that does."""
+    """Return the terminal of the calling main, None for other code."""
     stacks = calling_runtime()
     return None if stacks is None or stacks.event.handle is None else terminals.present
 
@@ -342,9 +337,8 @@ def _inputs(real: Callable[..., str]) -> Callable[..., str]:
         if isinstance(sys.stdin, NoTerminal):
             refuse_reading("input()")
             return real(prompt)
-        shown_on = sys.stdout  # the node's own words, as all that it prints
-        shown_on.write(str(prompt))
-        shown_on.flush()
+        sys.stdout.write(str(prompt))
+        sys.stdout.flush()
         line = sys.stdin.readline()
         if not line:
             raise EOFError

@@ -1,9 +1,9 @@
 """Generates the serializer of a message class as Python source.
 
-Serializing is the hottest code of a simulation, so each class gets a function of its own: nested
-messages are flattened, values of fixed size that follow each other become one precompiled
-`struct.Struct` (padding included, always zero), and what follows a string or sequence picks among
-precompiled ones by its position modulo 8. For ``std_msgs/msg/Header`` it reads about so::
+Serializing is the hottest code of a simulation, so each class gets its own function. Nested
+messages are flattened, and adjacent values of fixed size become one precompiled `struct.Struct`
+with zeros as padding. After a string or sequence, the position modulo 8 selects the struct. For
+``std_msgs/msg/Header`` it is about::
 
     def serialize(m):
         try:
@@ -20,7 +20,7 @@ precompiled ones by its position modulo 8. For ``std_msgs/msg/Header`` it reads 
             pass
         return careful(m)
 
-Whatever is not as usual is left to the careful serializer (`codec_encode`).
+Unusual values are left to the careful serializer (`checked_codec.encode`).
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _ONLY_BOOL = frozenset({bool})
 
 
 def make_serializer(spec: Message) -> Callable[[Any], bytes]:
-    """Return a function from a message to its CDR bytes; it raises what `encode` raises."""
+    """Return a function from a message to its CDR bytes, with the errors of `encode`."""
     return _Writer(spec).function()
 
 
@@ -128,7 +128,7 @@ class _Writer:
 
     def primitive(self, type_: Primitive, value: str) -> None:
         if type_.name == "char":
-            self.checks.append("False")  # only IDL files can have it; not worth fast code
+            self.checks.append("False")  # only IDL files can have it; no fast code
         elif type_.name == "boolean":
             self.checks.append(f"type({value}) is bool")
         elif type_.name != "octet":  # struct itself insists on bytes of length 1
@@ -226,7 +226,7 @@ class _Writer:
         self.place = place.joined(START)
 
     def loop(self, item: Item, sequence: str, place: KnownOffset) -> None:
-        """Write a loop over items, at whose every turn ``place`` holds."""
+        """Write a loop over items; ``place`` holds at every turn."""
         if not self.begun:
             self.emit(repr(HEADER))
             self.begun = True
@@ -252,7 +252,7 @@ class _Writer:
         return data
 
     def need_list(self, value: str) -> None:
-        # At once, not with the other checks: what follows walks through it.
+        # At once, not with the other checks, as the next lines iterate over it.
         self.source.line(
             f"if type({value}) is not list and type({value}) is not tuple: raise Unusual"
         )
@@ -277,7 +277,7 @@ class _Writer:
         self.parts.append(part)
 
     def flush(self) -> None:
-        """Emit the checks and the run of fixed-size values gathered so far."""
+        """Emit the gathered checks and the run of fixed-size values."""
         if self.checks:
             self.source.line(f"if not ({' and '.join(self.checks)}): raise Unusual")
             self.checks = []

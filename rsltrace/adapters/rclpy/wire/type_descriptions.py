@@ -1,8 +1,7 @@
-"""What an interface is made of, as ``~/get_type_description`` answers it.
+"""Descriptions of interfaces for ``~/get_type_description``.
 
-rosidl compiles the description of every interface into its type support library. It is read from
-there, through the same pointers that rcl follows: the answer is that of a native node, whether or
-not definition files are installed. Interfaces that nobody has built have it in a file.
+rosidl compiles them into the type support libraries; they are read through the same pointers that
+rcl follows. Those of interfaces that are not built are in a file.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ _GET_HASH = CFUNCTYPE(POINTER(_Hash), c_void_p)
 _GET_DESCRIPTION = CFUNCTYPE(POINTER(_Description), c_void_p)
 _GET_SOURCES = CFUNCTYPE(POINTER(_sequence_of(_Source)), c_void_p)
 
-# How many pointers stand before the three functions in rosidl's type support structures.
+# The number of pointers before the three functions in rosidl's type support structures.
 _BEFORE = {"message": 3, "service": 8, "action": 5}
 
 
@@ -124,7 +123,7 @@ def _pointer(capsule: Any) -> int:
 
 @cache
 def type_description(interface: Any) -> TypeDescription | None:
-    """Describe a message, service or action class; None if its type support cannot tell."""
+    """Describe a message, service or action class; None if its type support has no description."""
     metaclass = type(interface)
     if metaclass._TYPE_SUPPORT is None:
         metaclass.__import_type_support__()
@@ -156,7 +155,7 @@ def type_description(interface: Any) -> TypeDescription | None:
 
 
 def _from_file(name: str) -> TypeDescription | None:
-    """Read what rosidl has written down of an interface whose type support is not compiled."""
+    """Read rosidl's description of an interface whose type support is not compiled."""
     read = installed_description(name)
     if read is None:
         return None
@@ -210,7 +209,7 @@ def _text(string: Any) -> str:
 
 
 def answer_request(request: Any, response_type: Any, interfaces: Iterable[Any]) -> Any:
-    """Answer a GetTypeDescription request from the interfaces that a node uses, as rcl does."""
+    """Answer a GetTypeDescription request about a node's interfaces, as rcl does."""
     from type_description_interfaces.msg import TypeSource
 
     wanted = str(request.type_hash)
