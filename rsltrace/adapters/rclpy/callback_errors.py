@@ -105,7 +105,7 @@ class RclpyAdapter:
         self._logs = logs
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Record what the event under way raised, and decide what becomes of the run."""
+        """Record an exception of the current event, and decide how the run goes on."""
         stacks = self._stacks
         if isinstance(error, RunEnded):
             if not (stacks.ending.closing and isinstance(error.__context__, KeyboardInterrupt)):
@@ -113,8 +113,8 @@ class RclpyAdapter:
             error = error.__context__  # interrupted, and cut off while it cleaned up
         if os.getpid() != stacks.runners.process:
             end_child(error)
-        told_to_end = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
-        note = described if told_to_end else note_raised
+        is_ending = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
+        note = described if is_ending else note_raised
         raised = note(stacks.dispatcher, error, handle)
         mailbox = None if isinstance(handle, OutsideEvent) else mailbox_of(handle)
         node = self._logging_node(error)

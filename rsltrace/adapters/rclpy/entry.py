@@ -57,7 +57,7 @@ class Entry:
     program: object | None = None
     """The executable of a real process, for ``World.start_process``."""
     is_component: bool = False
-    """Whether ``make`` asks a container to load it."""
+    """Whether ``make`` requests a container to load it."""
     respawn: tuple[int, int | None] | None = None
     """How much later (ns) a process starts again that has ended, and how often (None: always)."""
     required: bool = False

@@ -1,4 +1,4 @@
-"""Faults of nodes that the job asks for: crash, hang, restart.
+"""Faults of nodes, as the job says: crash, hang, restart.
 
 A fault affects the node's process. Each entry of a job stands for one, whether the job constructs
 its nodes, a main makes them, or they are in a real process. Each fault is an event of its own,

@@ -122,7 +122,7 @@ class RclpyBoundary:
 
     @property
     def is_free(self) -> bool:
-        """Whether no simulation is under way in this process."""
+        """Whether no simulation is running in this process."""
         return self._world is None
 
     def now_ns(self) -> int:
@@ -286,40 +286,40 @@ class RclpyBoundary:
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return topic_types(node.asked_graph.publishers_of(node.node_named(name, namespace)))
+        return topic_types(node.usable_graph.publishers_of(node.node_named(name, namespace)))
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return topic_types(node.asked_graph.subscriptions_of(node.node_named(name, namespace)))
+        return topic_types(node.usable_graph.subscriptions_of(node.node_named(name, namespace)))
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return _service_types(node.asked_graph.services_of(node.node_named(name, namespace)))
+        return _service_types(node.usable_graph.services_of(node.node_named(name, namespace)))
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        return _service_types(node.asked_graph.clients_of(node.node_named(name, namespace)))
+        return _service_types(node.usable_graph.clients_of(node.node_named(name, namespace)))
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
     ) -> list[tuple[str, list[str]]]:
-        return node.asked_graph.topic_names_and_types()
+        return node.usable_graph.topic_names_and_types()
 
     def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return node.asked_graph.service_names_and_types()
+        return node.usable_graph.service_names_and_types()
 
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, _PUBLISHER) for p in node.asked_graph.publishers(topic)]
+        return [_endpoint_info(p, _PUBLISHER) for p in node.usable_graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.asked_graph.subscriptions(topic)]
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.usable_graph.subscriptions(topic)]
 
     # -- messages ----------------------------------------------------------------------------------
 

@@ -1,6 +1,6 @@
 """How the simulated middleware gets behind rclpy, and away again.
 
-The reference ``_rclpy`` is exchanged in every loaded rclpy module and in
+The reference ``_rclpy`` is replaced in every loaded rclpy module and in
 ``rclpy.impl.implementation_singleton`` (for modules that load later), and afterwards put back.
 """
 
@@ -237,13 +237,13 @@ KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
 _UNUSED = {"add_to_waitset"}  # executors get no wait set here
 
 
-def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> None:
+def check_release(real: Any, replacement: Any, handles: dict[str, type], package: Path) -> None:
     """Raise SetupError if rclpy uses a name of the extension that is missing here.
 
-    ``real`` is the extension, ``stand_ins`` the object in its place, ``handles`` are the classes
+    ``real`` is the extension, ``replacement`` the object in its place, ``handles`` are the classes
     of the objects it makes by their names, ``package`` is the folder of rclpy's sources.
     """
-    missing = missing_parts(real, stand_ins, handles, package)
+    missing = missing_parts(real, replacement, handles, package)
     if missing:
         raise SetupError(
             f"this version of rsltrace cannot simulate the rclpy in {package}: it uses "
@@ -253,13 +253,15 @@ def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: 
         )
 
 
-def missing_parts(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> list[str]:
+def missing_parts(
+    real: Any, replacement: Any, handles: dict[str, type], package: Path
+) -> list[str]:
     """Return the names of the extension that rclpy's sources use and that are missing, sorted."""
     # Sources also mention names for type checkers; the extension has none of those.
     lacking = [
         (rf"\b_rclpy\.{name}\b", name)
         for name in dir(real)
-        if name[0].isalpha() and not hasattr(stand_ins, name)
+        if name[0].isalpha() and not hasattr(replacement, name)
     ]
     for name, handle in handles.items():
         for method in vars(getattr(real, name, object)):

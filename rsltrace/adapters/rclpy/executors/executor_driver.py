@@ -65,7 +65,7 @@ class ExecutorDriver:
         self.wake()
 
     def remove(self, node: Any) -> None:
-        """Leave what is ready of a node in its mailbox, for whoever spins it next."""
+        """Stop running a node's callbacks; ready ones stay in its mailbox."""
         mailbox = self.nodes.pop(node, None)
         if mailbox is not None and mailbox.driver is self:
             mailbox.driver = None

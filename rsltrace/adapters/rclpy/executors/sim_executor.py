@@ -29,7 +29,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
         super().__init__(context=context)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        """Run a callback or coroutine right after the present event."""
+        """Run a callback or coroutine right after the current event."""
         if type(callback) in (ResumeTask, EventSetter) or is_bookkeeping(callback):
             callback(*args)  # rclpy's own, not an event
             return None

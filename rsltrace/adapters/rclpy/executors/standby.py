@@ -167,7 +167,7 @@ def _is_free(item: Any) -> bool:
     """Return whether a callback may run now, without asking a custom callback group."""
     try:
         group, own = item.wrapper.callback_group, item.own_group
-    except AttributeError:  # no entity of rclpy's, or one that nobody runs any more
+    except AttributeError:  # no entity of rclpy, or one that no longer runs
         wrapper = getattr(item, "wrapper", None)
         group = getattr(wrapper, "callback_group", None)
         return group is None or not (is_custom(group) or is_busy(group, wrapper))

@@ -70,7 +70,7 @@ def replaced_function_called(stacks: Runtime) -> Iterator[None]:
 def note_replaced_functions(
     stacks: Runtime, executor: type | None = None, *, hosted: bool = False
 ) -> None:
-    """Report functions that user code replaced and nobody calls.
+    """Report functions that user code replaced and that are never called.
 
     The bases of the class ``executor`` are checked, too. ``hosted``: the job constructs nodes.
     """

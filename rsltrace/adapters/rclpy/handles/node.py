@@ -210,48 +210,48 @@ class NodeHandle(Destroyable, Participant):
         return {name: parameter_class(name, value=value) for name, value in values.items()}
 
     def get_count_publishers(self, topic: str) -> int:
-        return len(self.asked_graph.publishers(topic))
+        return len(self.usable_graph.publishers(topic))
 
     def get_count_subscribers(self, topic: str) -> int:
-        return len(self.asked_graph.subscriptions(topic))
+        return len(self.usable_graph.subscriptions(topic))
 
     def get_count_clients(self, service: str) -> int:
-        return len(self.asked_graph.clients(service))
+        return len(self.usable_graph.clients(service))
 
     def get_count_services(self, service: str) -> int:
-        return len(self.asked_graph.services(service))
+        return len(self.usable_graph.services(service))
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        return [(node.name, node.namespace) for node in self.asked_graph.nodes]
+        return [(node.name, node.namespace) for node in self.usable_graph.nodes]
 
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
-        return [(node.name, node.namespace, "/") for node in self.asked_graph.nodes]
+        return [(node.name, node.namespace, "/") for node in self.usable_graph.nodes]
 
     def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
-        return action_names_and_types(self.asked_graph.topic_names_and_types())
+        return action_names_and_types(self.usable_graph.topic_names_and_types())
 
     def get_action_client_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        ends = self.asked_graph.subscriptions_of(self.node_named(name, namespace))
+        ends = self.usable_graph.subscriptions_of(self.node_named(name, namespace))
         return action_names_and_types(topic_types(ends))
 
     def get_action_server_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        ends = self.asked_graph.publishers_of(self.node_named(name, namespace))
+        ends = self.usable_graph.publishers_of(self.node_named(name, namespace))
         return action_names_and_types(topic_types(ends))
 
     def node_named(self, name: str, namespace: str) -> Participant:
         """Return a participant of the graph. Raises NodeNameNonExistentError if there is none."""
-        found = self.asked_graph.node_named(full_name(namespace, name))
+        found = self.usable_graph.node_named(full_name(namespace, name))
         if found is None:
             missing = full_name(namespace, name)
             raise self.real.NodeNameNonExistentError(f"cannot find node {missing}")
         return found
 
     @property
-    def asked_graph(self) -> Graph:
+    def usable_graph(self) -> Graph:
         """The graph, for calls of user code. Raises RCLError if the context is shut down."""
         self.require_up("failed to ask the graph")
         return self.stacks.domain.graph

@@ -17,7 +17,7 @@ from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
 
 _PLACES_MAX = 1000
 """The most lines recorded per entity: a program may generate code without end."""
-_LOOKS_FIRST = 32
+_LOOKUPS_FIRST = 32
 _STRIDE = 256
 """Callers are looked up for the first 32 outputs of each callback; then for about every 256th."""
 
@@ -29,29 +29,29 @@ class CallSites:
     not ``running``.
     """
 
-    __slots__ = ("_dispatcher", "_entity", "_looks", "_told", "due", "running")
+    __slots__ = ("_dispatcher", "_entity", "_lookups", "_recorded", "due", "running")
 
     def __init__(self, dispatcher: Dispatcher, entity: int) -> None:
         self._dispatcher = dispatcher
         self._entity = entity
-        self._told: set[tuple[int, str, int, int]] = set()
-        self._looks: dict[int, int] = {}
+        self._recorded: set[tuple[int, str, int, int]] = set()
+        self._lookups: dict[int, int] = {}
         self.due = 0
         self.running = -1
 
     def look(self, sent: int) -> None:
         """Record the caller of the rclpy method that has called ours the ``sent``-th time."""
         running = self._dispatcher.event.entity
-        looks = self._looks[running] = self._looks.get(running, 0) + 1
+        lookups = self._lookups[running] = self._lookups.get(running, 0) + 1
         is_due = sent == self.due
-        if looks < _LOOKS_FIRST:
+        if lookups < _LOOKUPS_FIRST:
             self.due = sent + 1
         elif is_due:  # uneven steps, as callbacks may repeat in even ones
             self.due = sent + _STRIDE // 2 + sent * 7919 % _STRIDE
         self.running = running
-        if looks <= _LOOKS_FIRST or is_due:
+        if lookups <= _LOOKUPS_FIRST or is_due:
             self._look(sys._getframe(3), running)
-        if looks == _LOOKS_FIRST and (recorder := self._dispatcher.recorder) is not None:
+        if lookups == _LOOKUPS_FIRST and (recorder := self._dispatcher.recorder) is not None:
             _record_line(self._dispatcher, self._entity, recorder.outputs, "", "")
 
     def _look(self, frame: FrameType, running: int) -> None:
@@ -61,8 +61,8 @@ class CallSites:
             return
         code = found.f_code
         key = running, code.co_filename, found.f_lineno, found.f_lasti  # hashing code takes long
-        if key not in self._told and len(self._told) < _PLACES_MAX:
-            self._told.add(key)
+        if key not in self._recorded and len(self._recorded) < _PLACES_MAX:
+            self._recorded.add(key)
             output = recorder.outputs
             _record_code(
                 self._dispatcher, self._entity, code, found.f_globals, found.f_lineno, output
@@ -78,8 +78,8 @@ class FunctionRecorder:
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
         self._known: dict[tuple[int, int], object] = {}  # by id: hashing code takes long
-        self._told: set[tuple[int, CodeType]] = set()
-        self._met = 0
+        self._recorded: set[tuple[int, CodeType]] = set()
+        self._calls = 0
 
     def run(self, entity: int, callback: Any, args: tuple[Any, ...] = ()) -> None:
         """Record that the current event runs a function for ``entity``; the function may be in
@@ -91,8 +91,8 @@ class FunctionRecorder:
             or (entity, _address(plain.__code__)) in self._known
         ):
             return
-        self._met += 1
-        if self._met > _LOOKS_FIRST and self._met % _STRIDE:
+        self._calls += 1
+        if self._calls > _LOOKUPS_FIRST and self._calls % _STRIDE:
             return
         for one in (callback, *args):
             found = function_of(one)
@@ -108,8 +108,8 @@ class FunctionRecorder:
                 return
 
     def _record_function(self, entity: int, code: CodeType, names: Any) -> None:
-        if (entity, code) not in self._told and len(self._told) < _PLACES_MAX:
-            self._told.add((entity, code))
+        if (entity, code) not in self._recorded and len(self._recorded) < _PLACES_MAX:
+            self._recorded.add((entity, code))
             _record_code(self._dispatcher, entity, code, names, code.co_firstlineno, NO_SEQUENCE)
 
 
@@ -124,8 +124,8 @@ def _record_code(
 def _record_line(dispatcher: Dispatcher, entity: int, output: int, place: str, name: str) -> None:
     recorder = dispatcher.recorder
     if recorder is not None:
-        told = CodeLine(recorder.index, entity, output, place, name)
-        recorder.code_line(told, dispatcher.loop.now_ns)
+        line = CodeLine(recorder.index, entity, output, place, name)
+        recorder.code_line(line, dispatcher.loop.now_ns)
 
 
 def _caller(frame: FrameType) -> FrameType | None:

@@ -91,7 +91,7 @@ class TaskRun:
         self.cause_output = 0
         self.input_hash = 0
         self._on_end = on_end
-        self._is_told = kind != _TASK  # others run their entity's callback
+        self._is_recorded = kind != _TASK  # others run their entity's callback
         self._awaited: Any = None
 
     def dispatch(self) -> None:
@@ -152,8 +152,8 @@ class TaskRun:
     def _step(self) -> None:
         coroutines = self._coroutines
         coroutines.suspended.pop(self, None)
-        if not self._is_told:
-            self._is_told = True
+        if not self._is_recorded:
+            self._is_recorded = True
             coroutines.functions.run(self.entity, *self.called)
         self._awaited = None
         task = self.task
@@ -183,8 +183,8 @@ class TaskRun:
 def _run_oldest_first() -> bool:
     from rclpy.executors import Executor
 
-    looks = getattr(Executor, "_wait_for_ready_callbacks", None)
-    return looks is None or "reversed(tasks)" not in inspect.getsource(looks)
+    wait = getattr(Executor, "_wait_for_ready_callbacks", None)
+    return wait is None or "reversed(tasks)" not in inspect.getsource(wait)
 
 
 class ResumeTask:

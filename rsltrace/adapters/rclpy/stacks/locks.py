@@ -308,4 +308,4 @@ class _LockHolder:
         for blocked in self._stacks.runners.blocked:
             if blocked.stack is self._owner:
                 return f"a lock that is held by {blocked.describe()}"
-        return "a lock that nobody will release"
+        return "a lock that no thread will release"

@@ -40,7 +40,7 @@ def describe_awaited(graph: Graph, future: object) -> str:
         what: str = action.waits_for(future)
         if what:
             return what
-    return "a Future that nobody completes"
+    return "a Future that no callback completes"
 
 
 def describe_service_call(graph: Graph, frame: FrameType | None) -> str:

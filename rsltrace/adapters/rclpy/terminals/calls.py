@@ -103,7 +103,7 @@ ShowTerminal = Callable[[Terminal, bool], None]
 
 
 @contextmanager
-def simulated_curses(asking: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
+def simulated_curses(caller_terminal: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
     """Let curses wait for keys in simulated time within the ``with`` block."""
     try:
         import _curses
@@ -115,24 +115,24 @@ def simulated_curses(asking: TerminalOfCaller, show: ShowTerminal) -> Iterator[N
     limit = _curses.window.timeout
     with ExitStack() as stack:
         for name in _READS:
-            making = partial(_reading, asking, limits_ms, all_ms, limit)
+            making = partial(_reading, caller_terminal, limits_ms, all_ms, limit)
             exchange(stack, _curses.window, name, making)
-        exchange(stack, _curses.window, "refresh", partial(_drained, asking))
+        exchange(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
         exchange(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
         exchange(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
-        redirect(stack, _curses.doupdate, partial(_drained, asking))
+        redirect(stack, _curses.doupdate, partial(_drained, caller_terminal))
         redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
         for function in (_curses.setupterm, _curses.initscr):
-            redirect(stack, function, partial(_beginning, asking, show))
-        redirect(stack, _curses.endwin, partial(_ending, asking, show))
+            redirect(stack, function, partial(_beginning, caller_terminal, show))
+        redirect(stack, _curses.endwin, partial(_ending, caller_terminal, show))
         yield
 
 
 def _beginning(
-    asking: TerminalOfCaller, show: ShowTerminal, real: Callable[..., Any]
+    caller_terminal: TerminalOfCaller, show: ShowTerminal, real: Callable[..., Any]
 ) -> Callable[..., Any]:
     def begin(*arguments: Any, **options: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is None:
             refuse_reading(f"curses.{real.__name__}()")
         else:
@@ -143,13 +143,13 @@ def _beginning(
 
 
 def _ending(
-    asking: TerminalOfCaller, show: ShowTerminal, real: Callable[[], Any]
+    caller_terminal: TerminalOfCaller, show: ShowTerminal, real: Callable[[], Any]
 ) -> Callable[[], Any]:
     def end() -> Any:
         try:
             return real()
         finally:
-            terminal = asking()
+            terminal = caller_terminal()
             if terminal is not None:
                 terminal.drain()
                 show(terminal, False)
@@ -157,11 +157,11 @@ def _ending(
     return end
 
 
-def _drained(asking: TerminalOfCaller, real: Any) -> Any:
+def _drained(caller_terminal: TerminalOfCaller, real: Any) -> Any:
     """Discard what is shown."""
 
     def shown(*arguments: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is not None:
             terminal.drain()
         return real(*arguments)
@@ -170,12 +170,16 @@ def _drained(asking: TerminalOfCaller, real: Any) -> Any:
 
 
 def _reading(
-    asking: TerminalOfCaller, limits_ms: dict[int, int], all_ms: list[int], limit: Any, real: Any
+    caller_terminal: TerminalOfCaller,
+    limits_ms: dict[int, int],
+    all_ms: list[int],
+    limit: Any,
+    real: Any,
 ) -> Any:
     name = real.__name__
 
     def read(self: Any, *arguments: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is None:
             refuse_reading(f"curses: {name}()")
             return real(self, *arguments)
@@ -390,8 +394,8 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
     return ready
 
 
-def _is_stdin(thing: Any) -> bool:
-    if isinstance(thing, int):
-        return thing == 0
-    fileno = getattr(thing, "fileno", None)
+def _is_stdin(stream: Any) -> bool:
+    if isinstance(stream, int):
+        return stream == 0
+    fileno = getattr(stream, "fileno", None)
     return fileno is not None and fileno() == 0

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from rsltrace.adapters.rclpy.wire.interface_classes import (
@@ -77,10 +78,12 @@ def installed_type_hash(name: str) -> str | None:
 
 
 def installed_description(name: str) -> Any:
-    """Return the type description of an interface from its JSON file, or None."""
+    """Return the type description in an interface's JSON file, as attributes, or None."""
     package, kind, type_ = name.split("/")
     path = _installed_file(package, kind, f"{type_}.json")
-    return None if path is None else json.loads(path.read_text("utf-8"))
+    if path is None:
+        return None
+    return json.loads(path.read_text("utf-8"), object_hook=lambda item: SimpleNamespace(**item))
 
 
 def installed_file_text(name: str) -> str | None:

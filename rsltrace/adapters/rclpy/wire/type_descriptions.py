@@ -159,30 +159,11 @@ def _from_file(name: str) -> TypeDescription | None:
     read = installed_description(name)
     if read is None:
         return None
-    whole, hashes = read["type_description_msg"], read["type_hashes"]
-    types = [whole["type_description"], *whole["referenced_type_descriptions"]]
-    text = installed_file_text(name)
-    kind = name.split("/")[1]
+    whole, text = read.type_description_msg, installed_file_text(name)
     return TypeDescription(
-        type_hash=next(h["hash_string"] for h in hashes if h["type_name"] == name),
-        types=tuple(
-            (
-                described["type_name"],
-                tuple(
-                    (
-                        field["name"],
-                        field["type"]["type_id"],
-                        field["type"]["capacity"],
-                        field["type"]["string_capacity"],
-                        field["type"]["nested_type_name"],
-                        field["default_value"],
-                    )
-                    for field in described["fields"]
-                ),
-            )
-            for described in types
-        ),
-        sources=() if text is None else ((name, kind, text),),
+        type_hash=next(h.hash_string for h in read.type_hashes if h.type_name == name),
+        types=tuple(map(_type, [whole.type_description, *whole.referenced_type_descriptions])),
+        sources=() if text is None else ((name, name.split("/")[1], text),),
     )
 
 
@@ -201,10 +182,14 @@ def _type(described: Any) -> tuple[str, tuple[tuple[str, int, int, int, str, str
 
 
 def _items(sequence: Any) -> list[Any]:
+    if isinstance(sequence, list):  # from a file
+        return sequence
     return [sequence.data[index] for index in range(sequence.size)]
 
 
 def _text(string: Any) -> str:
+    if isinstance(string, str):  # from a file
+        return string
     return string_at(string.data, string.size).decode() if string.data else ""
 
 
