@@ -119,7 +119,7 @@ class ProcessSubscription(_Named, Subscription):
             SUBSCRIPTION,
             self.process.go_on_with,
             (self.number, Ready.ENTITY, self._packed(delivery)),
-            *delivery[self.origin],
+            *delivery[5:8],
         )
 
     def take(self) -> bytes | None:
@@ -128,8 +128,10 @@ class ProcessSubscription(_Named, Subscription):
 
     def _packed(self, delivery: Delivery) -> bytes:
         self._received += 1
-        received_ns, _, _, _, data, _, _, _, sent_ns, number = delivery
-        return packed_item(sent_ns, received_ns or sent_ns, number, self._received, _NO_GID, data)
+        received_ns = delivery[0] or delivery[8]
+        return packed_item(
+            delivery[8], received_ns, delivery[9], self._received, _NO_GID, delivery[4]
+        )
 
 
 class ProcessService(_Named, Service):

@@ -97,7 +97,7 @@ _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP
 _ERROR = 40
 
 
-class RclpyAdapter:
+class RclpyExceptionHandler:
     """Handles exceptions of rclpy's nodes, and of everything that the job constructs."""
 
     def __init__(self, stacks: Runtime, logs: RosoutLogs) -> None:

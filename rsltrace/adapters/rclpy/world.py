@@ -13,7 +13,7 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.boundary.boundary import BoundaryContext, RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.installation import installed
-from rsltrace.adapters.rclpy.callback_errors import RclpyAdapter
+from rsltrace.adapters.rclpy.callback_errors import RclpyExceptionHandler
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.executors.user_executors import note_replaced_functions, own_executors
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
@@ -68,7 +68,7 @@ class World:
         self.parameters: dict[str, Parameters] = {}
         self._seed = seed
         self._logs = RosoutLogs(self.domain, base_dir=base_dir, echo=echo)
-        self.domain.dispatcher.door = RclpyAdapter(self.stacks, self._logs)
+        self.domain.dispatcher.door = RclpyExceptionHandler(self.stacks, self._logs)
         self._surroundings = BoundaryContext(self.stacks, self._logs, self.states)
         self._boundary: RclpyBoundary
         self._terminals: Terminals

@@ -25,7 +25,7 @@ from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Qos, Reliability
 from rsltrace.simulation.middleware.qos.status import MESSAGE_LOST
 from rsltrace.simulation.middleware.qos.timing import RequestedLease, finite
-from rsltrace.simulation.middleware.subscription import SENT_NS, Delivery, Subscription
+from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT
 from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
@@ -137,7 +137,7 @@ def direct_send(dispatcher: Dispatcher, link: OrderedLink) -> Send:
 
 
 # Canonical CDR, publishing event, which of its outputs, content hash, publication stamp (ns) and
-# number: the part of a Delivery from DATA on.
+# number: what a Delivery has from [4] on.
 Message = tuple[bytes, int, int, int, int, int]
 
 _DELAY = encode_draw(Draw.DELAY)
@@ -338,7 +338,7 @@ class Link:
             if subscription.deadline is not None:
                 subscription.deadline.seen()
             if self._lifespan_ns != INFINITE_NS:
-                stale_ns = arrived[SENT_NS] + self._lifespan_ns
+                stale_ns = arrived[8] + self._lifespan_ns
                 if stale_ns <= loop.now_ns:
                     return
                 loop.schedule_release(stale_ns, self._expire, arrived)

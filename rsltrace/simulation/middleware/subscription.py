@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
@@ -20,10 +20,13 @@ SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
 Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
 """A message on its way. It is a plain tuple like the loop's releases, because one is made for each
 message and subscription, and the loop sorts them. Its positions have names; hot paths unpack it."""
-RECEIVED_NS, ORDER, PLACE, ARRIVE, DATA, EVENT, OUTPUT, DIGEST, SENT_NS, NUMBER = range(10)
-"""Reception stamp; order and place in the loop's queue, and the function that it calls; canonical
-CDR; index of the publishing event, which of its outputs, content hash; publication stamp and
-number."""
+RECEIVED_NS: Final = 0  # reception stamp
+DATA: Final = 4  # canonical CDR; before it are order, place and receiver, as in the loop's releases
+EVENT: Final = 5  # index of the publishing event
+OUTPUT: Final = 6  # which of its outputs
+DIGEST: Final = 7  # hash of the content
+SENT_NS: Final = 8  # publication stamp
+NUMBER: Final = 9  # publication number
 
 
 class Subscription(Receiver):
