@@ -341,8 +341,9 @@ def _inputs(real: Callable[..., str]) -> Callable[..., str]:
         if isinstance(sys.stdin, NoTerminal):
             refuse_reading("input()")
             return real(prompt)
-        sys.stdout.write(str(prompt))
-        sys.stdout.flush()
+        output = sys.stdout  # of the node, as all that it prints
+        output.write(str(prompt))
+        output.flush()
         line = sys.stdin.readline()
         if not line:
             raise EOFError
