@@ -65,7 +65,7 @@ def where_to_get(package: str) -> str:
     if package in _WHEELS:
         return f"Source the ROS 2 workspace that holds it, or: pip install {debian}"
     return (
-        "There is no known wheel of it: put its sources (package.xml, .msg, .srv and .action "
+        "There is no wheel of it: put its sources (package.xml, .msg, .srv and .action "
         "files) into a folder of search_path, and its classes are made from them; or source the "
         f"ROS 2 workspace that holds it (for one of ROS's own: apt install {debian}, then source "
         f"/opt/ros/{distro}/setup.bash), and run rsltrace with the Python that it is built for"
