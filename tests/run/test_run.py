@@ -204,7 +204,7 @@ def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
         ("no_such_module:Talker", ["job.yaml:1:16: ", "no module 'no_such_module'"]),
         ("nodes_under_test:Tolker", ["job.yaml:1:16: ", "'Tolker'", "did you mean 'Talker'"]),
         ("nodes_under_test:TALL", ["not callable"]),
-        ("nodes_under_test:something", ["gave a int, not an rclpy Node"]),
+        ("nodes_under_test:something", ["returned a int, not an rclpy Node"]),
     ],
 )
 def test_what_cannot_be_constructed_is_explained(

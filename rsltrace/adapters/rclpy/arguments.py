@@ -1,8 +1,7 @@
 """ROS arguments (``--ros-args -r … -p … --params-file …``), parsed by rcl itself.
 
-Remapping and parameter files have many rules: wildcards, precedence, the types of YAML scalars.
-rclpy reaches rcl's parser only through a Node, which would open a DDS participant; so the same C
-functions are called here directly. They are plain C and touch no middleware.
+The rules are many: wildcards, precedence, the types of YAML scalars. rclpy reaches rcl's parser
+only through a Node, which opens a DDS participant, so the C functions are called directly here.
 """
 
 from __future__ import annotations
@@ -158,11 +157,11 @@ class InvalidArgumentsError(ValueError):
 
 
 class UnknownArgumentsError(InvalidArgumentsError):
-    """There are words among the ROS arguments that mean nothing to rcl; the text lists them."""
+    """rcl does not know some of the ROS arguments; the text lists them."""
 
 
 class RosArguments:
-    """A parsed argument list. Free of ROS: ``RosArguments([])`` remaps nothing."""
+    """A parsed argument list; ``RosArguments([])`` remaps nothing."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
         """Parse ``arguments``.
@@ -184,7 +183,6 @@ class RosArguments:
             raise UnknownArgumentsError(f"unknown ROS arguments: {self._unknown()}")
 
     def _unknown(self) -> list[str]:
-        """Return the words that rcl makes nothing of."""
         count = self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed))
         places = POINTER(ctypes.c_int)()
         self._rcl.rcl_arguments_get_unparsed_ros(
@@ -211,7 +209,7 @@ class RosArguments:
         return re.sub(r", at \S+:\d+", "", text.decode(errors="replace"))
 
     def log_levels(self) -> dict[str, str]:
-        """Return the names of the levels that ``--log-level`` gives; by logger, ``""`` for all."""
+        """Return the levels of ``--log-level`` by logger, ``""`` for all."""
         levels: dict[str, str] = {}
         for flag, value in zip(self.arguments, self.arguments[1:], strict=False):
             if flag == "--log-level":
@@ -220,7 +218,7 @@ class RosArguments:
         return levels
 
     def rosout(self) -> bool | None:
-        """Return whether nodes shall publish on /rosout, None if nothing is said of it."""
+        """Return whether nodes publish on /rosout, None if not given."""
         said = [a for a in self.arguments if a in ("--enable-rosout-logs", "--disable-rosout-logs")]
         return said[-1].startswith("--enable") if said else None
 

@@ -1,4 +1,4 @@
-"""What becomes of a run in which user code raised: handed on, logged, or the end of it."""
+"""Exceptions of user code: passed on to a spin, logged, or the end of the run."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ import os
 import sys
 from typing import Any, NoReturn, Protocol
 
-from rsltrace.adapters.rclpy.handles.logs import Logs
+from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.hints import hint_for
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, mailbox_of
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import class_of
 from rsltrace.errors import JobError, RsltraceError, RunError, nearest
@@ -30,8 +30,6 @@ from rsltrace.simulation.middleware.publisher import Publisher, Watcher
 from rsltrace.terminal import tell
 from rsltrace.trace.model.event import EventKind
 
-# Ending a run by a message: the job's ``stop: topic:``, RSLCPP's ``/rslcpp/error_code``.
-
 
 class _TopicStop(Protocol):
     @property
@@ -41,10 +39,10 @@ class _TopicStop(Protocol):
 
 
 def watch_exit_code(loop: EventLoop, spec: _TopicStop, *, where: str) -> Watcher:
-    """Return a watcher that ends the run after the time step of the first message.
+    """Return a watcher that ends the run after the first message (``stop: topic:`` of a job).
 
-    With ``spec.exit_code`` (a dotted field path; ``where`` it stands in the job) the message's
-    field is the exit status.
+    ``spec.exit_code`` is the dotted path of the message's field that holds the exit status;
+    ``where`` is its place in the job.
     """
 
     def watch(publisher: Publisher, data: bytes) -> None:
@@ -57,7 +55,7 @@ def watch_exit_code(loop: EventLoop, spec: _TopicStop, *, where: str) -> Watcher
                 if name not in fields:
                     near = nearest(name, fields)
                     hint = f"did you mean {near!r}?" if near else f"there are {', '.join(fields)}"
-                    hint = hint if fields else "what comes before it is no message"
+                    hint = hint if fields else "the part before it is not a message"
                     raise JobError(
                         f"stop.topic.exit_code: {spec.name} is a {msg_type.__qualname__} without "
                         f"the field {spec.exit_code!r}: {hint}",
@@ -76,18 +74,15 @@ def watch_exit_code(loop: EventLoop, spec: _TopicStop, *, where: str) -> Watcher
     return watch
 
 
-# The exit status that an exception asks for, and how a forked process ends by one.
-
-
 def exit_status(error: SystemExit) -> int:
-    """Return the status with which Python would end."""
+    """Return Python's exit status."""
     if error.code is None:
         return 0
     return int(error.code) if isinstance(error.code, int) else 1
 
 
 def end_child(error: BaseException) -> NoReturn:
-    """End a process that a callback forked and left by an exception: the run is its parent's."""
+    """End a forked process whose callback raised: only the parent process runs the simulation."""
     if not isinstance(error, SystemExit):
         tell(user_traceback(error), end="")
     elif error.code is not None and not isinstance(error.code, int):
@@ -102,33 +97,33 @@ _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP
 _ERROR = 40
 
 
-class RclpyDoor:
-    """The door of rclpy's nodes, and of all that the job constructs."""
+class RclpyExceptionHandler:
+    """Handles exceptions of rclpy's nodes, and of everything that the job constructs."""
 
-    def __init__(self, stacks: Stacks, logs: Logs) -> None:
+    def __init__(self, stacks: Runtime, logs: RosoutLogs) -> None:
         self._stacks = stacks
         self._logs = logs
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
-        """Record what the event under way raised, and decide what becomes of the run."""
+        """Record an exception of the current event, and decide how the run goes on."""
         stacks = self._stacks
         if isinstance(error, RunEnded):
             if not (stacks.ending.closing and isinstance(error.__context__, KeyboardInterrupt)):
                 return
-            error = error.__context__  # it was told to end, and cut off while it saw to that
+            error = error.__context__  # interrupted, and cut off while it cleaned up
         if os.getpid() != stacks.runners.process:
             end_child(error)
-        told_to_end = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
-        note = described if told_to_end else note_raised
+        is_ending = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
+        note = described if is_ending else note_raised
         raised = note(stacks.dispatcher, error, handle)
         mailbox = None if isinstance(handle, OutsideEvent) else mailbox_of(handle)
-        node = self._who_goes_on(error)
+        node = self._logging_node(error)
         if mailbox is not None and node is None:
             self._hand_on(mailbox, raised)
         elif isinstance(error, SystemExit):
             reason = f"{raised.label} raised SystemExit"
             if error.code is not None and not isinstance(error.code, int):
-                reason += f": {raised.said}"  # what Python would print
+                reason += f": {raised.said}"  # as Python prints it
             stacks.loop.stop(Stop(reason, exit_status(error)))
         elif isinstance(error, KeyboardInterrupt):
             stacks.loop.stop(Stop("interrupted", 130))
@@ -139,7 +134,7 @@ class RclpyDoor:
             end_run(stacks.dispatcher, raised, self._run_error(raised))
 
     def _hand_on(self, mailbox: Mailbox, raised: Raised) -> None:
-        """Let an exception come out of the spin of whoever runs the callback: it is theirs."""
+        """Raise an exception out of the spin that runs the callback."""
         mailbox.raised = raised.error
         self._stacks.programs.present.failures.append(raised)
 
@@ -147,20 +142,20 @@ class RclpyDoor:
         failures = self._stacks.programs.present.failures
         earlier = next((one for one in failures if one.error is raised.error), None)
         if earlier is not None:
-            return earlier.as_error(hint_for(earlier.error))  # has come out of its main
+            return earlier.as_error(hint_for(earlier.error))  # its main raised it again
         error = raised.error
         if not isinstance(error, RsltraceError):
             return raised.as_error(hint_for(error))
-        # Raised by the middleware itself: the message says what to do, this says where.
+        # Raised by the middleware itself: its message has no place, so add one.
         failure = type(error).__new__(type(error))
         failure.__dict__.update(error.__dict__)
         Exception.__init__(failure, f"{raised.said}\n  in {raised.where}")
         return failure if isinstance(failure, RunError) else RunError(str(failure))
 
-    def _who_goes_on(self, error: BaseException) -> NodeHandle | None:
-        """Return the node whose callback's exception is only logged: its job entry says so.
+    def _logging_node(self, error: BaseException) -> NodeHandle | None:
+        """Return the node whose exceptions are only logged, as its job entry says.
 
-        What rsltrace itself refuses always ends the run; so does a node that was never made.
+        rsltrace's own errors and exceptions of constructors always end the run.
         """
         event = self._stacks.event
         node = event.node

@@ -1,4 +1,4 @@
-"""Components of a job: containers are asked to load them, as ``ros2 launch`` does it."""
+"""Components of a job: loaded by a request to their container, as ``ros2 launch`` does it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _RULES = ("-r", "--remap")
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """What a container is asked to load. ``arguments`` are what ``ros2 run`` would be given for
-    it; ``name`` and ``namespace`` are empty where it names itself."""
+    """A component to load. ``arguments`` are those of ``ros2 run``; ``name`` and ``namespace`` are
+    empty if the component names itself."""
 
     package: str
     plugin: str
@@ -35,9 +35,9 @@ class Component:
         return load_service(self.container)
 
     def load(self) -> list[Any]:
-        """Have it loaded, and wait for that; no node of this process comes of it.
+        """Load it and wait for the response; return no nodes.
 
-        :raises RunError: if the container cannot load it, and the job does not say to go on.
+        :raises RunError: if the container cannot load it, unless ``log_failure``.
         """
         import rclpy
 
@@ -70,7 +70,7 @@ class Component:
         )
 
     def _rules(self) -> Iterable[str]:
-        """Return the remappings: not those of the node's own name, which is asked for."""
+        """Return the remappings, except for the node's own name."""
         for part in self.arguments:
             for flag, rule in zip(part.arguments, part.arguments[1:], strict=False):
                 if flag in _RULES and not rule.startswith(("__node:=", "__ns:=", "__name:=")):
@@ -90,7 +90,7 @@ def load_service(container: str) -> str:
 
 
 def check_loadable(where: str) -> None:
-    """Raise ``JobError`` if nobody here can ask a container to load something."""
+    """Raise ``JobError`` if the service type for loading components is not installed."""
     try:
         _service_class()
     except SetupError as error:

@@ -1,4 +1,4 @@
-"""What is constructed in a world, and the arguments that ``ros2 run`` would give it."""
+"""Entries of a job, ready to be constructed, and their ROS arguments."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from rsltrace.trace.model.finding import Policy
 
 @dataclass(frozen=True, slots=True)
 class StartRule:
-    """When an entry starts that does not start with the run: ``delay_ns`` after all of the others
-    have come true. ``started`` and ``ended`` are keys of other entries."""
+    """Starts an entry ``delay_ns`` after all other conditions are met. ``started`` and ``ended``
+    are keys of other entries."""
 
     delay_ns: int = 0
     topic: str | None = None
@@ -29,36 +29,35 @@ class StartRule:
 
 
 Typed = tuple[int | None, bytes | None]
-"""What is typed at once, None for the end of the input, and when (ns since the start of the run),
-None for when it is asked for."""
+"""When something is typed (ns since the start of the run; None: when it is read), and the bytes
+(None: the end of the input)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One entry of a job, ready to be constructed.
 
-    ``make`` returns a node or a list of nodes; ``arguments`` are what ``ros2 run`` would give
-    them, in lists of which later ones have the last word on parameters. ``key`` is a name of its
-    own among the entries, whatever other entries there are.
+    ``make`` returns a node or a list of nodes. ``arguments`` are those of ``ros2 run``, in lists of
+    which later ones override parameters. ``key`` is unique among the entries.
     """
 
     name: str
     make: Callable[[], Any]
     arguments: list[RosArguments]
     log_exceptions: bool = False
-    """Whether a callback of its nodes that raises is logged instead of ending the run."""
+    """Whether exceptions of callbacks are logged instead of ending the run."""
     key: str = ""
     policy: Policy | None = None
     argv: list[str] | None = None
-    """The command line, if ``make`` is a main to be run in a program of its own."""
+    """The command line, if ``make`` is a main."""
     start_after: StartRule | None = None
-    """When it starts, None for those that start with the run."""
+    """None: it starts with the run."""
     stdin: Sequence[Typed] | None = None
-    """What is typed at its terminal, None if it has none."""
+    """The input of its terminal, None if it has none."""
     program: object | None = None
-    """What runs as a process of its own, if it does: ``World.start_process`` knows how."""
+    """The executable of a real process, for ``World.start_process``."""
     is_component: bool = False
-    """Whether ``make`` asks a container to load it."""
+    """Whether ``make`` requests a container to load it."""
     respawn: tuple[int, int | None] | None = None
     """How much later (ns) a process starts again that has ended, and how often (None: always)."""
     required: bool = False
@@ -80,14 +79,13 @@ def ros_arguments(
     where: str,
     for_all: Sequence[str] = (),
 ) -> list[RosArguments]:
-    """Return what ``ros2 run`` would be given for a node of a job, as lists of arguments.
+    """Return the arguments of ``ros2 run`` for a node of a job, as lists.
 
-    The job's own parameters are a list of their own: rcl would let a file's entry for one node
-    win over a parameter given for all. ``for_all`` are the job's arguments for all nodes: their
-    names go before the node's own (the first rule counts), their parameters after.
+    The job's own parameters are a separate list, as rcl prefers a file's entry for one node to a
+    parameter for all. ``for_all`` are the job's arguments for all nodes: their names come first
+    (the first rule counts), their parameters last.
 
-    :raises JobError: if rcl refuses them (a broken parameter file) or would cut a text off; it
-        begins with ``where``.
+    :raises JobError: if rcl refuses them (a broken parameter file) or would truncate a text.
     """
     arguments = list(for_all)
     if name is not None:
@@ -117,10 +115,8 @@ def ros_arguments(
 
 @contextmanager
 def _parameter_file(parameters: dict[str, str], where: str) -> Iterator[list[str]]:
-    """Yield the words for parameters that ``-p`` has no way to name, as ``ros2 launch`` gives all.
-
-    rcl reads the file at once.
-    """
+    """Yield ``--params-file`` arguments for parameters whose names ``-p`` does not allow; rcl reads
+    the file at once."""
     if not parameters:
         yield []
         return
@@ -132,7 +128,7 @@ def _parameter_file(parameters: dict[str, str], where: str) -> Iterator[list[str
 
 
 def _yaml_value(value: Any, where: str) -> str:
-    """Write a parameter so that rcl's YAML parser reads the same value and type again."""
+    """Write a parameter so that rcl's YAML parser reads the same value and type."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, int):
@@ -144,7 +140,7 @@ def _yaml_value(value: Any, where: str) -> str:
     if isinstance(value, str):
         if "\0" in value:
             raise JobError(
-                f"the parameter {value!r} has a NUL character, where ROS ends a text: leave it out",
+                f"the parameter {value!r} has a NUL character, where ROS ends a text: remove it",
                 where=where,
             )
         return '"' + "".join(map(_escaped, value)) + '"'

@@ -1,8 +1,8 @@
-"""Nodes that crash, hang or start again, because the job says so.
+"""Faults of nodes, as the job says: crash, hang, restart.
 
-What goes wrong is the process that a node is in: natively it is that which dies or is stopped. Each
-entry of a job stands for one, whether its nodes are constructed by the job, made by a main, or in a
-real process. Each fault is an event of its own, before anything else that is ready.
+A fault affects the node's process. Each entry of a job stands for one, whether the job constructs
+its nodes, a main makes them, or they are in a real process. Each fault is an event of its own,
+before anything else that is ready.
 """
 
 from __future__ import annotations
@@ -13,8 +13,11 @@ from typing import Any, Protocol, cast
 
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, SpinningExecutor
 from rsltrace.adapters.rclpy.stacks.mains import crash_program
-from rsltrace.adapters.rclpy.stacks.victims import Victims
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
@@ -24,23 +27,109 @@ from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.trace.model.event import NO_EVENT, Draw, EventKind, encode_draw
 from rsltrace.trace.model.texts import format_seconds
 
+
+class FaultedNodes:
+    """The nodes (handles) of one process that crashes or hangs: a ``program``, or the nodes of an
+    ``entry`` in the host.
+
+    A process that is killed runs nothing any more, no ``finally`` either, so its blocked calls are
+    abandoned. One that hangs is stopped between two instructions: arrivals wait, timers are late,
+    and its calls return when it goes on.
+    """
+
+    def __init__(
+        self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: Entry | None
+    ) -> None:
+        self._stacks = stacks
+        self._nodes = nodes
+        self._program = None if program is stacks.programs.host else program
+        self._entry = entry
+        self._running: list[Any] = []
+        self._spinning: list[tuple[Mailbox, SpinningExecutor]] = []
+
+    @property
+    def are_destroyed(self) -> bool:
+        return all(node.destroyed for node in self._nodes)
+
+    def hold(self) -> None:
+        """Run nothing of them until ``release``."""
+        self._keep_what_comes()
+        for node in self._nodes:
+            if node.mailbox is not None:
+                if node.mailbox.driver is not None:
+                    self._spinning.append((node.mailbox, node.mailbox.driver))
+                    node.mailbox.driver = None
+            elif node.wrapper is not None:
+                self._running.append(node.wrapper)
+                self._stacks.executor.remove_node(node.wrapper)
+
+    def release(self) -> None:
+        """Let them go on: kept items are ready now."""
+        for node in self._running:
+            if not node.handle.destroyed:
+                self._stacks.executor.add_node(node)
+        holders = self._nodes if self._program is None else [self._program, *self._nodes]
+        for holder in holders:
+            held, holder.held = holder.held, None
+            self._stacks.loop.tasks.extend(held or ())
+        for mailbox, driver in self._spinning:
+            if not mailbox.closed:
+                mailbox.driver = driver
+                driver.wake()
+
+    def crash(self) -> None:
+        """Remove them from the run, as a killed process."""
+        self._keep_what_comes()
+        stacks = self._stacks
+        for blocked in [one for one in stacks.runners.blocked if self._is_ours(one)]:
+            del stacks.runners.blocked[blocked]
+            abandon(blocked.stack)
+            blocked.stop_waiting()
+        for run in [one for one in stacks.coroutines.suspended if one.node in self._nodes]:
+            del stacks.coroutines.suspended[run]
+        for thread in list(stacks.threads.alive):
+            if thread.node in self._nodes or thread.program is self._program:
+                thread.end()
+        for node in self._nodes:
+            if node.wrapper is not None and node.mailbox is None:
+                stacks.executor.remove_node(node.wrapper)
+            if node.mailbox is not None:
+                node.mailbox.close()
+            for endpoint in stacks.domain.graph.endpoints_of(node):
+                endpoint.destroy()
+            node.destroy()
+
+    def _keep_what_comes(self) -> None:
+        """Keep their items that the loop dispatches from now on."""
+        if self._program is not None:
+            self._program.held = []
+        for node in self._nodes:
+            node.held = []
+
+    def _is_ours(self, blocked: BlockedCall) -> bool:
+        if self._program is not None:
+            return blocked.program is self._program
+        return blocked.event[2] in self._nodes or (
+            self._entry is not None and blocked.constructing is self._entry
+        )
+
+
 _DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
 
 
 class RealProcess(Protocol):
-    """A process of its own in which nodes are."""
+    """A real process with nodes."""
 
     key: str
 
     def crash(self) -> None:
-        """Be gone at once, within the event under way."""
+        """End at once, within the current event."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeFault:
-    """What happens to a node: ``kind`` is ``crash``, ``hang`` or ``restart``; ``for_ns`` as in the
-    job. When: at a time, after an event, or after a message (from 1) of a topic. ``where`` names
-    its line in the job."""
+    """A fault of a node: ``kind`` is ``crash``, ``hang`` or ``restart``. It happens at a time,
+    after an event, or after a message (from 1) of a topic. ``where`` is its line in the job."""
 
     kind: str
     node: str
@@ -53,13 +142,13 @@ class NodeFault:
 
 
 class NodeFaults(EventObserver):
-    """The faults of one run that are about nodes. Armed before the first node is made."""
+    """The node faults of a run. Make it before the first node."""
 
     order = ObserverOrder.FAULTS
 
     def __init__(self, world: World, faults: Sequence[NodeFault], start_ns: int) -> None:
         self.world = world
-        self._strikes = [_Strike(self, fault) for fault in faults]
+        self._strikes = [_ScheduledFault(self, fault) for fault in faults]
         self._counts: dict[str, int] = {}
         by_event = [strike for strike in self._strikes if strike.fault.event is not None]
         self._by_event = sorted(by_event, key=lambda strike: -(strike.fault.event or 0))
@@ -72,13 +161,12 @@ class NodeFaults(EventObserver):
             world.domain.watch(topic, self._sent)
 
     def missed(self) -> Iterator[tuple[str, str]]:
-        """Yield the place in the job of each fault that has not struck, and why."""
+        """Yield the place in the job of each fault that did not happen, and why."""
         for strike in self._strikes:
             if strike.missed:
                 yield strike.fault.where, strike.missed
 
     def after_event(self) -> None:
-        """See which faults follow the event."""
         events = self.world.domain.loop.events
         while self._by_event and events > (self._by_event[-1].fault.event or 0):
             self._by_event.pop().come()
@@ -93,26 +181,26 @@ class NodeFaults(EventObserver):
                 strike.come()
 
 
-class _Strike:
-    """One fault. The loop dispatches it when its time has come."""
+class _ScheduledFault:
+    """A fault that the loop dispatches at its time."""
 
     def __init__(self, faults: NodeFaults, fault: NodeFault) -> None:
         self._world = faults.world
         self.fault = fault
-        self.missed = "it has not come to that"
-        self._victims: Victims | None = None
+        self.missed = "the run ended before it"
+        self._faulted: FaultedNodes | None = None
 
     def come(self) -> None:
-        """Strike next, before anything else that is ready."""
+        """Dispatch it next, before anything else that is ready."""
         if self._world.domain.loop.stopped is None:
             self._world.domain.loop.tasks.append(self)
 
     def dispatch(self) -> None:
-        """Strike, as one event; or let those go on again that hang."""
-        if self._victims is not None:
-            victims, self._victims = self._victims, None
-            if not victims.are_gone:
-                self._event(self._node(), Draw.GOES_ON, 0, victims.let_go)
+        """Apply the fault as one event, or end a hang."""
+        if self._faulted is not None:
+            faulted, self._faulted = self._faulted, None
+            if not faulted.are_destroyed:
+                self._event(self._node(), Draw.GOES_ON, 0, faulted.release)
             return
         node = self._node()
         if node is None:
@@ -124,11 +212,9 @@ class _Strike:
         self._event(node, _DRAWS[self.fault.kind], for_ns, lambda: self._strike(node))
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(None, self.describe())
 
     def describe(self) -> str:
-        """Name it for people."""
         return f"{self.fault.kind} of {self.fault.node}"
 
     def _node(self) -> Participant | None:
@@ -152,7 +238,7 @@ class _Strike:
         entry = self._entry(node)
         if fault.kind == "restart":
             if entry is None:
-                raise self._cannot("no entry of nodes: has made it, so it cannot be made anew")
+                raise self._cannot("no entry of nodes: has made it")
             world.starts.add_at(entry, world.domain.loop.now_ns + (fault.for_ns or 0))
         if not isinstance(node, NodeHandle):
             if node.process is None:
@@ -161,14 +247,14 @@ class _Strike:
                 raise self._cannot("it is in a process of its own; crash and restart are possible")
             cast("RealProcess", node.process).crash()
             return
-        victims = Victims(world.stacks, self._nodes(node, entry), node.process, entry)
+        faulted = FaultedNodes(world.stacks, self._nodes(node, entry), node.process, entry)
         if fault.kind == "hang":
-            victims.hold()
+            faulted.hold()
             if fault.for_ns is not None:
-                self._victims = victims
+                self._faulted = faulted
                 world.domain.loop.schedule(world.domain.loop.now_ns + fault.for_ns, self.come)
             return
-        victims.vanish()
+        faulted.crash()
         if node.process is not world.stacks.programs.host:
             crash_program(world.stacks, node.process)
             if fault.kind == "restart":
@@ -177,7 +263,7 @@ class _Strike:
             world.stacks.programs.tell("ended", entry.key)
 
     def _nodes(self, node: NodeHandle, entry: Entry | None) -> list[Any]:
-        """Return the nodes of the process that a node is in."""
+        """Return the nodes of a node's process."""
         own = [one for one in self._world.domain.graph.nodes if one.process is node.process]
         if node.process.entry is not None:
             return own
@@ -185,7 +271,6 @@ class _Strike:
         return [node] if entry is None else same
 
     def _entry(self, node: Participant) -> Entry | None:
-        """Return the entry of the job that stands for a node's process."""
         if not isinstance(node, NodeHandle):
             if node.process is None:
                 return None

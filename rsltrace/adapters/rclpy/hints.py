@@ -1,9 +1,7 @@
-"""What to do about an error that has less to do with the node than with where it runs.
+"""Hints for errors that come from the environment of a node, such as packages that are missing.
 
-Most often a package cannot be imported: which one, who wants it, where to get it.
-
-Interface packages (messages, services, actions) are generated code, so ``pip install <name>`` is
-seldom the answer: a few are on package indexes under other names, the rest come from ROS 2 itself.
+``pip install <name>`` seldom works for interface packages: a few are on package indexes under other
+names, the rest come from ROS 2.
 """
 
 from __future__ import annotations
@@ -18,17 +16,15 @@ from typing import Any
 from rsltrace.guard.virtual import set_order
 from rsltrace.simulation.middleware.events.failure import text_of
 
-# Nodes whose constructor never came to rclpy's own, so that they are none.
-
 
 def is_unmade(value: object) -> bool:
-    """Return whether a value is of a class of nodes, and ``Node.__init__`` has not run on it."""
+    """Return whether a value is a node whose ``Node.__init__`` has not run."""
     module = sys.modules.get("rclpy.node")
     return module is not None and isinstance(value, module.Node) and not hasattr(value, "handle")
 
 
 def constructor_of(node: object) -> str:
-    """Return the name of a node's class, and where its constructor is."""
+    """Return the name of a node's class, and the place of its constructor."""
     kind: Any = type(node)
     code = getattr(kind.__init__, "__code__", None)
     place = f" ({code.co_filename}:{code.co_firstlineno})" if code is not None else ""
@@ -43,42 +39,41 @@ _WHEELS = frozenset(
     visualization_msgs
     """.split()
 )
-"""Interface packages of which there are wheels: those of ROS's stacks and of common_interfaces."""
+"""Interface packages with wheels."""
 
 _STANDS_STILL = (
     "\n  If that was a difference of two times: computing takes no simulated time, so a ROS clock "
     "shows the same throughout a callback, as it may under use_sim_time: allow for a difference "
     "of 0, measure from one callback to the next, or write clocks: {advances: true} in the job, "
-    "which lets it advance by a nanosecond per look"
+    "which advances the clock by a nanosecond per reading"
 )
 
 _INITIALIZED = "Context.init() must only be called once"
 
 _COMPILED = (
-    "\n  The guard goes through sets in an order of its own; "
-    "to leave them as they are, write 'guard: {order: allow}' in the job"
+    "\n  The guard iterates sets in a fixed order; to turn that off, write "
+    "'guard: {order: allow}' in the job"
 )
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")
 
 
 def where_to_get(package: str) -> str:
-    """Say how to make an interface package importable, as a sentence."""
+    """Return a sentence on how to make an interface package importable."""
     distro = os.environ.get("ROS_DISTRO") or "jazzy"
     debian = f"ros-{distro}-{package.replace('_', '-')}"
     if package in _WHEELS:
         return f"Source the ROS 2 workspace that holds it, or: pip install {debian}"
     return (
-        "There is no wheel of it that we know of: put its sources (package.xml, .msg, .srv and "
-        ".action files) into a folder of search_path, and its classes are made from them; or "
-        f"source the ROS 2 workspace that holds it (one of ROS's own: apt install {debian}, then "
-        f"source /opt/ros/{distro}/setup.bash), and run rsltrace with the Python that it is built "
-        "for"
+        "There is no wheel of it: put its sources (package.xml, .msg, .srv and .action "
+        "files) into a folder of search_path, and its classes are made from them; or source the "
+        f"ROS 2 workspace that holds it (for one of ROS's own: apt install {debian}, then source "
+        f"/opt/ros/{distro}/setup.bash), and run rsltrace with the Python that it is built for"
     )
 
 
 def cannot_import(module: str, error: ModuleNotFoundError) -> str:
-    """Say why a user's module cannot be imported, and what to do."""
+    """Return why a module of user code cannot be imported, and what to do."""
     needed = error.name or "?"
     package = needed.partition(".")[0]
     place, line = _last_line(error.__traceback__)
@@ -93,7 +88,7 @@ def cannot_import(module: str, error: ModuleNotFoundError) -> str:
 
 
 def import_raised(module: str, error: BaseException, said: str) -> str:
-    """Say what a user's module raised (``said``: its text) when it was imported, and where."""
+    """Return what a module of user code raised (``said``: its text) at import, and where."""
     if isinstance(error, SyntaxError) and error.filename:
         place, line = f"{error.filename}:{error.lineno}", error.text or ""
         said = error.msg
@@ -103,12 +98,12 @@ def import_raised(module: str, error: BaseException, said: str) -> str:
     hint = ""
     if isinstance(error, SystemExit):
         hint = (
-            "; what a module does when it is imported should be definitions: put the rest into a "
+            "; a module should only define things when it is imported: put the rest into a "
             "function (and name that with 'main:'), or run it as a program ('script:', 'module:')"
         )
     elif isinstance(error, RuntimeError) and said.endswith(_INITIALIZED):
         hint = (
-            ": rclpy is initialized already, the nodes of a job share one process; move "
+            ": the nodes of a job share one process, where rclpy is initialized already; move "
             "rclpy.init() into a function that makes the node and spins, and name that with "
             "'main:', or run the file as a program ('script:')"
         )
@@ -117,7 +112,7 @@ def import_raised(module: str, error: BaseException, said: str) -> str:
 
 
 def hint_for(error: BaseException) -> str:
-    """Return what to add to the text of an exception that user code raised while it ran."""
+    """Return a hint to append to the text of an exception of user code."""
     if isinstance(error, ZeroDivisionError):
         return _STANDS_STILL
     if _is_of_order(error):
@@ -134,7 +129,7 @@ def hint_for(error: BaseException) -> str:
 
 
 def _is_of_order(error: BaseException) -> bool:
-    """Whether an error names a call with which the guard puts sets in order, or is raised by it."""
+    """Return whether an error comes from the guard's functions that order sets."""
     if "__rsltrace_" in text_of(error):
         return True
     traceback, last = error.__traceback__, None
@@ -144,7 +139,7 @@ def _is_of_order(error: BaseException) -> bool:
 
 
 def parameter_in(error: BaseException | None) -> str | None:
-    """Return the name of the parameter whose value an exception of rclpy is about, if it is."""
+    """Return the name of the parameter that an exception of rclpy is about, if any."""
     if not type(error).__name__.startswith("InvalidParameter"):
         return None
     found = re.search(r"\bparameter '([^']+)'", str(error))
@@ -152,7 +147,7 @@ def parameter_in(error: BaseException | None) -> str | None:
 
 
 def _as_double(said: str) -> str:
-    """Say how to write the commonest parameter of a wrong type."""
+    """Return how to write an integer for a parameter of type double."""
     found = re.search(r"to '(-?[0-9]+)' of type 'INTEGER', expecting type 'DOUBLE'", said)
     if found is None:
         return ""
@@ -165,7 +160,7 @@ def _is_interface(package: str, line: str) -> bool:
 
 
 def _last_line(traceback: TracebackType | None) -> tuple[str, str]:
-    """Return the place of the import that failed (``file:line``), and its text."""
+    """Return the place (``file:line``) and text of the import that failed."""
     found = ("", "")
     while traceback is not None:
         file, number = traceback.tb_frame.f_code.co_filename, traceback.tb_lineno

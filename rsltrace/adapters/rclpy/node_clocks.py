@@ -1,4 +1,4 @@
-"""The clocks of nodes that do not show simulated time."""
+"""Clocks of nodes that do not show simulated time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from rsltrace.trace.model.event import encode_clock
 
 @dataclass(frozen=True, slots=True)
 class ClockRule:
-    """What is different about the clocks of nodes (a glob). One that ``advances`` shows a
-    nanosecond more at each look at one time. Of one that ``follows``, /clock sets ROS time."""
+    """The clock of nodes (a glob). One that ``advances`` shows a nanosecond more at each reading of
+    one time. One that ``follows`` takes ROS time from /clock."""
 
     node: str
     model: ClockModel
@@ -22,8 +22,8 @@ class ClockRule:
 
 
 class NodeClocks:
-    """What each node's clock shows. Each has a stream of its own for random jumps; that one has
-    happened is an output of the event in which the clock is read next."""
+    """The clocks of nodes. Each has a random stream for jumps; a jump is an output of the event
+    that next reads the clock."""
 
     def __init__(
         self,
@@ -40,10 +40,10 @@ class NodeClocks:
         self._clocks: dict[str, WrongClock | None] = {}
         self._rule_of: dict[str, ClockRule | None] = {}
         self._ahead: dict[str, tuple[int, int]] = {}
-        """Of a clock that advances: the time of the last look, and how far ahead it was."""
+        """For clocks that advance: the time of the last reading, and how far ahead it was."""
 
     def shows(self, node: str | None, now_ns: int) -> int:
-        """Return what the clock of ``node`` (None: nobody's) shows at simulated time ``now_ns``."""
+        """Return what the clock of ``node`` shows at simulated time ``now_ns``."""
         if node is None:
             return now_ns
         if node not in self._clocks:
@@ -60,17 +60,16 @@ class NodeClocks:
         return clock.shows(now_ns)
 
     def follows(self, node: str | None) -> bool:
-        """Return whether /clock (or who sets it by hand) drives the ROS time of a node."""
+        """Return whether /clock (or user code) sets the ROS time of a node."""
         rule = self._rule(node or "")
         return rule is not None and rule.follows
 
     def advances(self, node: str | None) -> bool:
-        """Return whether a ROS clock of a node shows more at each look."""
         rule = self._rule(node or "")
         return rule is not None and rule.advances
 
     def look(self, node: str | None, now_ns: int) -> int:
-        """Return what a ROS clock of ``node`` shows to who looks at it now."""
+        """Return what a ROS clock of ``node`` shows, and advance it."""
         shown_ns, name = self.shows(node, now_ns), node or ""
         if not self.advances(name):
             return shown_ns
@@ -85,7 +84,7 @@ class NodeClocks:
         return shown_ns + ahead_ns
 
     def _rule(self, node: str) -> ClockRule | None:
-        """Return what is different about a node's clock; "" is code of no node."""
+        """Return the rule of a node's clock; "" is code of no node."""
         if node not in self._rule_of:
             rules = (rule for rule in self._rules if fnmatchcase(node, rule.node))
             self._rule_of[node] = next(rules, None)

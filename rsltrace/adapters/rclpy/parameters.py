@@ -1,4 +1,4 @@
-"""The parameters of the nodes of a run: those they have declared, and those they were given."""
+"""The declared and the unused parameters of a run's nodes."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from rsltrace.simulation.middleware.graph import Graph
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """The parameters of a node: those it has declared, and those it was given besides.
+    """The declared parameters of a node, and given ones that it did not declare (``unused``).
 
-    ``entry_key`` is the key of the job's entry that made the node, empty if none did.
-    ``unconfigured``: a managed node that nobody has configured yet, which is when such a node
-    declares its parameters.
+    ``entry_key``: the job's entry that made it, or empty. ``unconfigured``: a managed node before
+    its configuration, when it declares its parameters.
     """
 
     entry_key: str
@@ -25,7 +24,7 @@ class Parameters:
 
 
 def parameters_of(graph: Graph) -> dict[str, Parameters]:
-    """Return the parameters of the nodes there are now. Who allows undeclared ones uses all."""
+    """Return the parameters of the nodes, without nodes that allow undeclared ones."""
     found = {}
     for handle in graph.nodes:
         if not isinstance(handle, NodeHandle):
@@ -40,7 +39,7 @@ def parameters_of(graph: Graph) -> dict[str, Parameters]:
 
 
 def _is_unconfigured(node: object) -> bool:
-    """Say whether a node is a managed one in the state in which such nodes begin."""
+    """Return whether a node is a managed one in its first state."""
     lifecycle = sys.modules.get("rclpy.lifecycle")
     if lifecycle is None or not isinstance(node, lifecycle.LifecycleNodeMixin):
         return False

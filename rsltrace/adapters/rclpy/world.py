@@ -1,5 +1,4 @@
-"""A simulated ROS world from its first node to its last: construction, the jump to the start, the
-run, and the destruction of the nodes."""
+"""A simulated ROS world: constructs the nodes, jumps to the start time, runs and destroys them."""
 
 from __future__ import annotations
 
@@ -12,31 +11,32 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.boundary.boundary import Boundary, Surroundings
+from rsltrace.adapters.rclpy.boundary.boundary import BoundaryContext, RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.installation import installed
-from rsltrace.adapters.rclpy.callback_errors import RclpyDoor
+from rsltrace.adapters.rclpy.callback_errors import RclpyExceptionHandler
 from rsltrace.adapters.rclpy.entry import Entry
-from rsltrace.adapters.rclpy.executors.user_executors import note_exchanged, own_executors
-from rsltrace.adapters.rclpy.handles.logs import Logs
+from rsltrace.adapters.rclpy.executors.user_executors import note_replaced_functions, own_executors
+from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
 from rsltrace.adapters.rclpy.stacks.asyncio_loops import simulated_event_loops
-from rsltrace.adapters.rclpy.stacks.blocked_groups import note_waits
-from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked
-from rsltrace.adapters.rclpy.stacks.exit_handlers import own_exit_handlers
-from rsltrace.adapters.rclpy.stacks.forked_child import forked_children_end
+from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked, simulated_waiting
+from rsltrace.adapters.rclpy.stacks.endless_waits import note_waits
+from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent, EntryStarts
 from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
-from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs
-from rsltrace.adapters.rclpy.stacks.process_exit import own_process_ends, own_signal_handlers
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_waiting
-from rsltrace.adapters.rclpy.stacks.starts import Construction, Starts
+from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs, own_exit_handlers
+from rsltrace.adapters.rclpy.stacks.process_exit import (
+    own_process_ends,
+    own_signal_handlers,
+)
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.threads import cooperative_threads
 from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
 from rsltrace.errors import DeadlockError, JobError, RunError
+from rsltrace.guard.redirect import replace_attribute
 from rsltrace.simulation.chance.channel import NetworkPlan
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
@@ -48,10 +48,10 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind
 
 
 class World:
-    """Nodes in a loop. Use as a context manager: within it, rclpy is simulated.
+    """Nodes in an event loop. Within its ``with`` block, rclpy is simulated.
 
-    ``domain`` is what all participants share, ``stacks`` what belongs to the call stacks of user
-    code, ``states`` are the hashed ones of nodes, ``clocks`` is None where all of them are right.
+    ``domain`` is shared by all participants, ``stacks`` is the runtime of user code, ``states``
+    holds the hashed states of nodes. ``clocks`` is None if all clocks show simulated time.
 
     :param base_dir: the job's folder; source paths in logs are relative to it.
     :param echo: print log records on stderr.
@@ -61,23 +61,23 @@ class World:
         self, loop: EventLoop, *, base_dir: Path, seed: int = 0, echo: bool = True
     ) -> None:
         self.domain = Domain(loop)
-        self.stacks = Stacks(self.domain)
+        self.stacks = Runtime(self.domain)
         self.states = NodeStates()
         self.clocks: NodeClocks | None = None
         self.nodes: list[Any] = []
         self.parameters: dict[str, Parameters] = {}
         self._seed = seed
-        self._logs = Logs(self.domain, base_dir=base_dir, echo=echo)
-        self.domain.dispatcher.door = RclpyDoor(self.stacks, self._logs)
-        self._surroundings = Surroundings(self.stacks, self._logs, self.states)
-        self._boundary: Boundary
+        self._logs = RosoutLogs(self.domain, base_dir=base_dir, echo=echo)
+        self.domain.dispatcher.door = RclpyExceptionHandler(self.stacks, self._logs)
+        self._surroundings = BoundaryContext(self.stacks, self._logs, self.states)
+        self._boundary: RclpyBoundary
         self._terminals: Terminals
         self._stack = ExitStack()
         self.constructed: list[Entry] = []
-        """The entries in the order in which they have been constructed."""
-        self.starts = Starts(self.stacks, self.construct)
+        """The entries in the order of their construction."""
+        self.starts = EntryStarts(self.stacks, self.construct)
         self.start_process: Callable[[Entry, tuple[int, int]], None]
-        """Starts an entry that runs as a process of its own, as one event."""
+        """EntryStarts an entry that runs as a process of its own, as one event."""
 
     def __enter__(self) -> World:
         stacks = self.stacks
@@ -97,7 +97,6 @@ class World:
             stack.enter_context(simulated_event_loops(stacks))
             stack.enter_context(own_exit_handlers(stacks))
             stack.enter_context(own_process_ends(stacks))
-            stack.enter_context(forked_children_end(stacks))
             stack.enter_context(own_signal_handlers(stacks))
             self._terminals = stack.enter_context(simulated_terminals(stacks))
             rclpy.init(args=[])
@@ -126,7 +125,7 @@ class World:
             if untrack is not None:  # from ROS 2 Kilted on, a shutdown destroys nodes once more
                 untrack(node)
         rclpy.try_shutdown()
-        # What user code has left behind must meet its finalizers while rclpy is still simulated.
+        # Finalizers of objects that user code left behind must run while rclpy is still simulated.
         if error is not None and error.__cause__ is not None:
             traceback.clear_frames(error.__cause__.__traceback__)
         self.nodes.clear()
@@ -135,15 +134,14 @@ class World:
         gc.collect()
 
     def use_network(self, plan: NetworkPlan) -> None:
-        """Give what nodes send delays and losses. Before the first node is made."""
+        """Delay and lose messages. Call it before the first node is made."""
         self.domain.transport.network = Network(self.domain.dispatcher, plan)
 
     def plan(self, entries: Sequence[Entry], start_ns: int) -> None:
-        """Say what will be constructed, and when the run starts: a main that ends must know of
-        those that begin later."""
+        """Register the mains before the first begins: one that ends must know of later ones."""
         programs = self.stacks.programs
         programs.all = [
-            Program(programs, entry)
+            SimulatedProgram(programs, entry)
             for entry in entries
             if entry.argv is not None and entry.program is None
         ]
@@ -151,7 +149,7 @@ class World:
 
     @contextmanager
     def importing(self) -> Iterator[None]:
-        """Let what modules make when they are imported (a lock, a thread) belong to the run."""
+        """Let objects that modules make at import (locks, threads) belong to the run."""
         programs = self.stacks.programs
         programs.importing = True
         try:
@@ -160,36 +158,34 @@ class World:
             programs.importing = False
 
     def use_clocks(self, rules: tuple[ClockRule, ...], start_ns: int) -> None:
-        """Let the clocks of some nodes be different. Before the first node is made."""
+        """Give some nodes other clocks. Call it before the first node is made."""
         if rules:
             self.clocks = NodeClocks(self.domain, rules, seed=self._seed, start_ns=start_ns)
             self._surroundings.clocks = self.clocks
 
     def use_scheduling(self, loop: OrderedLoop, plan: SchedulingPlan) -> None:
-        """Let a plan say what runs when, and how long it takes. Before the first node is made."""
+        """Use a scheduling policy and execution times. Call it before the first node is made."""
         Scheduling(self.domain.dispatcher, loop, plan)
         if plan.execution and self.domain.transport.network is None:
-            # What a callback sends leaves when it is over: that takes links.
+            # A callback's messages leave when it is over, which takes links.
             self.use_network(NetworkPlan())
 
     def switch_at_lines(self, loop: OrderedLoop, packages: frozenset[str]) -> None:
-        """Let threads take turns at lines of user code; that of ``packages`` is, too."""
+        """Switch threads at lines of user code; ``packages`` count as user code, too."""
         self._stack.enter_context(switches_at_lines(self.stacks, loop, packages))
 
     def show_log(self, severity: int, name: str, text: str) -> None:
-        """Print a log record of a node that publishes its records itself, if they are printed."""
         self._logs.show(severity, name, text)
 
     def echo_logs(self, echo: bool) -> None:
-        """Print log records on stderr from now on, or no longer."""
         self._logs.echo = echo
 
     # -- the stages of a run ---------------------------------------------------------------------
 
     def construct(self, entry: Entry, cause: tuple[int, int] = (NO_EVENT, 0)) -> bool:
-        """Construct one entry of the job as one event; return False if that ended the run.
+        """Construct an entry as one event; return False if that ended the run.
 
-        ``cause`` is the event and output that it follows from.
+        ``cause``: the event and output that it follows from.
         """
         stacks = self.stacks
         self.constructed.append(entry)
@@ -208,12 +204,12 @@ class World:
             stacks.programs.tell("started", entry.key)
 
         def construct() -> None:
-            event = Construction(lambda: f"constructing {entry.name}", entry)
+            event = ConstructionEvent(lambda: f"constructing {entry.name}", entry)
             stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build, cause)
-            # Whoever switched here goes on: this function, or the loop's runner after a wait.
+            # The stack that switched here goes on: this function, or the loop after a wait.
             stacks.runners.step_aside()
 
-        # A constructor that blocks (on a service, say) is left waiting while others go on.
+        # If a constructor blocks (on a service, say), the others are constructed meanwhile.
         stacks.programs.constructing = entry
         stacks.runners.waiting.append(getcurrent())
         greenlet(construct).switch()
@@ -229,8 +225,8 @@ class World:
 
         if not isinstance(node, Node):
             raise JobError(
-                f"{name} gave a {type(node).__qualname__}, not an rclpy Node: name a Node subclass "
-                "or a function that returns a node (or a list of nodes)"
+                f"{name} returned a {type(node).__qualname__}, not an rclpy Node: name a Node "
+                "subclass or a function that returns a node (or a list of nodes)"
             )
         if is_unmade(node):
             raise RunError(f"{constructor_of(node)} has not called super().__init__(name)")
@@ -238,23 +234,23 @@ class World:
         self.stacks.executor.add_node(node)
 
     def all_nodes(self) -> list[Any]:
-        """Return the rclpy nodes there are, in the order of their construction."""
+        """Return the rclpy nodes, in the order of their construction."""
         wrappers = [getattr(handle, "wrapper", None) for handle in self.domain.graph.nodes]
         return [wrapper for wrapper in wrappers if wrapper is not None]
 
     def keep(self, node: Any) -> None:
-        """Destroy ``node`` with the others at the end, although it is not run."""
+        """Destroy ``node`` at the end, although its callbacks do not run."""
         self.nodes.append(node)
 
-    def renew(self, program: Program) -> None:
-        """Let a main that has crashed be constructed once more, in a process of its own."""
+    def renew(self, program: SimulatedProgram) -> None:
+        """Prepare a crashed main to be started again."""
         programs = self.stacks.programs
-        new = Program(programs, program.entry)
+        new = SimulatedProgram(programs, program.entry)
         programs.all[programs.all.index(program)] = new
         self._terminals.hand_over(program, new)
 
     def jump(self, time_ns: int) -> None:
-        """Move from construct time to the start of the run, telling clocks of the jump."""
+        """Move from construction time to the start of the run, and run jump callbacks."""
         loop = self.domain.loop
         delta_ns = time_ns - loop.now_ns
         loop.jump(time_ns)
@@ -266,10 +262,10 @@ class World:
             )
 
     def go_on(self) -> None:
-        """Run the loop until it ends or its gate pauses it; afterwards this may be called again.
+        """Run the loop until it ends or its gate pauses it; call it again after a pause.
 
-        The loop never runs on this stack, so that no callback can keep it from going on. A quiet
-        end with somebody still waiting is a deadlock.
+        The loop never runs on this stack, so no callback can block it. If the loop runs out of
+        events while a call still waits, that is a deadlock.
         """
         stacks, outcome = self.stacks, self.domain.outcome
         runners, ending = stacks.runners, stacks.ending
@@ -280,7 +276,7 @@ class World:
         outcome.note_end(stacks.loop.events)
         if outcome.error is None:
             note_waits(stacks, outcome)
-        note_exchanged(stacks, hosted=bool(self.nodes))
+        note_replaced_functions(stacks, hosted=bool(self.nodes))
         self.parameters = parameters_of(self.domain.graph)
         end_programs(stacks)
         end_blocked(stacks)
@@ -290,11 +286,11 @@ class World:
             outcome.error = DeadlockError(_deadlock(ending.stuck))
 
     def waiting(self) -> str:
-        """Say who waits for what, where nothing can happen any more."""
+        """Describe the deadlock: which call waits for what."""
         return _deadlock(self.stacks.who_waits())
 
     def blocked(self) -> list[str]:
-        """Say of each blocked call that may not wait for ever what it waits for."""
+        """Describe the blocked calls that may not wait for ever."""
         return [one.waits_for() for one in self.stacks.runners.blocked if not one.is_patient()]
 
     def destroy(self) -> None:
@@ -320,35 +316,26 @@ class World:
 
     @property
     def error(self) -> RunError | None:
-        """What went wrong, if anything did."""
         return self.domain.outcome.error
 
 
 def _deadlock(waits: list[str]) -> str:
     lines = "\n".join(f"  {text}" for text in waits[:20])
-    return f"nothing can happen any more, but somebody waits:\n{lines}"
+    return f"deadlock: nothing can happen any more, and these calls still wait:\n{lines}"
 
 
 @contextmanager
-def _fresh_rclpy(boundary: Boundary) -> Iterator[None]:
-    """Give rclpy's module globals their first values for a run, and their old ones afterwards."""
+def _fresh_rclpy(boundary: RclpyBoundary) -> Iterator[None]:
+    """Reset rclpy's module globals for a run, and restore them afterwards."""
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
-    first_values: list[tuple[Any, str, Any]] = [
-        (rclpy.utilities, "g_default_context", None),
-        (rclpy.context, "g_logging_ref_count", 0),
-        (rclpy, "__executor", None),
-    ]
-    saved = [(module, name, getattr(module, name, None)) for module, name, _ in first_values]
-    for module, name, first in first_values:
-        setattr(module, name, first)
-    boundary.ros_clocks.clear()
-    boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
-    boundary.real.rclpy_logging_initialize()
-    try:
+    with ExitStack() as stack:
+        replace_attribute(stack, rclpy.utilities, "g_default_context", None)
+        replace_attribute(stack, rclpy.context, "g_logging_ref_count", 0)
+        replace_attribute(stack, rclpy, "__executor", None)
+        boundary.ros_clocks.clear()
+        boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
+        boundary.real.rclpy_logging_initialize()
         yield
-    finally:
-        for module, name, old in saved:
-            setattr(module, name, old)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
@@ -17,10 +17,16 @@ from rsltrace.trace.model.event import EventKind
 
 SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
 
-# A message on its way, as the loop's releases are: reception stamp (ns), order and place in the
-# loop's queue, who is called; then canonical CDR, index of the publishing event, which of its
-# outputs, content hash, publication stamp (ns), publication number.
 Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
+"""A message on its way. It is a plain tuple like the loop's releases, because one is made for each
+message and subscription, and the loop sorts them. Its positions have names; hot paths unpack it."""
+RECEIVED_NS: Final = 0  # reception stamp
+DATA: Final = 4  # canonical CDR; before it are order, place and receiver, as in the loop's releases
+EVENT: Final = 5  # index of the publishing event
+OUTPUT: Final = 6  # which of its outputs
+DIGEST: Final = 7  # hash of the content
+SENT_NS: Final = 8  # publication stamp
+NUMBER: Final = 9  # publication number
 
 
 class Subscription(Receiver):
@@ -31,7 +37,7 @@ class Subscription(Receiver):
     """
 
     kind = EntityKind.SUBSCRIPTION
-    origin = slice(5, 8)
+    origin = slice(EVENT, SENT_NS)
 
     def __init__(
         self,
@@ -65,7 +71,7 @@ class Subscription(Receiver):
         if not self.may_run():
             return
         assert self.callback is not None
-        data, *cause = self.queue.popleft()[4:8]
+        _, _, _, _, data, *cause, _, _ = self.queue.popleft()
         self.dispatcher.execute(
             self, self.entity_id, self.node, SUBSCRIPTION, self.callback, (data,), *cause
         )

@@ -1,8 +1,8 @@
-"""What action servers and action clients have in common: an action is made of other entities.
+"""Base classes of action servers and clients, and goals.
 
-An action is three services and two topics under ``<name>/_action/``; each is an entity of its own
-here, so that the trace shows every request, response, feedback and status as it is. What arrives
-for any of them goes to rclpy's waitable, one at a time and in the order of arrival.
+An action is three services and two topics under ``<name>/_action/``. Each is an entity, so the
+trace shows every request, response, feedback and status. Arrivals go to rclpy's waitable one by
+one, in the order of arrival.
 """
 
 from __future__ import annotations
@@ -14,17 +14,13 @@ from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.services import ClientHandle, ServiceHandle
-from rsltrace.adapters.rclpy.stacks.code_lines import Functions
+from rsltrace.adapters.rclpy.stacks.code_lines import FunctionRecorder
 from rsltrace.adapters.rclpy.stacks.mailbox import servers_text
 from rsltrace.adapters.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.adapters.rclpy.wire.interfaces import type_name
 from rsltrace.trace.model.event import EventKind
 
-# The goals of an action server, each with its state machine.
-#
-# The rules are those of rcl_action (ROS 2 Jazzy).
-
-# Numbers of action_msgs/msg/GoalStatus.
+# Numbers of action_msgs/msg/GoalStatus. The state machine of a goal is rcl_action's (ROS 2 Jazzy).
 ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 1, 2, 3, 4, 5, 6
 _TRANSITIONS = {
     (ACCEPTED, "EXECUTE"): EXECUTING,
@@ -52,23 +48,21 @@ class GoalHandle(Handle):
         self.accepted_ns = info.stamp.sec * 1_000_000_000 + info.stamp.nanosec
         self.done_ns: int | None = None
         self.status_bytes = b""
-        """What a message of its status says of it, but for the status, once there has been one."""
+        """Its part of a status message, without the status; empty before the first message."""
         goals[goal_id] = self
 
     def get_status(self) -> int:
-        """Return the status, a number of GoalStatus."""
         return self.status
 
     def is_active(self) -> bool:
-        """Return whether the goal has not come to an end."""
         return self.status in (ACCEPTED, EXECUTING, CANCELING)
 
     def cancelable(self) -> bool:
-        """Return whether a cancel request may still stop the goal."""
+        """Return whether a cancel request can stop the goal."""
         return (self.status, "CANCEL_GOAL") in _TRANSITIONS
 
     def update_goal_state(self, event: Any) -> None:
-        """Go to the state that an event leads to. Raises RCLError if it leads nowhere."""
+        """Apply an event to the state machine. Raises RCLError if it is not allowed."""
         state = _TRANSITIONS.get((self.status, event.name))
         if state is None:
             raise self._real.RCLError(
@@ -84,14 +78,14 @@ PartT = TypeVar("PartT", bound="Part")
 
 
 class Part(ReceiverHandle):
-    """One of an action's endpoints: its arrivals are handed to the action's waitable."""
+    """An endpoint of an action; its arrivals go to the action's waitable."""
 
     owner: ActionHandle
     in_waitable = True
     in_wait_sets: str
-    """What it is to a wait set: ``service``, ``client`` or ``subscription``."""
+    """Its kind in a wait set: ``service``, ``client`` or ``subscription``."""
     purpose: str
-    """``goal``, ``cancel``, or what else it is for."""
+    """``goal``, ``cancel``, ``result``, ``feedback`` or ``status``."""
 
     def find_wrapper(self) -> Any:
         """Return the action's waitable once its node is being run."""
@@ -112,9 +106,9 @@ class Part(ReceiverHandle):
         return {"action": self.owner.name}
 
     def user_callback(self) -> object:
-        """Return the server's callback for this kind of request; a client has none of its own."""
+        """Return the server's callback for this kind of request."""
         own = getattr(self.wrapper, f"_{self.purpose}_callback", None)
-        if getattr(own, "__module__", "").startswith("rclpy."):  # a goal that is simply accepted
+        if getattr(own, "__module__", "").startswith("rclpy."):  # the default goal callback
             own = None
         return own or getattr(self.wrapper, "_execute_callback", None)
 
@@ -131,14 +125,14 @@ class GoalClient(Part, ClientHandle):
     in_wait_sets = "client"
 
 
-class GoalSubscription(Part, SubscriptionHandle):
+class ActionSubscriptionHandle(Part, SubscriptionHandle):
     """A client's feedback or status subscription."""
 
     in_wait_sets = "subscription"
 
 
 class ActionHandle(Handle):
-    """What servers and clients have in common: their parts, and the one that is ready."""
+    """Base class of action servers and clients: their endpoints (``parts``)."""
 
     waitable_attribute: str
     is_client: bool
@@ -146,7 +140,7 @@ class ActionHandle(Handle):
     def __init__(self, node: NodeHandle, action_type: Any, name: str) -> None:
         super().__init__()
         self.stacks = node.stacks
-        self._functions = Functions(node.dispatcher)
+        self._functions = FunctionRecorder(node.dispatcher)
         self.node = node
         self.name = node.resolve(name, service=False)
         self.parts: list[Part] = []
@@ -158,11 +152,10 @@ class ActionHandle(Handle):
 
     @property
     def type_name(self) -> str:
-        """The name of the action's type."""
         return type_name(self.action_type)
 
     def own(self, kind: type[PartT], interface: Any, name: str, qos: Any) -> PartT:
-        """Make a part at ``<name>/_action/``; it has its owner before its constructor runs."""
+        """Make an endpoint below ``<name>/_action/``; its owner is set before its constructor."""
         part = kind.__new__(kind)
         part.owner = self
         part.purpose = name.partition("_goal")[0].replace("send", "goal")
@@ -171,18 +164,16 @@ class ActionHandle(Handle):
         return part
 
     def add_to_waitset(self, wait_set: Any) -> None:
-        """Let an executor that has wait sets of its own wait for the parts."""
         for part in self.parts:
             self._places[part] = getattr(wait_set, f"add_{part.in_wait_sets}")(part)
 
     def is_part_ready(self, wait_set: Any, part: Part) -> bool:
-        """Return whether a part is the one that is executed, or was found ready by a wait set."""
+        """Return whether an endpoint is being executed, or is ready in a wait set."""
         if wait_set is None:
             return part is self._ready
         return bool(wait_set.is_ready(part.in_wait_sets, self._places[part]))
 
     def path(self, name: str) -> str:
-        """Return the full name of a part."""
         return f"{self.name}/_action/{name}"
 
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
@@ -200,7 +191,7 @@ class ActionHandle(Handle):
         return None
 
     def waits_for(self, future: Any) -> str:
-        """Say what would complete a future, if it is a client's own."""
+        """Describe what would complete a client's future; empty for other futures."""
         waitable = self.find_waitable()
         for what in ("goal", "result", "cancel"):
             pending = getattr(waitable, f"_pending_{what}_requests", {})
@@ -212,7 +203,7 @@ class ActionHandle(Handle):
         return ""
 
     async def execute(self, part: Part) -> None:
-        """Do what rclpy's executors do for a waitable of which ``part`` is ready."""
+        """Run the waitable as rclpy's executors do when ``part`` is ready."""
         waitable = part.wrapper
         self._ready = part
         try:

@@ -1,10 +1,11 @@
-"""Action servers: three services, two topics, and the goals that were accepted.
+"""Action servers: three services, two topics, and the accepted goals.
 
-Which goals a cancel request means and when results expire are rcl_action's rules (ROS 2 Jazzy).
+The rules for cancel requests and the expiry of results are rcl_action's (ROS 2 Jazzy).
 """
 
 from __future__ import annotations
 
+from functools import partialmethod
 from typing import Any
 
 from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, GoalHandle, GoalService
@@ -68,8 +69,7 @@ class ActionServerHandle(ActionHandle):
     # -- requests and responses ----------------------------------------------------------------
 
     def is_ready(self, wait_set: Any) -> tuple[bool, bool, bool, bool]:
-        """Say which of goal, cancel, result request and expiry is being executed, or is ready in a
-        wait set."""
+        """Return whether a goal, cancel or result request is ready, and whether goals expire."""
         parts = (self._goal, self._cancel, self._result)
         goal, cancel, result = (self.is_part_ready(wait_set, part) for part in parts)
         return goal, cancel, result, self._expired
@@ -78,42 +78,29 @@ class ActionServerHandle(ActionHandle):
         """Count its subscriptions, guard conditions, timers, clients and services, as rcl does."""
         return 0, 0, 1, 0, 3
 
-    def _take_request(self, part: GoalService, request_type: Any) -> tuple[RequestId, Any]:
-        request, info = part.service_take_request(request_type)
+    def _take_request(self, service: str, request_type: Any) -> tuple[RequestId, Any]:
+        """Take the request that is being executed."""
+        request, info = getattr(self, service).service_take_request(request_type)
         return info.request_id, request
 
-    def take_goal_request(self, request_type: Any) -> tuple[RequestId, Any]:
-        """Take the goal request that is being executed."""
-        return self._take_request(self._goal, request_type)
+    take_goal_request = partialmethod(_take_request, "_goal")
+    take_cancel_request = partialmethod(_take_request, "_cancel")
+    take_result_request = partialmethod(_take_request, "_result")
 
-    def take_cancel_request(self, request_type: Any) -> tuple[RequestId, Any]:
-        """Take the cancel request that is being executed."""
-        return self._take_request(self._cancel, request_type)
+    def _send_response(self, service: str, header: RequestId, response: Any) -> None:
+        getattr(self, service).service_send_response(response, header)
 
-    def take_result_request(self, request_type: Any) -> tuple[RequestId, Any]:
-        """Take the result request that is being executed."""
-        return self._take_request(self._result, request_type)
-
-    def send_goal_response(self, header: RequestId, response: Any) -> None:
-        """Answer a goal request."""
-        self._goal.service_send_response(response, header)
-
-    def send_cancel_response(self, header: RequestId, response: Any) -> None:
-        """Answer a cancel request."""
-        self._cancel.service_send_response(response, header)
-
-    def send_result_response(self, header: RequestId, response: Any) -> None:
-        """Answer a result request."""
-        self._result.service_send_response(response, header)
+    send_goal_response = partialmethod(_send_response, "_goal")
+    send_cancel_response = partialmethod(_send_response, "_cancel")
+    send_result_response = partialmethod(_send_response, "_result")
 
     def publish_feedback(self, message: Any) -> None:
-        """Publish feedback on a goal."""
         self._feedback.publish(message)
 
     def publish_status(self) -> None:
-        """Publish the status of every goal that is known.
+        """Publish the status of every known goal.
 
-        All of them are in each message, so the part of a goal that never changes is kept as bytes.
+        Each message holds all goals, so the bytes of a goal that never change are cached.
         """
         parts = [
             (goal.status_bytes or self._keep_bytes(goal)) + goal.status.to_bytes(1, "little")
@@ -135,7 +122,6 @@ class ActionServerHandle(ActionHandle):
     # -- goals -----------------------------------------------------------------------------------
 
     def goal_exists(self, goal_info: Any) -> bool:
-        """Return whether a goal of this id is known."""
         return bytes(goal_info.goal_id.uuid) in self.goals
 
     def process_cancel_request(self, request: Any, response_type: Any) -> Any:
@@ -160,7 +146,7 @@ class ActionServerHandle(ActionHandle):
         return response
 
     def notify_goal_done(self) -> None:
-        """Let the results of finished goals expire after the timeout."""
+        """Schedule the expiry of the results of finished goals."""
         now_ns = self.stacks.loop.now_ns
         for goal in self.goals.values():
             if not goal.is_active() and goal.done_ns is None:
@@ -169,7 +155,7 @@ class ActionServerHandle(ActionHandle):
                     self.stacks.loop.schedule(now_ns + self._timeout_ns, self._expiry.wake)
 
     def expire_goals(self, most: int) -> tuple[Any, ...]:
-        """Forget goals whose results have been kept long enough; return their infos."""
+        """Forget expired goals; return their infos."""
         timeout_ns = self._timeout_ns
         if timeout_ns is None:
             return ()
@@ -182,7 +168,7 @@ class ActionServerHandle(ActionHandle):
         return tuple(self.goals.pop(goal_id).info for goal_id in gone[:most])
 
     async def expire(self) -> None:
-        """Do what rclpy's executors do for a waitable whose goals expire."""
+        """Run the waitable as rclpy's executors do when goals expire."""
         waitable = self._expiry.wrapper
         self._expired = True
         try:
@@ -194,7 +180,7 @@ class ActionServerHandle(ActionHandle):
 
 
 class _Expiry:
-    """Dispatches a server's expiry of goals; belongs to its goal service in the trace."""
+    """Dispatches the expiry of a server's goals, as its goal service in the trace."""
 
     def __init__(self, server: ActionServerHandle) -> None:
         self._server = server
@@ -209,12 +195,10 @@ class _Expiry:
         return self._server.node
 
     def wake(self) -> None:
-        """Expire goals now."""
         if not self._server.destroyed:
             self._server.stacks.loop.ready.append(self)
 
     def dispatch(self) -> None:
-        """Expire goals, as one event."""
         server = self._server
         mailbox = self.node.mailbox
         if mailbox is not None and mailbox.keeps(self):
@@ -226,7 +210,6 @@ class _Expiry:
         start_coroutine(server.stacks, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy."""
         told = self.node.mailbox is not None
         return on_no_executor(self.node, self.describe(), "waitable", told=told)
 

@@ -1,12 +1,13 @@
-"""The object that stands where rclpy keeps its C extension (``installing`` puts it there).
+"""The object that replaces rclpy's C extension during a run (``installation`` puts it there).
 
-What has no side effect on the machine is passed through to the real extension: enums, exceptions,
-name validation, QoS structures, time points, log levels.
+Whatever has no side effect on the machine is passed through to the real extension: enums,
+exceptions, name validation, QoS structures, time points, log levels.
 """
 
 from __future__ import annotations
 
 import weakref
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,23 +19,21 @@ from rsltrace.adapters.rclpy.boundary.early_init import check_process
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable, set_invalid_handle
-from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
 from rsltrace.adapters.rclpy.handles.lifecycle import StateMachineHandle
-from rsltrace.adapters.rclpy.handles.logs import Logs
-from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
+from rsltrace.adapters.rclpy.handles.node import NodeHandle, topic_types
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
-from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
+from rsltrace.adapters.rclpy.handles.pubsub import EventHandle, PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of
 from rsltrace.adapters.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
     TypeDescriptionServiceHandle,
 )
-from rsltrace.adapters.rclpy.handles.timers import RosTimerHandle, TimerHandle
+from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types
@@ -45,7 +44,7 @@ from rsltrace.simulation.middleware.qos.status import (
     LivelinessChangedStatus,
     MatchedStatus,
 )
-from rsltrace.simulation.middleware.services import RequestId, ServiceInfo
+from rsltrace.simulation.middleware.services import RequestId, ServiceEnd, ServiceInfo
 from rsltrace.simulation.middleware.subscription import Subscription
 
 _PASSED_THROUGH = (
@@ -74,21 +73,21 @@ _PASSED_THROUGH = (
 
 
 @dataclass(slots=True)
-class Surroundings:
-    """What the boundary needs of a world; ``clocks`` is None where all of them are right."""
+class BoundaryContext:
+    """What the boundary needs from a world; ``clocks`` is None if all show simulated time."""
 
-    stacks: Stacks
-    logs: Logs
+    stacks: Runtime
+    logs: RosoutLogs
     states: NodeStates
     clocks: NodeClocks | None = None
 
 
-class Boundary:
-    """Stands in for the module ``rclpy._rclpy_pybind11``; ``world`` is that of the moment."""
+class RclpyBoundary:
+    """Stands in for the module ``rclpy._rclpy_pybind11``."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
-        self._world: Surroundings | None = None
+        self._world: BoundaryContext | None = None
         self._last_now_ns = 0
         self._signals = real.SignalHandlerOptions.NO
         self.ros_clocks: list[weakref.ref[ClockHandle]] = []
@@ -108,26 +107,22 @@ class Boundary:
             setattr(self, f"rmw_{name}_status_t", CountStatus)
         self.rmw_requested_deadline_missed_status_t = CountStatus
 
-    # -- the world of the moment ---------------------------------------------------------------
+    # -- the current world -----------------------------------------------------------------------
 
     @property
-    def world(self) -> Surroundings:
-        """The world that new entities join.
-
-        :raises UnsupportedError: between runs.
-        """
+    def world(self) -> BoundaryContext:
+        """The world that new entities join. Raises UnsupportedError between runs."""
         if self._world is None:
             raise UnsupportedError("no simulation is running in this process")
         return self._world
 
     @property
-    def stacks(self) -> Stacks:
-        """The stacks of the world of the moment."""
+    def stacks(self) -> Runtime:
         return self.world.stacks
 
     @property
     def is_free(self) -> bool:
-        """Whether no simulation is under way in this process."""
+        """Whether no simulation is running in this process."""
         return self._world is None
 
     def now_ns(self) -> int:
@@ -135,42 +130,40 @@ class Boundary:
         return self._last_now_ns if self._world is None else self._world.stacks.loop.now_ns
 
     def shown_ns(self, owner: str | None) -> int:
-        """Return what the clock of a node shows; without an owner, that of the present node."""
+        """Return what the clock of a node shows (None: of the node that runs)."""
         world = self._world
         if world is None or world.clocks is None:
             return self.now_ns()
         return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
 
     def follows(self, owner: str | None) -> bool:
-        """Return whether /clock drives the ROS time of a node in the run of the moment."""
+        """Return whether /clock drives the ROS time of a node."""
         world = self._world
         return world is not None and world.clocks is not None and world.clocks.follows(owner)
 
     def look_ns(self, owner: str | None) -> int:
-        """Return what a ROS clock of a node shows to user code, which may advance by the look."""
+        """Return what a node's ROS clock shows to user code; reading may advance it."""
         world = self._world
         if world is None or world.clocks is None:
             return self.now_ns()
         return world.clocks.look(owner or self.current_node_name(), world.stacks.loop.now_ns)
 
     def current_node_name(self) -> str | None:
-        """Return the name of the node whose callback or constructor runs, if any does."""
+        """Return the name of the node whose callback or constructor runs."""
         node = self._world.stacks.event.node if self._world is not None else None
         return None if node is None else str(node.fully_qualified_name)
 
-    def enter(self, world: Surroundings) -> None:
-        """Make ``world`` the one that new entities join."""
+    def enter(self, world: BoundaryContext) -> None:
         if self._world is not None:
             raise UnsupportedError("another simulation is running in this process")
         self._world = world
 
     def leave(self) -> None:
-        """End the world of the moment."""
         self._last_now_ns = self.now_ns()
         self._world = None
 
     def jump_clocks(self, delta_ns: int) -> None:
-        """Tell ROS clocks with jump callbacks that time has jumped."""
+        """Run the jump callbacks of ROS clocks."""
         for reference in list(self.ros_clocks):
             clock = reference()
             if clock is None:
@@ -272,7 +265,7 @@ class Boundary:
         return WaitSetHandle(*arguments)
 
     def EventsExecutor(self, context: Any) -> Any:  # noqa: N802
-        """Return an executor that behaves as rclpy's: here all of them run on events."""
+        """Return an ordinary executor: in a run, all of them run on events."""
         from rclpy.executors import SingleThreadedExecutor
 
         return SingleThreadedExecutor(context=context)
@@ -293,44 +286,40 @@ class Boundary:
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = node.asked_graph.publishers_of(node.node_named(name, namespace))
-        return names_and_types([(end.topic, end.type_name) for end in found])
+        return topic_types(node.usable_graph.publishers_of(node.node_named(name, namespace)))
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = node.asked_graph.subscriptions_of(node.node_named(name, namespace))
-        return names_and_types([(end.topic, end.type_name) for end in found])
+        return topic_types(node.usable_graph.subscriptions_of(node.node_named(name, namespace)))
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = node.asked_graph.services_of(node.node_named(name, namespace))
-        return names_and_types([(end.service, end.type_name) for end in found])
+        return _service_types(node.usable_graph.services_of(node.node_named(name, namespace)))
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = node.asked_graph.clients_of(node.node_named(name, namespace))
-        return names_and_types([(end.service, end.type_name) for end in found])
+        return _service_types(node.usable_graph.clients_of(node.node_named(name, namespace)))
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
     ) -> list[tuple[str, list[str]]]:
-        return node.asked_graph.topic_names_and_types()
+        return node.usable_graph.topic_names_and_types()
 
     def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return node.asked_graph.service_names_and_types()
+        return node.usable_graph.service_names_and_types()
 
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, _PUBLISHER) for p in node.asked_graph.publishers(topic)]
+        return [_endpoint_info(p, _PUBLISHER) for p in node.usable_graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.asked_graph.subscriptions(topic)]
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.usable_graph.subscriptions(topic)]
 
     # -- messages ----------------------------------------------------------------------------------
 
@@ -349,7 +338,7 @@ class Boundary:
     # -- logging -----------------------------------------------------------------------------------
 
     def rclpy_logging_configure(self, context: Any) -> None:
-        """Do nothing: rcl's would open a log file below the home folder."""
+        """Do nothing: rcl's function would open a log file below the home folder."""
 
     def rclpy_logging_fini(self) -> None:
         pass
@@ -384,7 +373,32 @@ class Boundary:
         pass
 
 
+HANDLES: dict[str, type] = {
+    "ActionClient": ActionClientHandle,
+    "ActionGoalHandle": GoalHandle,
+    "ActionServer": ActionServerHandle,
+    "Client": ClientHandle,
+    "Clock": ClockHandle,
+    "ClockEvent": ClockEventHandle,
+    "Context": ContextHandle,
+    "EventHandle": EventHandle,
+    "GuardCondition": GuardConditionHandle,
+    "LifecycleStateMachine": StateMachineHandle,
+    "Node": NodeHandle,
+    "Publisher": PublisherHandle,
+    "Service": ServiceHandle,
+    "Subscription": SubscriptionHandle,
+    "Timer": TimerHandle,
+    "TypeDescriptionService": TypeDescriptionServiceHandle,
+    "WaitSet": WaitSetHandle,
+}
+"""The classes of the objects that the boundary makes, by their names in rclpy's extension."""
+
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
+
+
+def _service_types(ends: Iterable[ServiceEnd]) -> list[tuple[str, list[str]]]:
+    return names_and_types([(end.service, end.type_name) for end in ends])
 
 
 def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:

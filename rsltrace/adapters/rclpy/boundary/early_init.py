@@ -1,8 +1,8 @@
-"""A main whose module calls ``rclpy.init()`` when it is imported.
+"""Mains whose module calls ``rclpy.init()`` at import.
 
-The modules of mains are imported before the run, so that what is wrong with a job is said with its
-line. They have no process by then, and so no context to initialize: such a module is imported by
-its program, as ``python`` does it.
+The modules of mains are imported before the run, so that errors in a job name its line. They have
+no simulated process then, and so no context to initialize: such a module is imported again by its
+program.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from contextlib import contextmanager
 
 
 class NeedsItsProcess(BaseException):
-    """A module uses rclpy's contexts when it is imported. No ``Exception``: user code that catches
-    those is not to take it for one of rclpy's."""
+    """A module uses rclpy's contexts at import. No ``Exception``, so that user code does not catch
+    it."""
 
 
 _without_process = False
@@ -21,10 +21,9 @@ _without_process = False
 
 @contextmanager
 def before_its_process() -> Iterator[None]:
-    """Import the module of a main before its program begins; rclpy's default context is none of
-    the run's meanwhile.
+    """Import the module of a main before its program begins.
 
-    :raises NeedsItsProcess: if the module initializes a context, or asks for the default one.
+    :raises NeedsItsProcess: if the module initializes a context, or uses the default one.
     """
     global _without_process
     import rclpy.utilities
@@ -43,6 +42,6 @@ def before_its_process() -> Iterator[None]:
 
 
 def check_process() -> None:
-    """Raise ``NeedsItsProcess`` if what is going to be initialized has no process yet."""
+    """Raise ``NeedsItsProcess`` if there is no simulated process to initialize yet."""
     if _without_process:
         raise NeedsItsProcess

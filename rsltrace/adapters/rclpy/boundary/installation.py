@@ -1,6 +1,6 @@
 """How the simulated middleware gets behind rclpy, and away again.
 
-The reference ``_rclpy`` is exchanged in every loaded rclpy module and in
+The reference ``_rclpy`` is replaced in every loaded rclpy module and in
 ``rclpy.impl.implementation_singleton`` (for modules that load later), and afterwards put back.
 """
 
@@ -13,7 +13,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
@@ -23,32 +23,14 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
-from rsltrace.adapters.rclpy.actions.parts import GoalHandle
-from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
-from rsltrace.adapters.rclpy.boundary.boundary import Boundary
-from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
-from rsltrace.adapters.rclpy.handles.context import ContextHandle
-from rsltrace.adapters.rclpy.handles.guard_condition import GuardConditionHandle
-from rsltrace.adapters.rclpy.handles.lifecycle import StateMachineHandle
-from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_events import EventHandle
-from rsltrace.adapters.rclpy.handles.services import (
-    ClientHandle,
-    ServiceHandle,
-    TypeDescriptionServiceHandle,
-)
-from rsltrace.adapters.rclpy.handles.timers import TimerHandle
-from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
+from rsltrace.adapters.rclpy.boundary.boundary import HANDLES, RclpyBoundary
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.guard.guard import engage
+from rsltrace.guard.redirect import replace_attribute
 
-# Who logs: rclpy's logger looks for its caller at every call, here it does once per source file.
-#
-# rclpy walks up the stack with ``inspect.getframeinfo``, which reads source files, and
-# ``os.path.realpath``: half a millisecond, of which nothing but the line can be new. What it finds
-# (and so what ``once``, ``skip_first`` and throttles go by) is the same here.
+# rclpy's logger finds its caller with ``inspect.getframeinfo``, which reads source files, and
+# ``os.path.realpath``: half a millisecond per record. Here that is done once per source file. What
+# it finds (and so what ``once``, ``skip_first`` and throttles go by) is the same.
 
 _FIELDS = ("function_name", "file_path", "line_number", "last_index")
 
@@ -59,19 +41,17 @@ def quick_log_callers() -> Iterator[None]:
     from rclpy.impl import rcutils_logger
 
     logger: Any = rcutils_logger
-    real = logger.CallerId
-    if getattr(real, "_fields", None) == _FIELDS:  # else it is of a release that is not known here
-        logger.CallerId = _log_callers_quick(logger, real)
-    try:
+    with ExitStack() as stack:
+        if getattr(logger.CallerId, "_fields", None) == _FIELDS:  # else: an unknown release
+            quick = _log_callers_quick(logger, logger.CallerId)
+            replace_attribute(stack, logger, "CallerId", quick)
         yield
-    finally:
-        logger.CallerId = real
 
 
 def _log_callers_quick(logger: Any, real: Any) -> Any:
-    """Return a ``CallerId`` that does what ``real`` does and remembers what it knows of files."""
+    """Return a ``CallerId`` that does what ``real`` does and remembers the paths of files."""
     internal: list[str] = []
-    """What was in rclpy's list of its own files when ``places`` was made; others may add theirs."""
+    """rclpy's list of its own files when ``places`` was made; user code may extend it."""
     places: dict[str, str | None] = {}
     """Absolute paths by the names in code objects; None for files of rclpy's logging."""
     make = tuple.__new__
@@ -109,11 +89,8 @@ def _log_callers_quick(logger: Any, real: Any) -> Any:
     return CallerId
 
 
-# Texts of goal ids without numpy's general formatter.
-#
-# rclpy's action server makes the text of a goal's id (sixteen octets) five times per goal, for
-# debug records that hardly anybody sees. numpy takes some 50 µs for one; the same text is made
-# here in 3.
+# rclpy's action server formats a goal's id (sixteen octets) five times per goal, for debug records.
+# numpy takes 50 µs for each; the same text is made here in 3.
 
 _OCTETS = 16
 _OCTET = np.dtype(np.uint8)
@@ -125,10 +102,10 @@ _OLD_STYLE = 113
 
 @contextmanager
 def quick_id_texts() -> Iterator[None]:
-    """Make the texts of sixteen octets quickly within the ``with`` block."""
+    """Format arrays of sixteen octets quickly within the ``with`` block."""
     arrayprint: Any = sys.modules.get("numpy._core.arrayprint")
     real = getattr(arrayprint, "_array2string", None)
-    if real is None:  # another numpy, which has it elsewhere: then it takes its time
+    if real is None:  # another numpy, which has it elsewhere
         yield
         return
 
@@ -147,34 +124,29 @@ def quick_id_texts() -> Iterator[None]:
             return octets_text(a)
         return real(a, options, separator, prefix)
 
-    arrayprint._array2string = _array2string
-    try:
+    with ExitStack() as stack:
+        replace_attribute(stack, arrayprint, "_array2string", _array2string)
         yield
-    finally:
-        arrayprint._array2string = real
 
 
 def octets_text(octets: Any) -> str:
-    """Return what ``str`` makes of an array of octets that fits into a line."""
+    """Return the text that ``str`` gives for an array of octets that fits into a line."""
     words = [str(octet) for octet in octets.tolist()]
     width = max(map(len, words))
     return f"[{' '.join([word.rjust(width) for word in words])}]"
 
 
-# What messages load when their type is first used, without the generator that comes with it.
-#
-# ``rosidl_generator_py`` holds the one function that messages ask for, and a generator of Python
-# code with a template engine and a parser of IDL, a tenth of what a short command takes. In a run
-# the engine would be compiled as if it were a node's library, and the parser has warnings of old
-# modules, which ``pytest -W error`` makes a node's failure. Who asks the package for the generator
-# gets it.
+# Messages need one function of ``rosidl_generator_py``. The rest of that package, a code generator
+# with a template engine and an IDL parser, is loaded only on demand: it takes a tenth of a short
+# command's time, would be compiled as a node's library in a run, and gives deprecation warnings,
+# which ``pytest -W error`` makes a node's failure.
 
 _PACKAGE = "rosidl_generator_py"
 _LOADER = "import_type_support"
 
 
 def load_type_support() -> None:
-    """Load what messages load, now and not in a run; it may be missing where nothing needs it."""
+    """Load what messages need, before the run; it may be missing where nothing needs it."""
     with warnings.catch_warnings(), suppress(ImportError):
         warnings.simplefilter("ignore")
         importlib.import_module("rosidl_parser")
@@ -185,7 +157,7 @@ def load_type_support() -> None:
 
 
 def _load_in_part(spec: ModuleSpec) -> None:
-    """Have the package with its one function; the rest is loaded when it is asked for."""
+    """Load the package with its one function, the rest on demand."""
     package = sys.modules[_PACKAGE] = module_from_spec(spec)
     try:
         function = getattr(importlib.import_module(f"{_PACKAGE}.{_LOADER}_impl"), _LOADER)
@@ -211,14 +183,11 @@ def _load_fully(package: ModuleType, spec: ModuleSpec) -> None:
         spec.loader.exec_module(package)
 
 
-# Publishing without rclpy's care for C memory, of which there is none here.
-#
 # ``Publisher.publish`` puts a ``with`` around each message so that the C publisher is not freed
-# under it: a property and two more calls, which took a twelfth of an event. What it does is the
-# same here.
+# meanwhile, which took a twelfth of an event. There is no C publisher here.
 
 _NAMES = {"handle", "msg_type", "_Publisher__publisher", "publish", "publish_raw"}
-"""What rclpy's own method looks up, among other things; of a release that does not, it stays."""
+"""What rclpy's own method looks up; if a release's method does not, it is not replaced."""
 
 
 @contextmanager
@@ -229,7 +198,7 @@ def quick_publish() -> Iterator[None]:
     kind: Any = Publisher
     real = kind.publish
     if not set(getattr(getattr(real, "__code__", None), "co_names", ())) >= _NAMES:
-        yield  # somebody has exchanged it, or it is of a release that is not known here
+        yield  # replaced by user code, or an unknown release
         return
     kind.publish = ours = _quick(real)
     try:
@@ -240,7 +209,7 @@ def quick_publish() -> Iterator[None]:
 
 
 def _quick(real: Callable[[Any, Any], None]) -> Any:
-    """Return a method that does what ``real`` does, and leaves it what is an error."""
+    """Return a method that does what ``real`` does, and calls it for errors."""
 
     @wraps(real)
     def publish(self: Any, msg: Any) -> None:
@@ -261,41 +230,38 @@ def _quick(real: Callable[[Any, Any], None]) -> Any:
     return publish
 
 
-# Whether this rclpy is one whose C-extension boundary rsltrace can stand behind.
-#
-# Each release of ROS 2 adds a few names to the boundary. One that rclpy's Python code uses and
-# that has no stand-in here would fail in the middle of a run, so it is looked for before the first
-# one.
+# Each release of ROS 2 adds a few names to the extension. If rclpy's Python code uses one that is
+# missing here, the run is refused before it starts.
 
 KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
 _UNUSED = {"add_to_waitset"}  # executors get no wait set here
 
 
-def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> None:
-    """Make sure that nothing rclpy uses is missing.
+def check_release(real: Any, replacement: Any, handles: dict[str, type], package: Path) -> None:
+    """Raise SetupError if rclpy uses a name of the extension that is missing here.
 
-    ``real`` is the extension, ``stand_ins`` what takes its place, ``handles`` the classes of the
-    objects it makes by their names in the extension, ``package`` the folder of rclpy's sources.
-
-    :raises SetupError: naming what is missing.
+    ``real`` is the extension, ``replacement`` the object in its place, ``handles`` are the classes
+    of the objects it makes by their names, ``package`` is the folder of rclpy's sources.
     """
-    missing = missing_parts(real, stand_ins, handles, package)
+    missing = missing_parts(real, replacement, handles, package)
     if missing:
         raise SetupError(
-            f"the rclpy in {package} is of a release of ROS 2 that this version of rsltrace cannot "
-            f"simulate: it uses {', '.join(missing)} of its C extension, for which rsltrace has no "
-            f"stand-in. It works with {KNOWN}: update rsltrace, source one of these, or install "
-            "the wheels into an environment of their own: pip install 'rsltrace[ros]'"
+            f"this version of rsltrace cannot simulate the rclpy in {package}: it uses "
+            f"{', '.join(missing)} of its C extension. rsltrace works with {KNOWN}: "
+            "update rsltrace, source one of these, or install the wheels into a separate "
+            "environment: pip install 'rsltrace[ros]'"
         )
 
 
-def missing_parts(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> list[str]:
-    """Return what rclpy's sources use of the extension and has no stand-in, sorted."""
-    # Sources also mention names that only a type checker sees; the extension has none of those.
+def missing_parts(
+    real: Any, replacement: Any, handles: dict[str, type], package: Path
+) -> list[str]:
+    """Return the names of the extension that rclpy's sources use and that are missing, sorted."""
+    # Sources also mention names for type checkers; the extension has none of those.
     lacking = [
         (rf"\b_rclpy\.{name}\b", name)
         for name in dir(real)
-        if name[0].isalpha() and not hasattr(stand_ins, name)
+        if name[0].isalpha() and not hasattr(replacement, name)
     ]
     for name, handle in handles.items():
         for method in vars(getattr(real, name, object)):
@@ -307,31 +273,10 @@ def missing_parts(real: Any, stand_ins: Any, handles: dict[str, type], package: 
     return sorted(name for use, name in lacking if re.search(use, sources))
 
 
-_HANDLES: dict[str, type] = {
-    "ActionClient": ActionClientHandle,
-    "ActionGoalHandle": GoalHandle,
-    "ActionServer": ActionServerHandle,
-    "Client": ClientHandle,
-    "Clock": ClockHandle,
-    "ClockEvent": ClockEventHandle,
-    "Context": ContextHandle,
-    "EventHandle": EventHandle,
-    "GuardCondition": GuardConditionHandle,
-    "LifecycleStateMachine": StateMachineHandle,
-    "Node": NodeHandle,
-    "Publisher": PublisherHandle,
-    "Service": ServiceHandle,
-    "Subscription": SubscriptionHandle,
-    "Timer": TimerHandle,
-    "TypeDescriptionService": TypeDescriptionServiceHandle,
-    "WaitSet": WaitSetHandle,
-}
-"""The classes of the objects that the boundary makes, by their names in rclpy's extension."""
-
-_installed: Boundary | None = None
+_installed: RclpyBoundary | None = None
 
 
-def boundary() -> Boundary:
+def boundary() -> RclpyBoundary:
     """Return the boundary, loading rclpy's extension (but no rclpy module that binds it).
 
     :raises SetupError: if rclpy is not installed or cannot be loaded.
@@ -348,37 +293,37 @@ def boundary() -> Boundary:
             ) from error
         load_type_support()
         real = singleton.rclpy_implementation
-        ours = Boundary(real)
-        check_release(real, ours, _HANDLES, Path(singleton.__file__).parents[1])
+        ours = RclpyBoundary(real)
+        check_release(real, ours, HANDLES, Path(singleton.__file__).parents[1])
         _installed = ours
     return _installed
 
 
 def check_free() -> None:
-    """Raise UnsupportedError if a simulation is under way in this process: rclpy can be only one's.
+    """Raise UnsupportedError if a simulation is running in this process.
 
     :raises SetupError: if rclpy is not installed or cannot be loaded.
     """
     if not boundary().is_free:
         raise UnsupportedError(
-            "another simulation is running in this process: end it first (leave the block of the "
-            "other Simulation), or use a process of its own"
+            "another simulation is running in this process: leave its Simulation block first, or "
+            "use another process"
         )
 
 
 @contextmanager
-def installed() -> Iterator[Boundary]:
-    """Have rclpy use the simulated middleware within the ``with`` block."""
+def installed() -> Iterator[RclpyBoundary]:
+    """Let rclpy use the simulated middleware within the ``with`` block."""
     ours = boundary()
-    _exchange(ours.real, ours)
+    _swap_extension(ours.real, ours)
     try:
         with quick_log_callers(), quick_id_texts(), quick_publish():
             yield ours
     finally:
-        _exchange(ours, ours.real)
+        _swap_extension(ours, ours.real)
 
 
-def _exchange(old: Any, new: Any) -> None:
+def _swap_extension(old: Any, new: Any) -> None:
     for module in list(sys.modules.values()):
         names = getattr(module, "__dict__", None)
         if not isinstance(names, dict) or module is sys.modules[__name__]:

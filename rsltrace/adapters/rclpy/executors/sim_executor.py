@@ -1,4 +1,4 @@
-"""The executor that nodes see: rclpy's Executor API, with the loop in place of ``spin``."""
+"""The executor of a job's own nodes: rclpy's Executor API on top of the event loop."""
 
 from __future__ import annotations
 
@@ -13,31 +13,29 @@ from rsltrace.adapters.rclpy.handles.wait_set import (
     deactivate_node,
     sync_woken,
 )
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.coroutines import Resume
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.sim_event import FutureWake, SimEvent
+from rsltrace.adapters.rclpy.stacks.blocking_calls import EventSetter, SimEvent, wait
+from rsltrace.adapters.rclpy.stacks.coroutines import ResumeTask
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
 from rsltrace.trace.model.texts import patience_ns
 
 
 class SimExecutor(Executor):  # type: ignore[misc]
-    """The executor of a run. Adding a node to it is what makes the node's callbacks run."""
+    """The executor of a run. The callbacks of the nodes added to it run."""
 
-    def __init__(self, stacks: Stacks, context: Any) -> None:
+    def __init__(self, stacks: Runtime, context: Any) -> None:
         self._stacks = stacks
         self._sim_nodes: dict[Any, None] = {}
         super().__init__(context=context)
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        """Run a callback or coroutine right after the present event."""
-        if type(callback) in (Resume, FutureWake) or is_bookkeeping(callback):
+        """Run a callback or coroutine right after the current event."""
+        if type(callback) in (ResumeTask, EventSetter) or is_bookkeeping(callback):
             callback(*args)  # rclpy's own, not an event
             return None
         return create_task(self._stacks, callback, args, kwargs)
 
     def add_node(self, node: Any) -> bool:
-        """Run a node's callbacks from now on."""
         if node in self._sim_nodes:
             return False
         self._sim_nodes[node] = None
@@ -51,28 +49,26 @@ class SimExecutor(Executor):  # type: ignore[misc]
         return True
 
     def remove_node(self, node: Any) -> None:
-        """Stop running a node's callbacks."""
         if self._sim_nodes.pop(node, self) is None:
             deactivate_node(node.handle)
 
     def get_nodes(self) -> list[Any]:
-        """Return the nodes in the order in which they were added."""
         return list(self._sim_nodes)
 
     def wake(self) -> None:
-        """Look for waitables that have come or gone: the loop sees all other changes at once."""
+        """Look for added and removed waitables; the loop sees all other changes at once."""
         sync_woken(self._sim_nodes, sys._getframe(1))
 
     def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
-        """Wait in simulated time until the future is done; others run meanwhile."""
+        """Wait in simulated time until the future is done."""
         if future.done() or future.cancelled():
             return
         done = SimEvent(self._stacks, "a future to be completed")
-        future.add_done_callback(FutureWake(done))
+        future.add_done_callback(EventSetter(done))
         done.wait(None if timeout_sec is None or timeout_sec < 0 else timeout_sec)
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
-        """Let everything that is ready run, or else what comes next within the timeout."""
+        """Let everything that is ready run, else wait for the next event within the timeout."""
         stacks = self._stacks
         loop = stacks.loop
         if loop.tasks or loop.ready:
@@ -93,9 +89,5 @@ class SimExecutor(Executor):  # type: ignore[misc]
             self.spin_once(getattr(timeout_sec, "timeout", timeout_sec))
 
     def spin(self) -> None:
-        """Let others run until the run ends."""
         while self._context.ok():
             wait(self._stacks, "the run to end", patient=True)
-
-
-__all__ = ["SimExecutor"]

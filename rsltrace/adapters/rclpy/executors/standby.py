@@ -1,11 +1,10 @@
-"""A stack in rclpy's spin: what is ready for its executor runs on it at once.
+"""A fast path for spinning executors: callbacks run where the spin waits.
 
-A stack that waits for work in ``spin_once`` would be woken, take what is ready from a mailbox and
-run it next. So the loop's runner switches to it with what is ready, and it runs that where it
-waits. Between two callbacks rclpy's ``spin`` only asks whether to go on, and nobody sees it do so,
-as long as a callback has left everything as it was: then the stack stays in its wait. Code runs
-where it always ran and when it did: it may block, spin or raise there as ever. After a callback
-that leaves anything to see or to do for ``spin``, that goes on as usual.
+A stack that waits in ``spin_once`` would wake up, take the ready callback from a mailbox and run
+it. Instead the loop switches to that stack, which runs the callback inside its wait. Between two
+callbacks ``spin`` only checks whether to go on; if a callback changed nothing that the check sees,
+the stack stays in its wait. Otherwise ``spin`` goes on as usual. The order of callbacks, and where
+they may block, spin or raise, are the same.
 """
 
 from __future__ import annotations
@@ -22,26 +21,26 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 
 
-class Waker(Protocol):
-    """The pump of the executor that spins."""
+class StandbyOwner(Protocol):
+    """The driver of the spinning executor."""
 
     executor: Any
     standby: Standby | None
-    waits: list[Wait]
+    waits: list[BlockedCall]
     woken: bool
 
 
 class Standby:
-    """One stack in a spin. ``future`` is what it spins for, None if for ever; ``once`` says that it
-    goes on itself after each callback."""
+    """One spinning stack. ``future`` is what it spins for (None: for ever). With ``once`` the spin
+    goes on after each callback."""
 
-    def __init__(self, stacks: Stacks, pump: Waker, future: Any, *, once: bool) -> None:
+    def __init__(self, stacks: Runtime, driver: StandbyOwner, future: Any, *, once: bool) -> None:
         self._stacks = stacks
         self._loop = stacks.loop
         self._dispatcher = stacks.dispatcher
@@ -50,24 +49,24 @@ class Standby:
         self._runners = stacks.runners
         self._waiting = stacks.runners.waiting
         self._all_blocked = stacks.runners.blocked
-        self._pump = pump
-        self._context = pump.executor.context.handle
+        self._driver = driver
+        self._context = driver.executor.context.handle
         self._future = future
         self._once = once
-        self.blocked: Wait
-        """The wait of the spin."""
+        self.blocked: BlockedCall
+        """The spin's wait."""
         self.is_over = False
-        """Whether something has run after which the spin has to look itself."""
+        """Whether the spin has to go on itself after the last callback."""
         self.failure: BaseException | None = None
-        """What came out of that, which the spin raises."""
+        """The exception of that callback, which the spin raises."""
 
-    def begin(self, blocked: Wait) -> None:
+    def begin(self, blocked: BlockedCall) -> None:
         """Stand by from now on."""
         self.blocked = blocked
-        self._pump.standby = self
+        self._driver.standby = self
 
     def runs(self, mailbox: Mailbox, item: Dispatchable) -> bool:
-        """Run what is ready, if the spin would take it next and run it, on the stack that spins.
+        """Run an item on the spinning stack, if the spin would take it next.
 
         Called on the stack that runs the loop.
         """
@@ -78,17 +77,17 @@ class Standby:
         return True
 
     def _takes(self, item: Dispatchable) -> bool:
-        """Return whether the spin would take what is ready, and could run it now."""
+        """Return whether the spin would take the item and could run it now."""
         future = self._future
         return not self.blocked.woken and (future is None or not future.done()) and _is_free(item)
 
     def serve(self, mailbox: Mailbox, item: Dispatchable) -> bool:
-        """Run what is given to the stack, one callback after the other, and wait in between.
+        """Run the given callback and those that follow, waiting in between.
 
-        Returns whether the spin has to go on itself (see ``is_over``); else the wait was ended.
+        Returns whether the spin has to go on itself (see ``is_over``); if not, the wait has ended.
         """
-        pump, programs, dispatcher, event = (
-            self._pump,
+        driver, programs, dispatcher, event = (
+            self._driver,
             self._programs,
             self._dispatcher,
             self._event,
@@ -100,8 +99,8 @@ class Standby:
             blocked.stop_waiting()  # its time limit means nothing to a callback that blocks
         while True:
             del all_blocked[blocked]
-            pump.standby = None
-            pump.woken = False
+            driver.standby = None
+            driver.woken = False
             if programs.present is not program:
                 program.enter()
             programs.constructing = blocked.constructing
@@ -116,7 +115,7 @@ class Standby:
             if (
                 self._once
                 or failure is not None
-                or pump.woken
+                or driver.woken
                 or not context.is_up
                 or entities.pending
                 or (dispatcher.unrecorded if recorder is None else recorder.outputs)
@@ -126,7 +125,7 @@ class Standby:
             event.handle, event.entity, event.node = blocked.event
             for observer in dispatcher.node_observers:
                 observer.node_entered(event.node, is_made=False)
-            pump.standby = self
+            driver.standby = self
             all_blocked[blocked] = None
             following = self._following()
             if following is not None:
@@ -147,8 +146,7 @@ class Standby:
         return True
 
     def _following(self) -> tuple[greenlet, Mailbox, Dispatchable] | None:
-        """Take what the loop would dispatch next, if a stack that stands by would run it: that goes
-        on at once, without the loop and the host between them."""
+        """Take the loop's next item if a standby stack would run it, to switch there directly."""
         loop = self._loop
         if loop.tasks or not loop.ready or loop.events >= loop.looks_at:
             return None
@@ -156,9 +154,9 @@ class Standby:
         if not isinstance(item, ReceiverHandle) or item.node is None:
             return None
         mailbox: Mailbox | None = item.node.mailbox
-        if mailbox is None or mailbox.pump is None:
+        if mailbox is None or mailbox.driver is None:
             return None
-        standby: Any = mailbox.pump.standby
+        standby: Any = mailbox.driver.standby
         if standby is None or not standby._takes(item):
             return None
         loop.ready.popleft()
@@ -166,10 +164,10 @@ class Standby:
 
 
 def _is_free(item: Any) -> bool:
-    """Say whether nothing keeps a callback from running now, and nobody has to be asked."""
+    """Return whether a callback may run now, without asking a custom callback group."""
     try:
         group, own = item.wrapper.callback_group, item.own_group
-    except AttributeError:  # no entity of rclpy's, or one that nobody runs any more
+    except AttributeError:  # no entity of rclpy, or one that no longer runs
         wrapper = getattr(item, "wrapper", None)
         group = getattr(wrapper, "callback_group", None)
         return group is None or not (is_custom(group) or is_busy(group, wrapper))
@@ -181,17 +179,22 @@ def _is_free(item: Any) -> bool:
 
 
 def standby_of(
-    stacks: Stacks, pump: Waker, nodes: object, condition: Callable[[], bool], *, has_limit: bool
+    stacks: Runtime,
+    driver: StandbyOwner,
+    nodes: object,
+    condition: Callable[[], bool],
+    *,
+    has_limit: bool,
 ) -> Standby | None:
-    """Return what stands by for the spin that looks for work, None if that is not possible.
+    """Return a standby for the calling spin, None if it cannot have one.
 
-    ``has_limit`` says that it waits for some time only.
+    ``has_limit``: the spin waits with a timeout.
     """
     event = stacks.event
     if (
         nodes is not None
-        or pump.waits
-        or pump.standby is not None
+        or driver.waits
+        or driver.standby is not None
         or type(stacks.loop) is not EventLoop
         or type(stacks.loop.timers) is not CreationOrderQueue
         or stacks.dispatcher.resume_observers
@@ -200,7 +203,7 @@ def standby_of(
         or _get_running_loop() is not None
     ):
         return None
-    own = _rclpys_own()
+    own = _rclpy_code()
     frame: FrameType | None = sys._getframe(3)
     if frame is None or frame.f_code is not own.one_turn:
         return None
@@ -212,12 +215,12 @@ def standby_of(
     while frame is not None and frame.f_code in own.turns:
         frame = frame.f_back
     is_endless = not has_limit and frame is not None and frame.f_code in own.spins
-    return Standby(stacks, pump, future, once=not is_endless)
+    return Standby(stacks, driver, future, once=not is_endless)
 
 
-class _RclpysOwn(NamedTuple):
-    """Code of rclpy's ``SingleThreadedExecutor``: what runs one callback, those who call it, and
-    those who do so again and again; the condition that is never met, and ``Future.done``."""
+class _RclpyCode(NamedTuple):
+    """Code of rclpy's ``SingleThreadedExecutor``: the function that runs one callback, its callers,
+    the spin loops, the condition that is never met, and ``Future.done``."""
 
     one_turn: CodeType | None
     turns: frozenset[CodeType]
@@ -227,7 +230,7 @@ class _RclpysOwn(NamedTuple):
 
 
 @lru_cache(maxsize=1)
-def _rclpys_own() -> _RclpysOwn:
+def _rclpy_code() -> _RclpyCode:
     import rclpy
     from rclpy.executors import Executor, SingleThreadedExecutor
     from rclpy.task import Future
@@ -236,7 +239,7 @@ def _rclpys_own() -> _RclpysOwn:
     single = vars(SingleThreadedExecutor)
     spins = (Executor.spin, Executor.spin_until_future_complete, rclpy.spin)
     one_turn = single.get(names[0])
-    return _RclpysOwn(
+    return _RclpyCode(
         getattr(one_turn, "__code__", None),
         frozenset(single[name].__code__ for name in names if name in single),
         frozenset(spin.__code__ for spin in spins),
@@ -245,25 +248,20 @@ def _rclpys_own() -> _RclpysOwn:
     )
 
 
-class Ran:
-    """What rclpy's executor is given as a Task that it has run: the callback has run already."""
+class FinishedTask:
+    """Stands in for a Task whose callback has already run."""
 
     def __init__(self, failure: BaseException | None = None) -> None:
         self._failure = failure
 
     def __call__(self) -> None:
-        """Do as a Task does: only what is no Exception comes out at once."""
+        """Raise at once only what is no Exception, as a Task does."""
         if self._failure is not None and not isinstance(self._failure, Exception):
             raise self._failure
 
     def exception(self) -> BaseException | None:
-        """Return what the callback raised."""
         return self._failure
 
     def result(self) -> None:
-        """Raise what the callback raised."""
         if self._failure is not None:
             raise self._failure
-
-
-__all__ = ["Ran", "Standby", "standby_of"]

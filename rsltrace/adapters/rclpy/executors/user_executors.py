@@ -1,7 +1,7 @@
-"""Executors of the user's own: rclpy's classes, with the places exchanged where they would wait.
+"""Executors that user code makes: rclpy's classes, with a few methods replaced for a run.
 
-What is exchanged is few and the same in all versions: how an executor learns of nodes, and
-``wait_for_ready_callbacks``. The run's own ``SimExecutor`` overrides all of it.
+The replaced methods are those that add nodes, wake and shut down, and ``wait_for_ready_callbacks``.
+``SimExecutor`` overrides all of them.
 """
 
 from __future__ import annotations
@@ -9,29 +9,26 @@ from __future__ import annotations
 import sys
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import lru_cache
 from importlib import import_module
 from pathlib import PurePath
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-from rsltrace.adapters.rclpy.executors.pump import pump_of
+from rsltrace.adapters.rclpy.executors.executor_driver import driver_of
 from rsltrace.adapters.rclpy.handles.wait_set import sync_woken
-from rsltrace.adapters.rclpy.stacks.blocking_calls import lose_patience
-from rsltrace.adapters.rclpy.stacks.coroutines import Resume
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import count_refused_wait
+from rsltrace.adapters.rclpy.stacks.coroutines import ResumeTask
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
+from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.interface import file_of
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
-# Functions of rclpy that user code exchanges: one is called, of the others the run tells.
-#
-# Monitoring libraries put code of their own around the functions by which rclpy's executors run
-# callbacks. The loop does without these. ``await_or_execute``, through which all callbacks go, is
-# called nevertheless once somebody has replaced it; what else is replaced must not be lost in
-# silence.
+# Monitoring libraries wrap the functions by which rclpy's executors run callbacks. The loop does
+# not call these. A replaced ``await_or_execute`` is called; the run reports the others.
 
 _THROUGH = "await_or_execute"
 _ASKED_BY_SPINS = "wait_for_ready_callbacks"
@@ -43,13 +40,13 @@ _OWN = (
 
 
 @contextmanager
-def exchanged_function_called(stacks: Stacks) -> Iterator[None]:
-    """Run callbacks through what user code puts in place of ``await_or_execute``, if it does."""
+def replaced_function_called(stacks: Runtime) -> Iterator[None]:
+    """Run callbacks through the function that user code puts in place of ``await_or_execute``."""
     from rclpy import executors
 
     def look() -> None:
         through = getattr(executors, _THROUGH)
-        stacks.runs_callbacks = None if _is_own(through) else through
+        stacks.runs_callbacks = None if _is_rclpys(through) else through
         for node in stacks.domain.graph.nodes:
             wrapper = getattr(node, "wrapper", None)
             for one in [*wrapper.subscriptions, *wrapper.timers] if wrapper is not None else ():
@@ -70,30 +67,30 @@ def exchanged_function_called(stacks: Stacks) -> Iterator[None]:
         executors.__class__ = kind
 
 
-def note_exchanged(stacks: Stacks, executor: type | None = None, *, hosted: bool = False) -> None:
-    """Tell which functions user code has replaced although nobody calls them.
+def note_replaced_functions(
+    stacks: Runtime, executor: type | None = None, *, hosted: bool = False
+) -> None:
+    """Report functions that user code replaced and that are never called.
 
-    ``executor`` is a class whose bases are looked at, too. ``hosted`` says that the run itself has
-    nodes to spin.
+    The bases of the class ``executor`` are checked, too. ``hosted``: the job constructs nodes.
     """
     notes = stacks.domain.outcome.notes
     found = [
         f"{_where(function)}: {kind.__qualname__}.{name} is never called, because rsltrace runs "
-        "callbacks itself: what it does is missing from the run (exchange "
-        "rclpy.executors.await_or_execute instead, or wrap the callbacks)"
-        for kind, names in _looked_at(executor)
+        "callbacks itself; replace rclpy.executors.await_or_execute instead, or wrap the callbacks"
+        for kind, names in _checked_classes(executor)
         for name in names
-        if not _is_own(function := vars(kind).get(name))
+        if not _is_rclpys(function := vars(kind).get(name))
     ]
-    if hosted and not _is_own(spin := vars(_named(EXECUTOR))[_ASKED_BY_SPINS]):
+    if hosted and not _is_rclpys(spin := vars(_named(EXECUTOR))[_ASKED_BY_SPINS]):
         found.append(
             f"{_where(spin)}: Executor.{_ASKED_BY_SPINS} is not called for nodes that the job "
-            "constructs (node:), because nobody spins them: it is for those of a main: that spins"
+            "constructs (node:), only for nodes that a main: spins"
         )
     notes += [note for note in dict.fromkeys(found) if note not in notes]
 
 
-def _looked_at(executor: type | None) -> Iterator[tuple[type, tuple[str, ...]]]:
+def _checked_classes(executor: type | None) -> Iterator[tuple[type, tuple[str, ...]]]:
     for place, names in NEVER_CALLED.items():
         yield _named(place), names
     for kind in executor.__mro__ if executor is not None else ():
@@ -106,9 +103,11 @@ def _named(place: str) -> Any:
     return getattr(import_module(module), name)
 
 
-def _is_own(function: Any) -> bool:
-    """Say whether a function, if there is one, is rclpy's or what stands in for it here:
-    ``functools.wraps`` copies names, but not code."""
+def _is_rclpys(function: Any) -> bool:
+    """Return whether a function is None, rclpy's or its replacement here.
+
+    ``functools.wraps`` copies names, but not code.
+    """
     code = getattr(function, "__code__", None)
     parts = PurePath(code.co_filename).parts[-2:] if code is not None else ()
     return function is None or parts in _OWN
@@ -122,37 +121,33 @@ def _where(function: Any) -> str:
 
 
 @contextmanager
-def own_executors(stacks: Stacks) -> Iterator[None]:
+def own_executors(stacks: Runtime) -> Iterator[None]:
     """Have rclpy's executors wait in simulated time within the ``with`` block."""
     from rclpy import executors
     from rclpy.executors import Executor
 
     made: list[weakref.ref[Executor]] = []
     real = {name: getattr(Executor, name) for name in _methods(stacks, {}, made)}
-    names = ("os", "time")
-    saved = {name: getattr(executors, name) for name in names if hasattr(executors, name)}
-    for name, method in _methods(stacks, real, made).items():
-        setattr(Executor, name, method)
-    executors.os = SimpleNamespace(
-        sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
-    )
-    executors.time = SimpleNamespace(monotonic=lambda: stacks.loop.now_ns / 1_000_000_000)
-    try:
-        with exchanged_function_called(stacks):
-            yield
-    finally:
-        for name, method in real.items():
-            setattr(Executor, name, method)
-        for name, value in saved.items():
-            setattr(executors, name, value)
-        _release(made)
+    modules = {
+        "os": SimpleNamespace(
+            sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
+        ),
+        "time": SimpleNamespace(monotonic=lambda: stacks.loop.now_ns / 1_000_000_000),
+    }
+    with ExitStack() as stack:
+        stack.callback(_release, made)
+        for name, value in modules.items():
+            if hasattr(executors, name):
+                replace_attribute(stack, executors, name, value)
+        for name, method in _methods(stacks, real, made).items():
+            replace_attribute(stack, Executor, name, method)
+        stack.enter_context(replaced_function_called(stacks))
+        yield
 
 
 def _release(made: list[weakref.ref[Any]]) -> None:
-    """Take from executors that nobody shut down what they would give back to rclpy when collected.
-
-    By then it is the real rclpy again, which never had it.
-    """
+    """Take the guard conditions of executors that were not shut down: the real rclpy, which never
+    had them, would get them back when the executors are collected."""
     for reference in made:
         executor = reference()
         guard = getattr(executor, "_sigint_gc", None)
@@ -162,15 +157,15 @@ def _release(made: list[weakref.ref[Any]]) -> None:
 
 
 def _methods(
-    stacks: Stacks, real: dict[str, Any], made: list[weakref.ref[Any]]
+    stacks: Runtime, real: dict[str, Any], made: list[weakref.ref[Any]]
 ) -> dict[str, Callable[..., Any]]:
-    """Return what stands in for methods of ``Executor``; ``real`` are the originals, ``made``
-    gets the executors that are made."""
+    """Return the replacements of ``Executor`` methods. ``real`` are the originals; executors that
+    are made are added to ``made``."""
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real["__init__"](self, *args, **kwargs)
         made.append(weakref.ref(self))
-        note_exchanged(stacks, type(self))
+        note_replaced_functions(stacks, type(self))
         for guard in (self._guard, getattr(self, "_sigint_gc", None)):
             pending = stacks.domain.entities.pending
             if getattr(guard, "handle", None) in pending:  # they are no entities
@@ -178,36 +173,36 @@ def _methods(
 
     def add_node(self: Any, node: Any) -> bool:
         if stacks.ending.closing:  # ``while True: rclpy.spin(node)`` does nothing else from then on
-            lose_patience(stacks)
+            count_refused_wait(stacks)
         added: bool = real["add_node"](self, node)
         if added:
             if node.handle.mailbox is None:  # the first time: ``spin_once`` adds it again and again
-                note_exchanged(stacks, type(self))
-            pump_of(stacks, self).add(node)
+                note_replaced_functions(stacks, type(self))
+            driver_of(stacks, self).add(node)
         return added
 
     def remove_node(self: Any, node: Any) -> None:
         real["remove_node"](self, node)
-        pump_of(stacks, self).remove(node)
+        driver_of(stacks, self).remove(node)
 
     def get_nodes(self: Any) -> list[Any]:
-        return list(pump_of(stacks, self).nodes)
+        return list(driver_of(stacks, self).nodes)
 
     def wake(self: Any) -> None:
-        pump = pump_of(stacks, self)
-        sync_woken(pump.nodes, sys._getframe(1))
-        pump.wake()
+        driver = driver_of(stacks, self)
+        sync_woken(driver.nodes, sys._getframe(1))
+        driver.wake()
 
     def shutdown(self: Any, timeout_sec: float | None = None) -> bool:
         done: bool = real["shutdown"](self, timeout_sec)
-        pump_of(stacks, self).close()
+        driver_of(stacks, self).close()
         return done
 
     def make_task(self: Any, callback: Any, *args: Any, **kwargs: Any) -> Any:
-        if type(callback) is Resume or is_bookkeeping(callback):
+        if type(callback) is ResumeTask or is_bookkeeping(callback):
             callback(*args)  # rclpy's own, not an event
             return None
-        tasks = pump_of(stacks, self).tasks
+        tasks = driver_of(stacks, self).tasks
         return create_task(stacks, callback, args, kwargs, executor=self, mailbox=tasks)
 
     def wait_for_ready_callbacks(
@@ -216,7 +211,7 @@ def _methods(
         nodes: list[Any] | None = None,
         condition: Callable[[], bool] = lambda: False,
     ) -> tuple[Any, Any, Any]:
-        return pump_of(stacks, self).next(timeout_sec, nodes, condition)
+        return driver_of(stacks, self).next(timeout_sec, nodes, condition)
 
     return {
         "__init__": __init__,
@@ -231,7 +226,7 @@ def _methods(
 
 
 def is_bookkeeping(callback: Any) -> bool:
-    """Say whether a done callback is rclpy's own, which is part of an event and none itself."""
+    """Return whether a done callback is rclpy's own, which is no event of its own."""
     if getattr(callback, "__func__", None) in _bookkeeping():
         return True
     return getattr(callback, "__module__", "") == "rclpy.executors"
@@ -239,7 +234,7 @@ def is_bookkeeping(callback: Any) -> bool:
 
 @lru_cache(maxsize=1)
 def _bookkeeping() -> frozenset[Any]:
-    """Return the methods by which rclpy forgets requests that have been answered."""
+    """Return the methods by which rclpy forgets answered requests."""
     from rclpy.action import ActionClient
     from rclpy.client import Client
 

@@ -1,7 +1,6 @@
-"""Clocks: ROS, system and steady time are all simulated time, as each node's clock shows it.
+"""Clocks: ROS, system and steady time are all simulated time, as the node's clock shows it.
 
-Only where the job says so is ROS time that of ``/clock``, or what somebody sets by hand; it is then
-kept as rcl keeps it.
+If the job says so, ROS time is that of ``/clock`` or set by hand, by rcl's rules.
 """
 
 from __future__ import annotations
@@ -11,10 +10,10 @@ from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
+from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
 
 
-class _Now:
+class _TimePoint:
     """The part of ``rcl_time_point_t`` that rclpy reads."""
 
     __slots__ = ("nanoseconds",)
@@ -23,21 +22,21 @@ class _Now:
         self.nanoseconds = nanoseconds
 
 
-class Follower(Protocol):
-    """What goes by the time of a clock that ``/clock`` drives."""
+class ClockFollower(Protocol):
+    """Depends on the time of a clock that ``/clock`` drives."""
 
     def time_changes(self) -> None:
-        """Take note that ROS time is about to be switched on or off."""
+        """ROS time is about to be switched on or off."""
 
     def time_changed(self, *, switched: bool) -> None:
-        """Look at the clock again: it shows another time, or another kind of time."""
+        """The clock shows another time, or ROS time was switched on or off."""
 
 
 class ClockHandle(Handle):
     """Stands in for ``_rclpy.Clock``.
 
-    A clock outlives runs (rclpy itself keeps one in a class attribute), so it asks the boundary
-    for the world of the moment; between runs it stands at the last simulated time.
+    A clock outlives runs (rclpy keeps one in a class attribute), so it asks the boundary for the
+    current world; between runs it shows the last simulated time.
     """
 
     boundary: Any
@@ -47,7 +46,7 @@ class ClockHandle(Handle):
         self.clock_type = clock_type
         self._override = False
         self._set_ns = 0
-        self.followers: list[Follower] = []
+        self.followers: list[ClockFollower] = []
         self._callbacks: list[tuple[Any, bool, int, int]] = []
         self._owner: str | None = self.boundary.current_node_name()
         if clock_type == self.boundary.ClockType.ROS_TIME:
@@ -61,23 +60,22 @@ class ClockHandle(Handle):
 
     @property
     def is_driven(self) -> bool:
-        """Whether it shows what somebody has set, not simulated time."""
+        """Whether it shows a time that was set, not simulated time."""
         return self._override and self.follows
 
-    def get_now(self) -> _Now:
-        """Return simulated time, or what the clock of this node's computer shows instead."""
-        return _Now(self._set_ns if self.is_driven else self.boundary.look_ns(self._owner))
+    def get_now(self) -> _TimePoint:
+        """Return what the node's clock shows; this counts as a reading by user code."""
+        return _TimePoint(self._set_ns if self.is_driven else self.boundary.look_ns(self._owner))
 
     def now_ns(self) -> int:
-        """Return the same without that it counts as a look."""
+        """Return what the node's clock shows, without counting as a reading."""
         return self._set_ns if self.is_driven else int(self.boundary.shown_ns(self._owner))
 
     def get_ros_time_override_is_enabled(self) -> bool:
-        """Return whether ``use_sim_time`` switched this clock; it shows simulated time anyway."""
+        """Return whether ``use_sim_time`` is on for this clock."""
         return self._override
 
     def set_ros_time_override_is_enabled(self, enabled: bool) -> None:
-        """Remember the switch and tell those who asked for clock changes."""
         if enabled == self._override:
             return
         changes = self.boundary.ClockChange
@@ -90,7 +88,7 @@ class ClockHandle(Handle):
             follower.time_changed(switched=True)
 
     def set_ros_time_override(self, time_point: Any) -> None:
-        """Set ROS time if ``/clock`` drives it; else the loop is the only source of time."""
+        """Set ROS time, if ``/clock`` drives it."""
         if not self.follows:
             return
         time_ns = time_point.nanoseconds
@@ -113,11 +111,10 @@ class ClockHandle(Handle):
         self._callbacks.append((jump_handle, on_clock_change, min_forward, min_backward))
 
     def remove_clock_callback(self, jump_handle: Any) -> None:
-        """Forget a jump handle."""
         self._callbacks = [entry for entry in self._callbacks if entry[0] is not jump_handle]
 
     def jumped(self, delta_ns: int) -> None:
-        """Tell those whose threshold a jump of simulated time exceeds (start of the run)."""
+        """Run the jump callbacks for a jump of simulated time (at the start of the run)."""
         if self.is_driven:
             return
         change = self.boundary.ClockChange
@@ -125,7 +122,6 @@ class ClockHandle(Handle):
         self._jump(self._exceeded(delta_ns), kind, delta_ns, lambda: None)
 
     def _exceeded(self, delta_ns: int) -> list[Any]:
-        """Return the jump handles whose threshold a jump exceeds."""
         return [
             entry
             for entry in self._callbacks
@@ -144,7 +140,7 @@ class ClockHandle(Handle):
 
 
 class ClockEventHandle:
-    """Stands in for ``_rclpy.ClockEvent``: sleeping until a time, or until it is set."""
+    """Stands in for ``_rclpy.ClockEvent``."""
 
     boundary: Any
 
@@ -152,15 +148,12 @@ class ClockEventHandle:
         self._event = SimEvent(self.boundary.stacks, "a time to come (Clock.sleep_until)")
 
     def set(self) -> None:
-        """Wake sleepers."""
         self._event.set()
 
     def clear(self) -> None:
-        """Let sleepers sleep again."""
         self._event.clear()
 
     def is_set(self) -> bool:
-        """Return whether it is set."""
         return self._event.is_set()
 
     def _wait_until(self, clock: Any, until: Any) -> bool:
@@ -168,7 +161,7 @@ class ClockEventHandle:
         return left_ns <= 0 or self._event.wait_ns(left_ns)
 
     def wait_until_ros(self, clock: Any, until: Any) -> bool:
-        """Wait until a ROS clock shows a time; ``/clock`` may be what lets it."""
+        """Wait until a ROS clock, which ``/clock`` may drive, shows a time."""
         while clock.is_driven:
             if clock.now_ns() >= until.nanoseconds:
                 return True
@@ -187,17 +180,16 @@ class ClockEventHandle:
 
 
 class _Sleeper:
-    """Wakes who sleeps until a time whenever its clock shows another one."""
+    """Wakes a sleep whenever its clock shows another time."""
 
     def __init__(self, event: SimEvent) -> None:
         self._event = event
         self.woken = False
 
     def time_changes(self) -> None:
-        """Sleep on: only what the clock shows afterwards matters."""
+        """Sleep on: only the new time matters."""
 
     def time_changed(self, *, switched: bool) -> None:
-        """Wake up, unless somebody else has ended the sleep."""
         if not self._event.is_set():
             self.woken = True
             self._event.set()

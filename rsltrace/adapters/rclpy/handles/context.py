@@ -1,7 +1,7 @@
-"""The handle of ``rclpy.Context``: init arguments, and a shutdown.
+"""The handle of ``rclpy.Context``: init arguments and shutdown.
 
-That of a node which the job constructs ends the run; a main shuts down only itself. As in rcl, what
-belongs to a context that is down can be destroyed, and hardly anything else.
+A shutdown by a node that the job constructs ends the run; a main shuts down only itself. As in rcl,
+entities of a context that is shut down can be destroyed, but hardly used.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.event import OutputKind
 
@@ -26,12 +26,14 @@ _DOWN = (
 class ContextHandle(Handle):
     """Stands in for ``_rclpy.Context``."""
 
-    def __init__(self, real: Any, stacks: Stacks, arguments: Sequence[str], domain_id: int) -> None:
+    def __init__(
+        self, real: Any, stacks: Runtime, arguments: Sequence[str], domain_id: int
+    ) -> None:
         super().__init__()
         self._real = real
         self.stacks = stacks
         for argument in arguments:
-            argument.encode()  # raises what rclpy raises for what is not text
+            argument.encode()  # raises what rclpy raises for invalid text
         self.program = stacks.programs.present
         self.program.contexts.append(self)
         self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
@@ -39,7 +41,6 @@ class ContextHandle(Handle):
         self.is_up = True
 
     def ok(self) -> bool:
-        """Return whether the context has not been shut down."""
         return self.is_up
 
     def get_domain_id(self) -> int:
@@ -62,7 +63,7 @@ class ContextHandle(Handle):
             stacks.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
 
     def end(self) -> None:
-        """Shut down from outside, as a signal does."""
+        """Shut down as a signal does."""
         self.is_up = False
         graph = self.stacks.domain.graph
         for node in graph.nodes:
@@ -77,16 +78,15 @@ class ContextHandle(Handle):
         raise self._real.RCLError("Failed to publish: publisher's context is invalid")
 
     def require(self, task: str) -> None:
-        """Raise RCLError if the context is down: rcl refuses the task then."""
+        """Raise RCLError if the context is shut down, as rcl does for ``task``."""
         if not self.is_up:
             self._cut_off()
             raise self._real.RCLError(f"{task}: {_DOWN}")
 
     def _cut_off(self) -> None:
-        """End a callback or thread that the end of the run has met in the middle: that is no fault
-        of theirs. Main itself is told of the end, and sees to the rest as it would natively.
+        """Raise ``RunEnded`` in callbacks and threads of a main while the run ends.
 
-        :raises RunEnded: in all code of a main's program but that of main.
+        The end of the run is no error of theirs. The main itself goes on, as it would natively.
         """
         stacks, main = self.stacks, self.program.stack
         if not stacks.ending.closing or main is None:
@@ -96,7 +96,7 @@ class ContextHandle(Handle):
 
 
 def _only_ros(arguments: Sequence[str]) -> list[str]:
-    """Keep what stands between ``--ros-args`` and ``--`` (the program's own flags are not ours)."""
+    """Return the arguments between ``--ros-args`` and ``--``."""
     kept: list[str] = []
     inside = False
     for argument in arguments:
@@ -107,6 +107,3 @@ def _only_ros(arguments: Sequence[str]) -> list[str]:
         if argument == "--":
             inside = False
     return kept
-
-
-__all__ = ["ContextHandle", "InvalidArgumentsError"]

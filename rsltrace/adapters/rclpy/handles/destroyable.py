@@ -1,8 +1,7 @@
-"""The life of a handle, as rclpy's ``Destroyable`` has it.
+"""Base classes of handles, like rclpy's ``Destroyable``.
 
-rclpy puts a ``with handle:`` around every use so that C memory is not freed under it. Here there is
-no C memory: a destroyed handle is destroyed at once, and using it afterwards raises what rclpy
-expects. Entering and leaving happens on every publication, so it does no more than that.
+rclpy puts a ``with handle:`` around every use so that C memory is not freed meanwhile. Here is no C
+memory: a handle is destroyed at once, and using it afterwards raises what rclpy expects.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ _invalid_handle: type[Exception] = RuntimeError
 
 
 def set_invalid_handle(error: type[Exception]) -> None:
-    """Tell which exception rclpy expects from a destroyed handle (its own ``InvalidHandle``)."""
+    """Set the exception that a destroyed handle raises: rclpy's own ``InvalidHandle``."""
     global _invalid_handle
     _invalid_handle = error
 
@@ -26,9 +25,9 @@ class Destroyable:
     """A handle that can be used in ``with`` until it is destroyed."""
 
     destroyed: bool
-    """Whether it may be used no more; nothing but ``destroy`` sets it."""
+    """Set by ``destroy`` only."""
     destroy: Callable[[], None]
-    """Destroys the handle, unless that has been done."""
+    """Destroys the handle; calling it again does nothing."""
 
     def __enter__(self) -> Self:
         if self.destroyed:
@@ -39,7 +38,6 @@ class Destroyable:
         pass
 
     def destroy_when_not_in_use(self) -> None:
-        """Destroy the handle, unless that has been done."""
         self.destroy()
 
     @property
@@ -49,7 +47,7 @@ class Destroyable:
 
 
 class Handle(Destroyable):
-    """A handle of what is no entity of the middleware: a clock, a context, a goal."""
+    """A handle that is no entity of the middleware: a clock, a context, a goal."""
 
     def __init__(self) -> None:
         self.destroyed = False
@@ -60,4 +58,4 @@ class Handle(Destroyable):
             self._destroy()
 
     def _destroy(self) -> None:
-        """Give back what the handle holds; called once."""
+        """Release what the handle holds; called once."""

@@ -1,4 +1,4 @@
-"""What the handles of publishers, subscriptions, timers, clients and the like have in common."""
+"""Base classes of the handles of publishers, subscriptions, timers, clients and services."""
 
 from __future__ import annotations
 
@@ -7,51 +7,50 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive, is_custom
+from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive_group, is_custom
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, Runnable, callback_name
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 Alarm = Callable[[], None]
-"""Is called whenever something comes for an entity."""
+"""Called whenever something arrives for an entity."""
 
 _LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
 
 
 class EntityHandle(Destroyable, DomainEntity):
-    """An entity of the middleware that has, once rclpy has made it, a wrapper object.
+    """An entity of the middleware with its rclpy object, the ``wrapper``.
 
-    rclpy creates the handle first and wraps it afterwards, so the wrapper (which holds callback
-    and callback group) is looked up in the node's lists when it is first needed. Timers and guard
-    conditions are made without a node; until one lists them they do not run.
+    rclpy creates the handle first, so the wrapper (which holds callback and callback group) is
+    looked up in the node's lists when it is first needed. Timers and guard conditions are made
+    without a node, and do not run until a node lists them.
     """
 
     dispatch: Callable[[], None]
     lists: str
     """Name of the rclpy Node attribute that lists the wrappers."""
     begins_active = False
-    stacks: Stacks
+    stacks: Runtime
     wrapper: Any
     own_group: bool
-    """Whether its callback group is of a class of the user's own."""
+    """Whether its callback group is of a custom class."""
     _listed: tuple[Any, Any] | None
-    """Node and wrapper, if somebody else has met them while looking for its own."""
+    """Node and wrapper, if another handle has come across them in its own search."""
 
     destroy = DomainEntity.destroy
 
     def __new__(cls, *_: object, **__: object) -> Self:
-        # What a wrapper brings, which comes late. CPython lets objects share the table of their
-        # attributes' names as long as none of them gets a new one after many have been made.
+        # Set now, as CPython lets objects share the table of their attributes' names as long as
+        # none of them gets a new attribute later.
         self = super().__new__(cls)
         self.wrapper = self._listed = None
         self.own_group = False
         return self
 
     def get_logger_name(self) -> str:
-        """Return the node's logger name."""
         assert self.node is not None
         return str(self.node.logger_name())
 
@@ -72,7 +71,7 @@ class EntityHandle(Destroyable, DomainEntity):
         return self.wrapper
 
     def _look(self) -> tuple[Any, Any] | None:
-        """Look for node and wrapper, and tell the others of that list what theirs are: a node may
+        """Look for node and wrapper; note those of the other handles in the list, as a node may
         have thousands of timers."""
         for node in self._candidates():
             mine = None
@@ -85,7 +84,7 @@ class EntityHandle(Destroyable, DomainEntity):
         return None
 
     def begin(self, wrapper: Any, node: Any) -> None:
-        """Start to run: owner and callback are known now."""
+        """Start to run: node and wrapper are known now."""
         self.wrapper = wrapper
         self.node = node
         self.own_group = is_custom(getattr(wrapper, "callback_group", None))
@@ -93,20 +92,20 @@ class EntityHandle(Destroyable, DomainEntity):
         self.activate()
 
     def activate(self) -> None:
-        """Let the loop hear of what has come so far."""
+        """Put what has arrived so far into the loop."""
 
     def deactivate(self) -> None:
-        """Stop running: the node was taken from its executor."""
+        """Stop running: the node was removed from its executor."""
         self.wrapper = self._listed = None
         self.active = False
 
     def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
-        """Yield the handles of its kind that an rclpy node lists, each with its wrapper."""
+        """Yield an rclpy node's handles of this kind, each with its wrapper."""
         for wrapper in getattr(node, self.lists, ()):
             yield wrapper.handle, wrapper
 
     def _candidates(self) -> Iterator[Any]:
-        """Yield the nodes that may list it, those that are likely to first."""
+        """Yield the nodes that may list it, the likely ones first."""
         if self.node is not None:
             if self.node.wrapper is not None:
                 yield self.node
@@ -120,8 +119,7 @@ class EntityHandle(Destroyable, DomainEntity):
                 yield node
 
     def mailbox_keeps(self) -> bool:
-        """Leave it to the node's executor, if that is one of the user's own, to run the callback
-        when it spins; False if it is to run now."""
+        """Leave the callback to the user's executor, if one has the node; False if it runs now."""
         mailbox: Mailbox | None = self.node.mailbox if self.node is not None else None
         return mailbox is not None and mailbox.keeps(self)
 
@@ -150,7 +148,7 @@ class EntityHandle(Destroyable, DomainEntity):
             self.trace_name(),
             self.entity_id,
             node,
-            exclusive(group),
+            exclusive_group(group),
             () if node is None or group is None else _names_in_group(node, group),
             self.period(),
             executor=node is None or node.mailbox is None,
@@ -169,7 +167,7 @@ def _names_in_group(node: Any, group: Any) -> tuple[str, ...]:
 
 
 class ReceiverHandle(EntityHandle, Receiver):
-    """A handle with a queue of what has arrived for its callback."""
+    """A handle with a queue of arrivals for its callback."""
 
     def awaken(self) -> None:
         self.find_wrapper()
@@ -177,7 +175,7 @@ class ReceiverHandle(EntityHandle, Receiver):
     activate = Receiver.activate
 
     def may_run(self) -> bool:
-        """Return whether to take an arrival now; if the callback group is busy, try again later."""
+        """Return whether to take an arrival now; if not, it is tried again later."""
         mailbox = self.node.mailbox
         if mailbox is not None and mailbox.keeps(self):
             return False

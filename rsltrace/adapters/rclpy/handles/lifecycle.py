@@ -1,7 +1,7 @@
-"""Lifecycle nodes, through rclpy's own Python layer: the state machine behind them.
+"""The state machine behind rclpy's lifecycle nodes.
 
-States, transitions and labels are those of rcl_lifecycle's default state machine (read from a
-native one); services and the transition event topic are ordinary entities of the node.
+States, transitions and labels are those of rcl_lifecycle's default state machine. Services and the
+transition event topic are ordinary entities of the node.
 """
 
 from __future__ import annotations
@@ -59,13 +59,17 @@ Description = tuple[int, str, int, str, int, str]
 
 
 def transition_event(start: tuple[int, str], goal: tuple[int, str]) -> Any:
-    """Return what rcl_lifecycle publishes of a change between states (numbers and labels)."""
+    """Return the message that rcl_lifecycle publishes for a change between two states."""
     from lifecycle_msgs.msg import State, TransitionEvent
 
     return TransitionEvent(
         start_state=State(id=start[0], label=start[1]),
         goal_state=State(id=goal[0], label=goal[1]),
     )
+
+
+def _service_property(name: str) -> property:
+    return property(lambda self: self._services.get(name))  # None without communication
 
 
 class StateMachineHandle(Handle):
@@ -109,41 +113,34 @@ class StateMachineHandle(Handle):
 
     @property
     def initialized(self) -> bool:
-        """True: the machine is ready as soon as it is made."""
         return True
 
     @property
     def current_state(self) -> tuple[int, str]:
-        """The present state: its number and label."""
         return self._state, _STATES[self._state]
 
     @property
     def available_states(self) -> list[tuple[int, str]]:
-        """Every state there is."""
         return list(_STATES.items())
 
     @property
     def available_transitions(self) -> list[Description]:
-        """The transitions that lead away from the present state."""
         return [t for t in self.transition_graph if t[2] == self._state]
 
     @property
     def transition_graph(self) -> list[Description]:
-        """Every transition there is: number, label, start state, goal state with their labels."""
         return [
             (number, label, start, _STATES[start], goal, _STATES[goal])
             for number, label, start, goal in _TRANSITIONS
         ]
 
     def get_transition_by_label(self, label: str) -> int:
-        """Return the transition of that label from here. Raises RCLError if there is none."""
         for number, name, start, _ in _TRANSITIONS:
             if start == self._state and name == label:
                 return number
         raise self._real.RCLError(f"Failed to get transition from label: {label}")
 
     def trigger_transition_by_id(self, transition: int, publish_update: bool) -> None:
-        """Go where a transition leads. Raises RCLError if it does not start here."""
         for number, _, start, goal in _TRANSITIONS:
             if number == transition and start == self._state:
                 self._go(start, goal, publish_update)
@@ -154,7 +151,6 @@ class StateMachineHandle(Handle):
         )
 
     def trigger_transition_by_label(self, label: str, publish_update: bool) -> None:
-        """Go where the transition of that label leads. Raises RCLError if there is none here."""
         self.trigger_transition_by_id(self.get_transition_by_label(label), publish_update)
 
     def _go(self, start: int, goal: int, publish_update: bool) -> None:
@@ -164,30 +160,11 @@ class StateMachineHandle(Handle):
 
     # -- services ----------------------------------------------------------------------------------
 
-    @property
-    def service_change_state(self) -> ServiceHandle | None:
-        """The service ``~/change_state``, if the node has any."""
-        return self._services.get("change_state")
-
-    @property
-    def service_get_state(self) -> ServiceHandle | None:
-        """The service ``~/get_state``, if the node has any."""
-        return self._services.get("get_state")
-
-    @property
-    def service_get_available_states(self) -> ServiceHandle | None:
-        """The service ``~/get_available_states``, if the node has any."""
-        return self._services.get("get_available_states")
-
-    @property
-    def service_get_available_transitions(self) -> ServiceHandle | None:
-        """The service ``~/get_available_transitions``, if the node has any."""
-        return self._services.get("get_available_transitions")
-
-    @property
-    def service_get_transition_graph(self) -> ServiceHandle | None:
-        """The service ``~/get_transition_graph``, if the node has any."""
-        return self._services.get("get_transition_graph")
+    service_change_state = _service_property("change_state")
+    service_get_state = _service_property("get_state")
+    service_get_available_states = _service_property("get_available_states")
+    service_get_available_transitions = _service_property("get_available_transitions")
+    service_get_transition_graph = _service_property("get_transition_graph")
 
     def _destroy(self) -> None:
         for handle in [*self._services.values(), self._events]:

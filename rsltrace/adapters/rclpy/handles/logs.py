@@ -1,4 +1,4 @@
-"""Logging: every record is stamped with simulated time, printed, and published on /rosout."""
+"""Log records: stamped with simulated time, printed, and published on /rosout."""
 
 from __future__ import annotations
 
@@ -35,7 +35,6 @@ _SHARED = (
     "As soon as any node with that name is destructed it will unregister the publisher, preventing "
     "any further logs for that name from being published on the rosout topic."
 )
-"""What rcl says."""
 
 QOS_ROSOUT = Qos(
     history=History.KEEP_LAST,
@@ -56,11 +55,11 @@ class RosoutHandle(PublisherHandle):
     output_kind = int(OutputKind.LOG)
 
     def refuse(self, refusal: Callable[[object], NoReturn]) -> None:
-        """Go on: a node logs whatever has become of its context."""
+        """Ignore it: a node logs even after its context is shut down."""
 
 
-class Logs:
-    """Where log records go: the terminal, and the node's /rosout publisher."""
+class RosoutLogs:
+    """Prints log records and publishes them on the node's /rosout publisher."""
 
     def __init__(self, domain: Domain, *, base_dir: Path, echo: bool) -> None:
         self._domain = domain
@@ -71,16 +70,13 @@ class Logs:
 
     @cached_property
     def _record(self) -> Any:
-        """The message that every record is sent as."""
         from rcl_interfaces.msg import Log
 
         return Log()
 
     def attach(self, node: NodeHandle, qos: Any = None) -> None:
-        """Give a node its /rosout publisher, with the usual QoS profile unless it says another.
-
-        As in rcl, nodes of one name in one process share that of the first.
-        """
+        """Give a node its /rosout publisher. As in rcl, nodes with the same name in one process
+        share that of the first."""
         from rcl_interfaces.msg import Log
 
         name = node.logger_name()
@@ -95,7 +91,7 @@ class Logs:
         same.append(node)
 
     def detach(self, node: NodeHandle) -> None:
-        """Forget a node, and the publisher that it shares with others of its name."""
+        """Forget a node, and the publisher that it shares with others."""
         same = self._nodes.get(node.logger_name(), [])
         for one in [one for one in same if one.process is node.process]:
             same.remove(one)
@@ -112,10 +108,10 @@ class Logs:
     def log(
         self, severity: int, name: str, message: Any, function: str, file: str, line: int
     ) -> None:
-        """Take one record. Severity, name and message are hashed: line numbers are not news."""
+        """Take one record. Severity, name and message are hashed, line numbers are not."""
         if type(message) is not str:
             message = _text(message)
-        if not message.isascii():  # what no message can hold is shown and sent as an escape
+        if not message.isascii():  # lone surrogates are escaped
             message = message.encode(errors="backslashreplace").decode()
         if " at 0x" in message:
             text_with_address(message)
@@ -130,7 +126,7 @@ class Logs:
         rosout = getattr(node, "rosout", None)
         if rosout is None or rosout.destroyed:
             return
-        # The serializer checks each field, so that the setters need not.
+        # Set the slots: the serializer checks the values.
         record = self._record
         stamp = record._stamp
         stamp._sec, stamp._nanosec = divmod(now_ns, NS_PER_S)
@@ -141,12 +137,11 @@ class Logs:
         rosout.send(data, hash64(log_content(data)))
 
     def show(self, severity: int, name: str, message: str) -> None:
-        """Print a record, if records are printed."""
         if self.echo:
             self._print(severity, self._domain.loop.now_ns, name, message)
 
     def _print(self, severity: int, now_ns: int, name: str, message: str) -> None:
-        """Show a record; who cannot be told any more (``2>&1 | head``) changes nothing in a run."""
+        """Print a record; a closed stderr (``2>&1 | head``) does not affect the run."""
         label = _SEVERITY.get(severity, str(severity))
         try:
             tell(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}")
@@ -154,7 +149,7 @@ class Logs:
             self.echo = False
 
     def _portable(self, file: str) -> str:
-        """Return a source path that is the same wherever the job's folder lies."""
+        """Return a source path that does not depend on where the job's folder is."""
         path = Path(file)
         for base in (self._base_dir, Path(sys.prefix)):
             if path.is_relative_to(base):
@@ -166,11 +161,8 @@ class Logs:
 
 
 def _text(message: object) -> str:
-    """Return what rclpy's extension makes of a message that is no text.
-
-    :raises TypeError: if it refuses it, too.
-    """
-    if isinstance(message, str):  # of a class of the user's
+    """Convert a message that is not a plain str as rclpy's extension does."""
+    if isinstance(message, str):  # of a subclass
         return str.__str__(message)
     if message is None:
         return "(null)"

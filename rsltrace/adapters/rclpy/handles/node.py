@@ -17,10 +17,10 @@ from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
+from rsltrace.adapters.rclpy.stacks.entry_starts import policy_of
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.starts import policy_of
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.event import Asker
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
@@ -31,11 +31,11 @@ _GROUP_KINDS = {
     "ReentrantCallbackGroup": "reentrant",
 }
 _FRAMES_MAX = 10
-"""Between the boundary and the constructor of ``rclpy.Node`` are two or three."""
+"""There are two or three between the boundary and the constructor of ``rclpy.Node``."""
 
 
 class LogSink(Protocol):
-    """Where log records go; it publishes those of a node on /rosout."""
+    """Publishes the log records of nodes on /rosout."""
 
     def attach(self, node: Any, qos: Any = None) -> None:
         """Give a node its /rosout publisher."""
@@ -45,25 +45,24 @@ class LogSink(Protocol):
 
 
 _GROUPS: weakref.WeakKeyDictionary[NodeHandle, list[weakref.ref[Any]]] = weakref.WeakKeyDictionary()
-"""The callback groups of nodes that have more than the default one, in the order of their use. Not
-an attribute: Python shares the names of at most thirty among objects of a class."""
+"""The callback groups of nodes besides the default one, in the order of their use. Not an
+attribute: objects of a class share the names of at most thirty."""
 
 
 class NodeHandle(Destroyable, Participant):
     """Stands in for ``_rclpy.Node``.
 
-    ``wrapper`` is the ``rclpy.Node`` once an executor of this run has it; only then do its
-    callbacks run. The rules for names are those of ``rcl_node_init``; ``real`` is rclpy's own
-    extension.
+    ``wrapper`` is the ``rclpy.Node`` once an executor has it; only then do its callbacks run. Names
+    follow the rules of ``rcl_node_init``. ``real`` is rclpy's extension.
     """
 
     destroy = Participant.destroy
-    process: Program
+    process: SimulatedProgram
 
     def __init__(
         self,
         real: Any,
-        stacks: Stacks,
+        stacks: Runtime,
         logs: LogSink,
         states: NodeStates,
         node_name: str,
@@ -87,7 +86,7 @@ class NodeHandle(Destroyable, Participant):
         except InvalidArgumentsError as error:
             message = f"Failed to parse ROS arguments: {error}"
             raise real.RCLInvalidROSArgsError(message) from error
-        # The job's arguments for this node are the process's arguments of ``ros2 run``.
+        # The job's arguments for this node are those that ``ros2 run`` gives to a process.
         programs = stacks.programs
         program = programs.present
         entry = programs.constructing if programs.is_hosted else program.entry
@@ -123,21 +122,19 @@ class NodeHandle(Destroyable, Participant):
 
     @property
     def entry(self) -> Entry | None:
-        """The job's entry that made it, if one did."""
         return self._entry
 
     @property
     def entry_key(self) -> str:
-        """The key of the job's entry that made it; empty if none did."""
         return self._entry.key if self._entry is not None else ""
 
     @property
     def log_exceptions(self) -> bool:
-        """Whether a callback of its that raises is logged instead of ending the run."""
+        """Whether exceptions of its callbacks are logged instead of ending the run."""
         return self._entry is not None and self._entry.log_exceptions
 
     def _number_among_others(self) -> None:
-        """Tell the node apart from others of its name. ROS allows that; it is seldom meant."""
+        """Number the node if others have its name: ROS allows that, but it is seldom meant."""
         others = _at_work(self.stacks, self.fully_qualified_name)
         if others:
             taken = {other.number for other in others}
@@ -148,13 +145,13 @@ class NodeHandle(Destroyable, Participant):
                 notes.append(note)
 
     def _set_log_levels(self) -> None:
-        """Do what ``--log-level`` asks for, for the loggers it names and for this node's."""
+        """Apply ``--log-level`` to the loggers that it names and to this node's."""
         real = self.real
         levels: dict[str, str] = {}
         for arguments in [*self._outer, self.arguments]:
             levels.update(arguments.log_levels())
         everybody = levels.pop("", None)
-        if everybody is not None:  # but not for other programs of the run
+        if everybody is not None:  # not for other programs of the run
             levels.setdefault(self.logger_name(), everybody)
         for logger, level in levels.items():
             number = real.rclpy_logging_severity_level_from_string(level)
@@ -166,7 +163,7 @@ class NodeHandle(Destroyable, Participant):
         return name, self.arguments.remap_namespace(namespace, name, outer)
 
     def _outer_names(self) -> RosArguments | None:
-        """Return the process-wide arguments that rename things: the job's, or the context's."""
+        """Return the process-wide remapping arguments: the job's, or the context's."""
         if not self._outer:
             return None
         if self.process is not self.stacks.programs.host:
@@ -194,86 +191,73 @@ class NodeHandle(Destroyable, Participant):
     # -- what rclpy calls ----------------------------------------------------------------------
 
     def get_node_name(self) -> str:
-        """Return the node's name after remapping."""
         return self.name
 
     def get_namespace(self) -> str:
-        """Return the node's namespace after remapping."""
         return self.namespace
 
     def get_fully_qualified_name(self) -> str:
-        """Return namespace and name."""
         return self.fully_qualified_name
 
     def logger_name(self) -> str:
-        """Return the name rcl gives the node's logger: the FQN with dots."""
+        """Return rcl's name of the node's logger: the full name with dots."""
         return self.fully_qualified_name.strip("/").replace("/", ".")
 
     def get_parameters(self, parameter_class: Any) -> dict[str, Any]:
-        """Return the parameter overrides for this node as rclpy Parameters by name."""
         values: dict[str, Any] = {}
         for arguments in [*self._outer, self.arguments]:
             values.update(arguments.parameters(self.fully_qualified_name))
         return {name: parameter_class(name, value=value) for name, value in values.items()}
 
     def get_count_publishers(self, topic: str) -> int:
-        """Count the publishers of a fully qualified topic."""
-        return len(self.asked_graph.publishers(topic))
+        return len(self.usable_graph.publishers(topic))
 
     def get_count_subscribers(self, topic: str) -> int:
-        """Count the subscriptions of a fully qualified topic."""
-        return len(self.asked_graph.subscriptions(topic))
+        return len(self.usable_graph.subscriptions(topic))
 
     def get_count_clients(self, service: str) -> int:
-        """Count the clients of a fully qualified service."""
-        return len(self.asked_graph.clients(service))
+        return len(self.usable_graph.clients(service))
 
     def get_count_services(self, service: str) -> int:
-        """Count the servers of a fully qualified service."""
-        return len(self.asked_graph.services(service))
+        return len(self.usable_graph.services(service))
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
-        """Return every node of the graph, in creation order."""
-        return [(node.name, node.namespace) for node in self.asked_graph.nodes]
+        return [(node.name, node.namespace) for node in self.usable_graph.nodes]
 
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
-        """Return every node of the graph with its enclave (always the root one)."""
-        return [(node.name, node.namespace, "/") for node in self.asked_graph.nodes]
+        return [(node.name, node.namespace, "/") for node in self.usable_graph.nodes]
 
     def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
-        """Return every action of the graph with its type."""
-        return action_names_and_types(self.asked_graph.topic_names_and_types())
+        return action_names_and_types(self.usable_graph.topic_names_and_types())
 
     def get_action_client_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        """Return the actions that a node is a client of."""
-        ends = self.asked_graph.subscriptions_of(self.node_named(name, namespace))
-        return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
+        ends = self.usable_graph.subscriptions_of(self.node_named(name, namespace))
+        return action_names_and_types(topic_types(ends))
 
     def get_action_server_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        """Return the actions that a node serves."""
-        ends = self.asked_graph.publishers_of(self.node_named(name, namespace))
-        return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
+        ends = self.usable_graph.publishers_of(self.node_named(name, namespace))
+        return action_names_and_types(topic_types(ends))
 
     def node_named(self, name: str, namespace: str) -> Participant:
         """Return a participant of the graph. Raises NodeNameNonExistentError if there is none."""
-        found = self.asked_graph.node_named(full_name(namespace, name))
+        found = self.usable_graph.node_named(full_name(namespace, name))
         if found is None:
             missing = full_name(namespace, name)
             raise self.real.NodeNameNonExistentError(f"cannot find node {missing}")
         return found
 
     @property
-    def asked_graph(self) -> Graph:
-        """The graph, for user code that asks: it can as long as the context is up."""
+    def usable_graph(self) -> Graph:
+        """The graph, for calls of user code. Raises RCLError if the context is shut down."""
         self.require_up("failed to ask the graph")
         return self.stacks.domain.graph
 
     def require_up(self, task: str) -> None:
-        """Raise RCLError if the node's context is shut down: rcl refuses the task then."""
+        """Raise RCLError if the node's context is shut down, as rcl does for ``task``."""
         if not self.context.is_up:
             raise self.real.RCLError(f"{task}: rcl node's context is invalid")
 
@@ -286,8 +270,7 @@ class NodeHandle(Destroyable, Participant):
         return None if self.made is None else type(self.made)  # its constructor
 
     def group_name(self, group: Any) -> str:
-        """Return what the trace calls a callback group, by its kind and its number in the node:
-        ``reentrant 2``; "" for the default one."""
+        """Return the trace's name of a callback group (``reentrant 2``); "" for the default one."""
         if group is None or group is getattr(self.made, "default_callback_group", group):
             return ""
         groups = _GROUPS.setdefault(self, [])
@@ -318,8 +301,13 @@ class NodeHandle(Destroyable, Participant):
             self.rosout.destroy()
 
 
+def topic_types(ends: Iterable[Any]) -> list[tuple[str, list[str]]]:
+    """Return the topics of publishers or subscriptions, each with its types."""
+    return names_and_types([(end.topic, end.type_name) for end in ends])
+
+
 def _node_being_made() -> Callable[[], Any]:
-    """Return a reference to the ``rclpy.Node`` whose constructor makes a handle."""
+    """Return a weak reference to the ``rclpy.Node`` whose constructor makes a handle."""
     frame = sys._getframe(2)
     for _ in range(_FRAMES_MAX):
         made = frame.f_locals.get("self")
@@ -332,15 +320,12 @@ def _node_being_made() -> Callable[[], Any]:
 
 
 def class_name(cls: type) -> str:
-    """Return ``module:Class`` of a node's class."""
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
-def _at_work(stacks: Stacks, name: str) -> list[Participant]:
-    """Return the nodes of a name that are at work.
-
-    In a program's hands a node may be left behind: its context is shut down, or nobody spins it.
-    """
+def _at_work(stacks: Runtime, name: str) -> list[Participant]:
+    """Return the active nodes of a name: a main may leave a node with a context that is shut down,
+    or without an executor."""
     return [
         node
         for node in stacks.domain.graph.nodes_named(name)

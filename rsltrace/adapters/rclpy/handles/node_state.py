@@ -1,4 +1,4 @@
-"""The state of a node after each of its events: its own attributes, not those rclpy gave it."""
+"""Hashes of a node's state after each of its events: its attributes, without those of rclpy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rsltrace.trace.model.finding import Policy
 
 
 class NodeState:
-    """Hashes one node's state; ``keeps`` says whether what changes is written down, too."""
+    """Hashes one node's state; with ``keeps``, changes are recorded, too."""
 
     def __init__(self, dispatcher: Dispatcher, handle: Any, *, keeps: bool) -> None:
         self._dispatcher = dispatcher
@@ -31,7 +31,7 @@ class NodeState:
 
     @property
     def left_out(self) -> dict[str, str]:
-        """What has no hash: types by attribute."""
+        """The attributes that cannot be hashed, with their types."""
         return self._hasher.skipped
 
     def attribute_hashes(self) -> dict[str, int]:
@@ -41,11 +41,11 @@ class NodeState:
             return {} if node is None else self._hashes(self._attributes(node))[0]
 
     def after_event(self) -> int:
-        """Return the hash of the node's state now, 0 as long as there is no node."""
+        """Return the hash of the node's state, 0 if there is no node yet."""
         node = self._handle.wrapper
         if node is None:
             return 0
-        with engage(None):  # what a hash looks at is no finding
+        with engage(None):  # reads by the hash are no findings
             attributes = self._attributes(node)
             hashes, text = self._hashes(attributes)
             recorder = self._dispatcher.recorder
@@ -57,11 +57,11 @@ class NodeState:
         return hash64(text.encode("utf-8", "surrogatepass")) or 1
 
     def _hashes(self, attributes: dict[str, Any]) -> tuple[dict[str, int], str]:
-        """Return the hash of each attribute, and all of them as a text."""
+        """Return the hashes by attribute, and all of them as one text."""
         last, hashes, parts = self._last, {}, []
         for name, value in attributes.items():
             before = last.get(name)
-            if before is not None and before[0] is value:  # it never changes, and has not been set
+            if before is not None and before[0] is value:  # an immutable that was not set
                 _, digest, part = before
             else:
                 digest = self._hasher.digest(value, name)
@@ -92,7 +92,7 @@ class NodeState:
 
 
 def own_attributes(node: Any) -> dict[str, Any]:
-    """Return a node's attributes, except for those that rclpy gave it, and its parameters."""
+    """Return a node's attributes, without those of rclpy, and its parameters."""
     rclpys = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
     found = {name: value for name, value in vars(node).items() if name not in rclpys}
     found.update({f"parameter {name}": one.value for name, one in node._parameters.items()})
@@ -100,7 +100,7 @@ def own_attributes(node: Any) -> dict[str, Any]:
 
 
 class NodeStates:
-    """The states of the nodes of one run; ``policy`` is that of nodes without their own."""
+    """The states of a run's nodes; ``policy`` is for nodes without their own."""
 
     def __init__(self) -> None:
         self.policy = Policy()

@@ -1,22 +1,41 @@
-"""Publishers and subscriptions: messages of rclpy to bytes, and back for each callback."""
+"""The handles of publishers, subscriptions and QoS events."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
-from rsltrace.adapters.rclpy.handles.entity_handle import EntityHandle, ReceiverHandle
+from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.code_lines import CallSites
-from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
+from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import message_type
 from rsltrace.errors import UnsupportedError
+from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.participant import QosEvent
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Qos
-from rsltrace.simulation.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
+from rsltrace.simulation.middleware.qos.status import (
+    DEADLINE_MISSED,
+    INCOMPATIBLE,
+    LIVELINESS_CHANGED,
+    LIVELINESS_LOST,
+    MATCHED,
+    MESSAGE_LOST,
+)
+from rsltrace.simulation.middleware.subscription import (
+    DATA,
+    NUMBER,
+    RECEIVED_NS,
+    SENT_NS,
+    SUBSCRIPTION,
+    Delivery,
+    Subscription,
+)
+from rsltrace.trace.model.event import EventKind
 
 
 class PublisherHandle(EntityHandle, Publisher):
@@ -40,7 +59,7 @@ class PublisherHandle(EntityHandle, Publisher):
 
     def publish(self, msg: Any) -> None:
         """Publish a message: a snapshot of it goes to every connected subscription."""
-        serialize = self._serialize  # as elsewhere: Python calls what is in a variable sooner
+        serialize = self._serialize  # a local variable is called faster
         data = serialize(msg)
         sites = self._sites
         if self._count == sites.due or self._event.entity != sites.running:
@@ -48,33 +67,26 @@ class PublisherHandle(EntityHandle, Publisher):
         self.send(data)
 
     def publish_raw(self, data: bytes) -> None:
-        """Publish a serialized message, in canonical form.
-
-        :raises ValueError: if the bytes are not a message of this topic's type.
-        """
+        """Publish a serialized message. Raises ValueError if it is not of this topic's type."""
         data = self._canonical(data)
         self._sites.look(self._count)
         self.send(data)
 
     def refuse(self, refusal: Callable[[object], NoReturn]) -> None:
-        """Publish nothing any more: ``refusal`` raises what rclpy raises then. It takes the place
-        of what serializes, so that no publication has to ask first."""
+        """Let every publication raise by ``refusal``, which replaces the serializer: so no
+        publication has to check first."""
         self._serialize = self._canonical = refusal
 
     def get_topic_name(self) -> str:
-        """Return the resolved topic."""
         return self.topic
 
     def get_subscription_count(self) -> int:
-        """Count the connected subscriptions."""
         self.node.require_up("failed to get subscription count")
         return len(self.subscriptions)
 
     def wait_for_all_acked(self, timeout: Any) -> bool:
-        """Wait in simulated time until what was sent has reached every reliable subscription.
-
-        Returns whether it has; without links it has at once.
-        """
+        """Wait until all messages have reached every reliable subscription; return whether they
+        have."""
         limit_ns: int = timeout.nanoseconds
         left_ns = self.acknowledged_ns() - self.stacks.loop.now_ns
         if left_ns <= 0 or limit_ns == 0:
@@ -117,10 +129,10 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         graph.add_subscription(self)
 
     def dispatch(self) -> None:
-        """Take the oldest message and run the callback with a copy of its own."""
         if not self.may_run():
             return
         wrapper = self.wrapper
+        # A ``Delivery``, unpacked by its positions: the fastest way.
         _, _, _, _, data, event, position, digest, _, _ = delivery = self.queue.popleft()
         callback = wrapper._callback
         if callback is not self._callback:
@@ -136,7 +148,7 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         )
 
     def _as_received(self, data: bytes) -> bytes:
-        """Return the bytes that Fast DDS gives: between processes, their number is padded to four.
+        """Return the bytes as Fast DDS does: padded to a multiple of four between processes.
 
         Each entry of a job stands for a process.
         """
@@ -150,13 +162,13 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         return data + bytes(-len(data) % 4)
 
     def _learn(self, wrapper: Any) -> None:
-        """Look at a callback once, when it is new; users may exchange it."""
+        """Look up how to run a new callback; user code may replace it at any time."""
         self._callback = wrapper._callback
         self._coroutine = is_awaited(self.stacks, wrapper._callback)
         self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
 
     def forget_callback(self) -> None:
-        """Look at the callback once more: it may be run in another way from now on."""
+        """Look up how to run the callback again."""
         self._callback = None
 
     def take_message(self, msg_type: Any, raw: bool) -> Any:
@@ -164,44 +176,109 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         if not self.queue:
             return None
         delivery = self.queue.popleft()
-        data = delivery[4]
+        data = delivery[DATA]
         message = self._as_received(data) if raw else codec_for(msg_type).deserialize(data)
         return message, _message_info(delivery)
 
     def get_topic_name(self) -> str:
-        """Return the resolved topic."""
         return self.topic
 
     def is_cft_enabled(self) -> bool:
-        """Return False: there are no content filters."""
         return False
 
     def set_content_filter(self, expression: str, parameters: list[str]) -> None:
-        """Refuse: DDS's filter language is not spoken here (ROS 2 Kilted and later)."""
         self._refuse_filter(self.topic, expression)
 
     def _refuse_filter(self, topic: str, expression: str) -> None:
         raise UnsupportedError(
-            f"the subscription of {topic} has a content filter ({expression!r}), which cannot "
-            "be simulated by this version of rsltrace: compare in the callback instead"
+            f"the subscription of {topic} has a content filter ({expression!r}), which rsltrace "
+            "cannot simulate: compare in the callback instead"
         )
 
     def get_content_filter(self) -> Any:
-        """Refuse, as rclpy does for a subscription without a content filter."""
         raise self._real.RCLError("content filter topic is not enabled")
 
     def get_publisher_count(self) -> int:
-        """Count the connected publishers."""
         return len(self.publishers)
 
     trace_name = Subscription.trace_name
 
 
 def _message_info(delivery: Delivery) -> dict[str, int | None]:
-    """Return the MessageInfo dictionary that rclpy 7 passes to callbacks."""
+    """Return the MessageInfo of rclpy 7."""
     return {
-        "source_timestamp": delivery[8],
-        "received_timestamp": delivery[0],
-        "publication_sequence_number": delivery[9],
+        "source_timestamp": delivery[SENT_NS],
+        "received_timestamp": delivery[RECEIVED_NS],
+        "publication_sequence_number": delivery[NUMBER],
         "reception_sequence_number": None,
     }
+
+
+_QOS_EVENT = int(EventKind.QOS_EVENT)
+
+
+_NAMES = {
+    "MATCHED": MATCHED,
+    "INCOMPATIBLE_QOS": INCOMPATIBLE,
+    "DEADLINE_MISSED": DEADLINE_MISSED,
+    "LIVELINESS_CHANGED": LIVELINESS_CHANGED,
+    "LIVELINESS_LOST": LIVELINESS_LOST,
+    "MESSAGE_LOST": MESSAGE_LOST,
+}
+
+
+def _event_name(event_type: Any) -> str:
+    name: str = event_type.name
+    for ending, ours in _NAMES.items():
+        if name.endswith(ending):
+            return ours
+    return name.lower()
+
+
+class EventHandle(QosEvent, EntityHandle):
+    """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable. Each
+    trigger calls the ``alarms``."""
+
+    lists = "waitables"
+    alarms: tuple[Alarm, ...] = ()
+
+    def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
+        self.stacks = parent.stacks
+        super().__init__(parent.dispatcher, parent.node)
+        self.listen(parent, _event_name(event_type))
+
+    def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        for waitable in node.waitables:
+            handle = getattr(waitable, "_EventHandler__event", None)
+            if handle is not None:
+                yield handle, waitable
+
+    def activate(self) -> None:
+        self.trigger()
+
+    def trigger(self) -> None:
+        super().trigger()
+        for alarm in self.alarms:
+            alarm()
+
+    def dispatch(self) -> None:
+        if self.mailbox_keeps():
+            return
+        wrapper = self.wrapper
+        if wrapper is None or self.destroyed:
+            return
+        if not self.has_news():
+            self.is_queued = False
+            return
+        if self.stacks.groups.must_wait(self, wrapper):
+            return
+        self.is_queued = False
+        args = (self.take_event(),)
+        run_callback(self.stacks, self, _QOS_EVENT, wrapper.callback, args, *self.cause, 0)
+
+    def settle(self) -> bool:
+        self.find_wrapper()
+        return True
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"callback": callback_name(self.user_callback())}

@@ -1,4 +1,4 @@
-"""Services and clients: requests and responses of rclpy to bytes, and back."""
+"""The handles of services and clients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of, qos_of
-from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, Functions
+from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, FunctionRecorder
 from rsltrace.adapters.rclpy.stacks.tasks import (
     executor_of,
     is_awaited,
@@ -18,7 +18,7 @@ from rsltrace.adapters.rclpy.stacks.tasks import (
 )
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import service_type
-from rsltrace.adapters.rclpy.wire.type_descriptions import answer
+from rsltrace.adapters.rclpy.wire.type_descriptions import answer_request
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.services import (
     CLIENT,
@@ -30,19 +30,14 @@ from rsltrace.simulation.middleware.services import (
     ServiceInfo,
 )
 
-# Service introspection: what a service or client does, published as messages.
-#
-# ``configure_introspection`` of rclpy's services and clients opens a publisher of
-# ``<service>/_service_event``; each request and response that is sent or received becomes a
-# message there, with its contents or without, as rcl publishes them.
-
 # Numbers of service_msgs/msg/ServiceEventInfo.
 REQUEST_SENT, REQUEST_RECEIVED, RESPONSE_SENT, RESPONSE_RECEIVED = 0, 1, 2, 3
 _OFF, _CONTENTS = 0, 2
 
 
 class ServiceEvents:
-    """The event publisher of one service or client, while introspection is on."""
+    """Service introspection: publishes the requests and responses of a service or client on
+    ``<service>/_service_event``, with or without contents, as rcl does."""
 
     def __init__(self, node: NodeHandle, srv_type: Any, service: str, clock: Any, qos: Any) -> None:
         self._type = srv_type.Event
@@ -51,11 +46,9 @@ class ServiceEvents:
         self.publisher = PublisherHandle(node, self._type, f"{service}/_service_event", qos)
 
     def set_state(self, state: int) -> None:
-        """Publish contents, or metadata only."""
         self._contents = state == _CONTENTS
 
     def publish(self, event_type: int, request_id: RequestId, message: Any) -> None:
-        """Tell of one request or response."""
         from builtin_interfaces.msg import Time
         from service_msgs.msg import ServiceEventInfo
 
@@ -74,15 +67,16 @@ class ServiceEvents:
         self.publisher.publish(event)
 
     def close(self) -> None:
-        """Stop publishing."""
         if not self.publisher.destroyed:
             self.publisher.destroy_when_not_in_use()
 
 
-def reconfigured(events: ServiceEvents | None, end: Any, clock: Any, qos: Any, state: Any) -> Any:
-    """Return what ``end`` (a service or client) publishes its events with from now on, if at all.
+def updated_service_events(
+    events: ServiceEvents | None, end: Any, clock: Any, qos: Any, state: Any
+) -> Any:
+    """Return the ``ServiceEvents`` of ``end`` (a service or client) for a state; None for off.
 
-    As in rcl, switching off destroys the publisher, and one that is there keeps clock and QoS.
+    As in rcl, an existing publisher keeps its clock and QoS; switching off destroys it.
     """
     if int(state) == _OFF:
         if events is not None:
@@ -95,10 +89,10 @@ def reconfigured(events: ServiceEvents | None, end: Any, clock: Any, qos: Any, s
 
 
 class ServiceEndHandle(ReceiverHandle, ServiceEnd):
-    """What the handles of a client and of a server have in common."""
+    """Base class of the handles of services and clients."""
 
     def _prepare(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> tuple[Any, ...]:
-        """Set what rclpy's side needs; return what the middleware is given."""
+        """Set the attributes of rclpy's side; return the middleware's constructor arguments."""
         service = node.resolve(name, service=True)
         self._request = codec_for(srv_type.Request)
         self._response = codec_for(srv_type.Response)
@@ -108,8 +102,7 @@ class ServiceEndHandle(ReceiverHandle, ServiceEnd):
         return node.stacks.domain.transport, node, service, service_type(srv_type), qos_of(qos)
 
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
-        """Publish what is sent and received from now on, or no longer."""
-        self._service_events = reconfigured(self._service_events, self, clock, qos, state)
+        self._service_events = updated_service_events(self._service_events, self, clock, qos, state)
 
     def _tell(self, event_type: int, request_id: RequestId, message: Any) -> None:
         """Publish a service event, if introspection is on."""
@@ -135,44 +128,26 @@ class ServiceHandle(ServiceEndHandle, Service):
 
     @property
     def name(self) -> str:
-        """The resolved service name."""
         return self.service
 
     @property
     def qos(self) -> dict[str, Any]:
-        """The QoS profile as rclpy's lifecycle nodes ask for it."""
         return profile_of(self.profile)
 
     def dispatch(self) -> None:
-        """Take the oldest request, run the callback and send what it returns."""
         if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
-        request = self._request.deserialize(data)
-        wrapper = self.wrapper
-        if is_awaited(self.stacks, wrapper.callback):
-            start_coroutine(
-                self.stacks,
-                self,
-                SERVICE,
-                self._serve_async,
-                (request, header),
-                event,
-                position,
-                digest,
+        args = self._request.deserialize(data), header
+        if is_awaited(self.stacks, self.wrapper.callback):
+            serve = self._serve_async
+            start_coroutine(self.stacks, self, SERVICE, serve, args, event, position, digest)
+        else:
+            execute = self.dispatcher.execute
+            serve_now = self._serve
+            execute(
+                self, self.entity_id, self.node, SERVICE, serve_now, args, event, position, digest
             )
-            return
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            SERVICE,
-            self._serve,
-            (request, header),
-            event,
-            position,
-            digest,
-        )
 
     def _serve(self, request: Any, header: ServiceInfo) -> None:
         wrapper = self.wrapper
@@ -191,7 +166,7 @@ class ServiceHandle(ServiceEndHandle, Service):
         wrapper.send_response(response, header)
 
     def service_take_request(self, request_type: Any) -> tuple[Any, Any]:
-        """Take a request by hand; ``(None, None)`` if there is none."""
+        """Take a request outside of a callback; ``(None, None)`` if there is none."""
         if not self.queue:
             return None, None
         data, _, _, _, header = self.queue.popleft()
@@ -200,7 +175,6 @@ class ServiceHandle(ServiceEndHandle, Service):
         return request, header
 
     def service_send_response(self, response: Any, request_id: RequestId) -> None:
-        """Send a response to the client that asked."""
         self.respond(self._response.serialize(response), request_id)
         if self._service_events is not None:
             self._tell(RESPONSE_SENT, request_id, response)
@@ -214,21 +188,19 @@ class ClientHandle(ServiceEndHandle, Client):
     def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
         Client.__init__(self, *self._prepare(node, srv_type, name, qos))
         self._sites = CallSites(node.dispatcher, self.entity_id)
-        self._functions = Functions(node.dispatcher)
+        self._functions = FunctionRecorder(node.dispatcher)
         node.stacks.domain.graph.add_client(self)
 
     @property
     def service_name(self) -> str:
-        """The resolved service name."""
         return self.service
 
     def service_server_is_available(self) -> bool:
-        """Return whether a server is there now."""
         self.node.require_up("failed to check service availability")
         return bool(self.servers())
 
     def send_request(self, request: Any) -> int:
-        """Send a request to every server of that name; without one it is lost, as in DDS."""
+        """Send a request to every server; without one it is lost, as in DDS."""
         data = self._request.serialize(request)
         sites = self._sites
         if self._sequence == sites.due or self.dispatcher.event.entity != sites.running:
@@ -239,7 +211,7 @@ class ClientHandle(ServiceEndHandle, Client):
         return request_id.sequence_number
 
     def take_response(self, response_type: Any) -> tuple[Any, Any]:
-        """Take a response by hand; ``(None, None)`` if there is none."""
+        """Take a response outside of a callback; ``(None, None)`` if there is none."""
         if not self.queue:
             return None, None
         data, _, _, _, header = self.queue.popleft()
@@ -248,31 +220,24 @@ class ClientHandle(ServiceEndHandle, Client):
         return header, response
 
     def dispatch(self) -> None:
-        """Take the oldest response and complete its future."""
         if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            CLIENT,
-            self._complete,
-            (self._response.deserialize(data), header.request_id),
-            event,
-            position,
-            digest,
+        args = self._response.deserialize(data), header.request_id
+        execute = self.dispatcher.execute
+        execute(
+            self, self.entity_id, self.node, CLIENT, self._complete, args, event, position, digest
         )
 
     def _complete(self, response: Any, request_id: RequestId) -> None:
-        """Set the result; plain done callbacks belong to this event, coroutines become tasks. Where
-        executors poll, all do, as rclpy has it."""
+        """Set the future's result. Plain done callbacks belong to this event, coroutines become
+        tasks; if executors poll, all become tasks, as in rclpy."""
         if self._service_events is not None:
             self._tell(RESPONSE_RECEIVED, request_id, response)
         try:
             future = self.wrapper.get_pending_request(request_id.sequence_number)
         except KeyError:
-            return  # cancelled, or another server was faster
+            return  # cancelled, or answered by another server
         executor = executor_of(self.stacks, self)
         future._set_executor(executor)
         if self.stacks.loop.polls:
@@ -301,16 +266,14 @@ class TypeDescriptionServiceHandle:
         self.impl = ServiceHandle(node, GetTypeDescription, "~/get_type_description", profile)
 
     def handle_request(self, request: Any, response_type: Any, node: Any) -> Any:
-        """Describe an interface that one of the node's endpoints uses."""
-        return answer(request, response_type, _interfaces_of(self._graph, node))
+        return answer_request(request, response_type, _interfaces_of(self._graph, node))
 
     def destroy_when_not_in_use(self) -> None:
-        """Destroy the service, unless the node has done so already."""
         self.impl.destroy_when_not_in_use()
 
 
 def _interfaces_of(graph: Graph, node: Any) -> Iterator[Any]:
-    """Yield the classes of the messages, services and actions that a node uses."""
+    """Yield the message, service and action classes that a node uses."""
     for end in graph.endpoints_of(node):
         if isinstance(end, PublisherHandle | SubscriptionHandle):
             yield end.msg_type

@@ -1,4 +1,4 @@
-"""The handle of ``rclpy.Timer``."""
+"""The handles of ``rclpy.Timer`` and ``rclpy.GuardCondition``, which are made without a node."""
 
 from __future__ import annotations
 
@@ -8,20 +8,21 @@ from functools import partial
 from typing import Any
 
 from rsltrace.adapters.rclpy.handles.clock import ClockHandle
-from rsltrace.adapters.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
 from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, start_callback
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
+from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, run_callback, start_callback
 from rsltrace.simulation.middleware.timer import TIMER, Timer
-from rsltrace.trace.model.event import NO_EVENT
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 
 
 class TimerHandle(EntityHandle, Timer):
-    """Stands in for ``_rclpy.Timer``. It runs once the node that lists it is being run."""
+    """Stands in for ``_rclpy.Timer``. It runs once a running node lists it."""
 
     lists = "timers"
 
-    def __init__(self, real: Any, stacks: Stacks, period_ns: int, autostart: bool) -> None:
+    def __init__(self, real: Any, stacks: Runtime, period_ns: int, autostart: bool) -> None:
         if period_ns < 0:
             raise real.RCLError("timer period must be non-negative")
         self.stacks = stacks
@@ -38,7 +39,6 @@ class TimerHandle(EntityHandle, Timer):
         self.dispatcher.loop.timers.remove(self.state)
 
     def dispatch(self) -> None:
-        """Run the callback of a timer that is due, and move it to its next deadline."""
         wrapper = self.wrapper
         dispatcher = self.dispatcher
         loop = dispatcher.loop
@@ -77,7 +77,7 @@ class TimerHandle(EntityHandle, Timer):
             )
 
     def forget_callback(self) -> None:
-        """Look at the callback once more: it may be run in another way from now on."""
+        """Look up how to run the callback again."""
         self._callback = None
 
     def _leave(self) -> None:
@@ -95,7 +95,7 @@ class TimerHandle(EntityHandle, Timer):
     # -- what rclpy calls ----------------------------------------------------------------------
 
     def call_timer(self) -> None:
-        """Account for a call made by hand."""
+        """Account for a call by user code."""
         if self.state.canceled:
             raise self._real.RCLError("timer is canceled")
         self.state.call(self.dispatcher.loop.now_ns)
@@ -103,35 +103,30 @@ class TimerHandle(EntityHandle, Timer):
             self.dispatcher.loop.timers.moved(self.state)
 
     def call_timer_with_info(self) -> dict[str, int]:
-        """Do ``call_timer`` and say when it was due and when it happened (ns)."""
+        """Call ``call_timer``; return when it was due and when it happened (ns)."""
         expected_ns = self.state.deadline_ns
         self.call_timer()
         return {"expected_call_time": expected_ns, "actual_call_time": self.dispatcher.loop.now_ns}
 
     def cancel_timer(self) -> None:
-        """Stop; ``reset_timer`` starts again."""
         self.cancel()
 
     def reset_timer(self) -> None:
-        """Start a new period now."""
         self.reset()
 
     def change_timer_period(self, period_ns: int) -> None:
-        """Set the period; the present deadline stays."""
+        """Set the period; the current deadline stays."""
         if period_ns < 0:
             raise self._real.RCLError("timer period must be non-negative")
         self.set_period(period_ns)
 
     def get_timer_period(self) -> int:
-        """Return the period in nanoseconds."""
         return self.state.period_ns
 
     def is_timer_ready(self) -> bool:
-        """Return whether the timer is due."""
         return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
 
     def is_timer_canceled(self) -> bool:
-        """Return whether the timer is cancelled."""
         return self.state.canceled
 
     def time_until_next_call(self) -> int | None:
@@ -141,34 +136,31 @@ class TimerHandle(EntityHandle, Timer):
         return self.state.deadline_ns - self.dispatcher.loop.now_ns
 
     def time_since_last_call(self) -> int:
-        """Return nanoseconds since the last call, or since creation."""
         return self.dispatcher.loop.now_ns - self.state.last_call_ns
 
 
 def _info_parameter(callback: Any) -> str | None:
-    """Return which parameter of a callback wants a TimerInfo (ROS 2 Kilted and later)."""
+    """Return the parameter of a callback that takes a TimerInfo (ROS 2 Kilted and later)."""
     import rclpy.timer
 
     wanted = getattr(rclpy.timer, "TimerInfo", None)
     if wanted is None:
         return None
-    with suppress(TypeError, ValueError):  # no signature: then it wants none
+    with suppress(TypeError, ValueError):  # no signature
         for parameter in inspect.signature(callback).parameters.values():
             if parameter.annotation == wanted:
                 return parameter.name
     return None
 
 
-# Timers of ROS clocks that ``/clock`` drives: due when that shows their deadline.
-#
-# The rules for jumps and for switching ROS time on and off are those of ``rcl/src/rcl/timer.c``.
-
-
 class RosTimerHandle(TimerHandle):
-    """A timer by a clock's own time while that is driven, by simulated time otherwise."""
+    """A timer of a ROS clock: by ``/clock`` while that drives the clock, else by simulated time.
+
+    The rules for jumps and for switching ROS time on and off are those of ``rcl/src/rcl/timer.c``.
+    """
 
     def __init__(
-        self, real: Any, stacks: Stacks, clock: ClockHandle, period_ns: int, autostart: bool
+        self, real: Any, stacks: Runtime, clock: ClockHandle, period_ns: int, autostart: bool
     ) -> None:
         self._clock = clock
         self._credit_ns = 0
@@ -185,13 +177,13 @@ class RosTimerHandle(TimerHandle):
     # -- the clock -------------------------------------------------------------------------------
 
     def time_changes(self) -> None:
-        """Keep how much of the period is over: only the rest is waited for in the new time."""
+        """Keep the elapsed part of the period: only the rest is waited for in the new time."""
         now_ns = self._clock.now_ns()
         if now_ns:
             self._credit_ns = now_ns - self.state.last_call_ns
 
     def time_changed(self, *, switched: bool) -> None:
-        """See whether the timer is due, or its clock has been set back behind its last call."""
+        """Check whether the timer is due, or its clock was set back before its last call."""
         now_ns = self._clock.now_ns()
         if switched:
             self.dispatcher.loop.timers.remove(self.state)
@@ -203,7 +195,7 @@ class RosTimerHandle(TimerHandle):
         self.activate()
 
     def activate(self) -> None:
-        """Let the loop run it when its clock says that it is due."""
+        """Let the loop run it when it is due by its clock."""
         if not self._clock.is_driven:
             super().activate()
             return
@@ -213,7 +205,6 @@ class RosTimerHandle(TimerHandle):
             self.dispatcher.loop.ready.append(self)
 
     def dispatch(self) -> None:
-        """Run the callback if the timer is still due by its clock."""
         if not self._clock.is_driven:
             super().dispatch()
             return
@@ -232,18 +223,12 @@ class RosTimerHandle(TimerHandle):
             return
         callback, digest = wrapper.callback, self.deadline_hash()
         state.call(now_ns)
-        if is_awaited(self.stacks, callback):
-            start_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
-        else:
-            self.dispatcher.execute(
-                self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
-            )
+        run_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
         self.activate()
 
     # -- what rclpy calls ------------------------------------------------------------------------
 
     def call_timer(self) -> None:
-        """Account for a call made by hand."""
         if not self._clock.is_driven:
             super().call_timer()
             return
@@ -252,7 +237,6 @@ class RosTimerHandle(TimerHandle):
         self.state.call(self._clock.now_ns())
 
     def reset(self) -> None:
-        """Start a new period now."""
         super().reset()
         if self._clock.is_driven:
             self.dispatcher.loop.timers.remove(self.state)
@@ -260,18 +244,83 @@ class RosTimerHandle(TimerHandle):
             self.activate()
 
     def is_timer_ready(self) -> bool:
-        """Return whether the timer is due."""
         return not self.state.canceled and self.state.deadline_ns <= self._clock.now_ns()
 
     def time_until_next_call(self) -> int | None:
-        """Return nanoseconds to the deadline (negative: overdue), None if cancelled."""
         return None if self.state.canceled else self.state.deadline_ns - self._clock.now_ns()
 
     def time_since_last_call(self) -> int:
-        """Return nanoseconds since the last call, or since creation."""
         return self._clock.now_ns() - self.state.last_call_ns
 
     def _destroy(self) -> None:
         super()._destroy()
         if self in self._clock.followers:
             self._clock.followers.remove(self)
+
+
+_GUARD = int(EventKind.GUARD_CONDITION)
+
+
+class GuardConditionHandle(EntityHandle):
+    """Stands in for ``_rclpy.GuardCondition``.
+
+    A trigger before the last one was handled is merged with it. Executors make guard conditions,
+    too; no node lists those, and their triggers do nothing. Each trigger calls the ``alarms``.
+    """
+
+    kind = EntityKind.GUARD_CONDITION
+    lists = "guards"
+
+    def __init__(self, stacks: Runtime) -> None:
+        self.stacks = stacks
+        super().__init__(stacks.dispatcher, None)
+        self._triggered = False
+        self._cause = (0, 0)
+        self._found: tuple[int, int] | None = None
+        self.alarms: tuple[Alarm, ...] = ()
+
+    def trigger_guard_condition(self) -> None:
+        if not self._triggered:
+            self._triggered = True
+            if self.active:
+                loop, dispatcher = self.dispatcher.loop, self.dispatcher
+                self._cause = (loop.events, dispatcher.note(OutputKind.GUARD, self.entity_id))
+                loop.ready.append(self)
+        for alarm in self.alarms:
+            alarm()
+
+    def found(self) -> None:
+        """Take the triggers so far for a polling point; later ones are for the next."""
+        if self._triggered:
+            self._found, self._triggered = self._cause, False
+
+    @property
+    def is_due(self) -> bool:
+        return self._triggered or self._found is not None
+
+    def is_triggered(self) -> bool:
+        return self._triggered
+
+    def take_trigger(self) -> None:
+        """Handle the triggers until now, as a wait set does."""
+        self._triggered = False
+
+    def activate(self) -> None:
+        if self._triggered:
+            self._cause = (self.dispatcher.loop.events, 0)
+            self.dispatcher.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Run the callback once for all triggers until now."""
+        if self.mailbox_keeps():
+            return
+        wrapper = self.wrapper
+        if not self.is_due or wrapper is None or self.destroyed:
+            return
+        if self.stacks.groups.must_wait(self, wrapper):
+            return
+        cause = self._found
+        if cause is None:
+            cause, self._triggered = self._cause, False
+        self._found = None
+        run_callback(self.stacks, self, _GUARD, wrapper.callback, (), *cause, 0)

@@ -1,14 +1,15 @@
-"""Wait sets of user code: ``rclpy.wait_for_message`` uses one, and code close to rcl does.
+"""Wait sets of user code (such as ``rclpy.wait_for_message``), and waitables that users write.
 
-Executors do without. Whoever waits here watches the entities for as long as the wait lasts, so that
-entities which nobody waits for pay nothing.
+Executors do not use wait sets. A wait set watches its entities only while it waits, so that other
+entities pay nothing.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
+from functools import partialmethod
 from types import FrameType
 from typing import Any
 
@@ -16,14 +17,14 @@ from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.sim_event import SimEvent
+from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 
 
 class WaitSetHandle(Handle):
-    """Stands in for ``_rclpy.WaitSet``. Its size is not fixed: entities are added as they come."""
+    """Stands in for ``_rclpy.WaitSet``; its size is not fixed."""
 
     def __init__(
         self,
@@ -43,38 +44,21 @@ class WaitSetHandle(Handle):
         self.clear_entities()
 
     def clear_entities(self) -> None:
-        """Start anew."""
         self._entities = {kind: [] for kind in _IS_READY}
         self._found = {kind: [] for kind in _IS_READY}
 
     def _add(self, kind: str, handle: Any) -> int:
+        """Add an entity; return the index for ``is_ready``."""
         entities = self._entities[kind]
         entities.append(handle)
         return len(entities) - 1
 
-    def add_subscription(self, handle: Any) -> int:
-        """Wait for a message; return the index to ask with."""
-        return self._add("subscription", handle)
-
-    def add_guard_condition(self, handle: Any) -> int:
-        """Wait for a trigger; return the index to ask with."""
-        return self._add("guard_condition", handle)
-
-    def add_timer(self, handle: Any) -> int:
-        """Wait for a timer to be due; return the index to ask with."""
-        return self._add("timer", handle)
-
-    def add_client(self, handle: Any) -> int:
-        """Wait for a response; return the index to ask with."""
-        return self._add("client", handle)
-
-    def add_service(self, handle: Any) -> int:
-        """Wait for a request; return the index to ask with."""
-        return self._add("service", handle)
-
-    def add_event(self, handle: Any) -> int:
-        """Wait for a QoS event; return the index to ask with."""
-        return self._add("event", handle)
+    add_subscription = partialmethod(_add, "subscription")
+    add_guard_condition = partialmethod(_add, "guard_condition")
+    add_timer = partialmethod(_add, "timer")
+    add_client = partialmethod(_add, "client")
+    add_service = partialmethod(_add, "service")
+    add_event = partialmethod(_add, "event")
 
     def is_ready(self, kind: str, index: int) -> bool:
         """Return whether the last wait found an entity ready."""
@@ -84,7 +68,7 @@ class WaitSetHandle(Handle):
         return index < len(found) and found[index]
 
     def get_ready_entities(self, kind: str) -> list[int]:
-        """Return the pointers of what the last wait found ready."""
+        """Return the pointers of the entities that the last wait found ready."""
         pairs = zip(self._entities[kind], self._found[kind], strict=False)
         return [handle.pointer for handle, found in pairs if found]
 
@@ -105,12 +89,12 @@ class WaitSetHandle(Handle):
                 guard.take_trigger()
 
     def members(self) -> list[Any]:
-        """Return the entities, in the order in which kinds and entities are looked at."""
+        """Return the entities, kind by kind."""
         return [handle for entities in self._entities.values() for handle in entities]
 
     @contextmanager
     def watched(self, alarm: Alarm) -> Iterator[None]:
-        """Within the ``with`` block, call ``alarm`` whenever something comes for an entity."""
+        """Call ``alarm`` whenever something arrives for an entity, within the ``with`` block."""
         with ExitStack() as stack:
             for kind, entities in self._entities.items():
                 for handle in entities:
@@ -118,24 +102,24 @@ class WaitSetHandle(Handle):
             yield
 
     def ready_now(self) -> list[tuple[str, Any]]:
-        """Return the kind and the entity of whatever is ready."""
+        """Return the ready entities, each with its kind."""
         return [
             (kind, handle)
             for kind, entities in self._entities.items()
             for handle in entities
-            if not handle.destroyed and _IS_READY[kind](handle)
+            if _is_ready(kind, handle)
         ]
 
     def _look(self) -> bool:
-        """See what is ready; return whether anything is."""
+        """Look for ready entities; return whether there are any."""
         self._found = {
-            kind: [not handle.destroyed and _IS_READY[kind](handle) for handle in entities]
+            kind: [_is_ready(kind, handle) for handle in entities]
             for kind, entities in self._entities.items()
         }
         return any(any(found) for found in self._found.values())
 
     def _patience_ns(self, until_ns: int | None) -> int | None:
-        """Return how long to wait at most: until the next timer is due, or the time is up."""
+        """Return the time until the next timer is due, or ``until_ns`` if that is sooner."""
         now_ns = self._stacks.loop.now_ns
         limits = [timer.time_until_next_call() for timer in self._entities["timer"]]
         limits.append(None if until_ns is None else until_ns - now_ns)
@@ -160,8 +144,12 @@ _IS_READY: dict[str, Callable[[Any], bool]] = {
 }
 
 
+def _is_ready(kind: str, handle: Any) -> bool:
+    return not handle.destroyed and _IS_READY[kind](handle)
+
+
 class _AlarmedQueue(deque[Any]):
-    """A queue that tells of what arrives."""
+    """A queue that calls ``alarm`` for each arrival."""
 
     alarm: Alarm
 
@@ -193,26 +181,18 @@ def _watch_triggers(handle: Any, alarm: Alarm) -> Iterator[None]:
         handle.alarms = tuple(one for one in handle.alarms if one is not alarm)
 
 
-@contextmanager
-def _watch_nothing(handle: Any, alarm: Alarm) -> Iterator[None]:
-    yield  # when a timer is due is known in advance
-
-
 _WATCH: dict[str, Callable[[Any, Alarm], Any]] = {
     "subscription": _watch_queue,
     "guard_condition": _watch_triggers,
-    "timer": _watch_nothing,
+    "timer": lambda handle, alarm: nullcontext(),  # it is known in advance when one is due
     "client": _watch_queue,
     "service": _watch_queue,
     "event": _watch_triggers,
 }
 
 
-# Waitables that users write themselves (``node.add_waitable``), run as an executor would.
-#
-# A waitable says which entities it waits for when it is asked to add them to a wait set. It is
-# asked once, and is ready whenever one of them is; rclpy's own waitables (actions, QoS events)
-# have handles that the loop dispatches without this.
+# Waitables of user code (``node.add_waitable``) add their entities to a wait set once, and are
+# ready whenever one of these is. rclpy's own (actions, QoS events) have handles instead.
 
 OWN_WAITABLES = ("_EventHandler__event", "_handle", "_client_handle")
 """Attributes by which rclpy's own waitables hold their handles."""
@@ -228,7 +208,7 @@ _KINDS = {
 
 
 class UserWaitable:
-    """One waitable of a node that is being run. ``wrapper`` is the user's object."""
+    """A waitable of user code; ``wrapper`` is the user's object."""
 
     def __init__(self, node: NodeHandle, waitable: Any) -> None:
         self.stacks = node.stacks
@@ -246,14 +226,13 @@ class UserWaitable:
         self._look_again()
 
     def trigger(self) -> None:
-        """Make it ready, because something has come."""
         if not self._queued and not self._closed:
             self._queued = True
             self._cause = (self.stacks.loop.events, 0)
             self.stacks.loop.ready.append(self)
 
     def _look_again(self) -> None:
-        """Make it ready if it is already, and when the next of its timers will be due."""
+        """Trigger it if it is ready, or when its next timer is due."""
         loop = self.stacks.loop
         if self._set.ready_now():
             self.trigger()
@@ -263,7 +242,6 @@ class UserWaitable:
             loop.schedule(loop.now_ns + patience_ns, self.trigger)
 
     def dispatch(self) -> None:
-        """Let the waitable take what is ready and execute it, as one event."""
         mailbox = self.node.mailbox
         if mailbox is not None and mailbox.keeps(self):
             return
@@ -285,7 +263,7 @@ class UserWaitable:
         start_coroutine(self.stacks, here, int(_KINDS[name]), self._execute, (), *cause, digest)
 
     async def _execute(self) -> None:
-        """Do what rclpy's executors do for a waitable after a wait."""
+        """Run it as rclpy's executors do after a wait."""
         self._set.wait(0)
         waitable = self.wrapper
         if waitable.is_ready(self._set):
@@ -297,25 +275,22 @@ class UserWaitable:
             self._look_again()
 
     def describe(self) -> str:
-        """Name it for people."""
         return f"{self.node.fully_qualified_name}: waitable {type(self.wrapper).__qualname__}"
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy."""
         told = self.node.mailbox is not None
         return on_no_executor(self.node, self.describe(), "waitable", told=told)
 
     def close(self) -> None:
-        """Run no more."""
         self._closed = True
         self._watching.close()
 
 
 def sync_waitables(node: NodeHandle) -> None:
-    """Run the waitables that a node's user has added, and no longer those taken away."""
+    """Run waitables that user code has added to a node, and stop those that it removed."""
     present: Any = ()
     if node.wrapper is not None:
-        # Each subscription and publisher may have one: with many, even to list them takes long.
+        # Each subscription and publisher may have one; listing many takes long.
         present = getattr(node.wrapper, "_Node__waitables", None)
         present = list(node.wrapper.waitables) if present is None else present
     before, node.waitable_count = node.waitable_count, len(present)
@@ -329,10 +304,10 @@ def sync_waitables(node: NodeHandle) -> None:
 
 
 def sync_woken(nodes: Collection[Any], caller: FrameType) -> None:
-    """Do ``sync_waitables`` for those of ``nodes`` that may have changed.
+    """Call ``sync_waitables`` for the ``nodes`` that may have changed.
 
-    A node wakes its executor whenever it has made or destroyed anything: then it is only that one,
-    and a thousand nodes need not be looked at nine thousand times.
+    A node wakes its executor after each change: then only that node is checked, so that a thousand
+    nodes are not checked nine thousand times.
     """
     if caller.f_code.co_name == "_wake_executor" and (woken := caller.f_locals["self"]) in nodes:
         nodes = [woken]
@@ -345,7 +320,7 @@ def _is_users(waitable: Any) -> bool:
 
 
 def activate_node(node: NodeHandle) -> None:
-    """Run the callbacks of a node from now on: an executor of this run has it."""
+    """Run the callbacks of a node from now on."""
     for handle in _handles(node):
         if handle.wrapper is None:
             handle.node = handle.node or node
@@ -355,7 +330,7 @@ def activate_node(node: NodeHandle) -> None:
 
 
 def deactivate_node(node: NodeHandle) -> None:
-    """Stop running the callbacks of a node; what it has received stays in its queues."""
+    """Stop running the callbacks of a node; received messages stay in its queues."""
     for handle in _handles(node):
         handle.deactivate()
     node.wrapper = None
@@ -363,7 +338,7 @@ def deactivate_node(node: NodeHandle) -> None:
 
 
 def _handles(node: NodeHandle) -> Iterator[Any]:
-    """Yield what runs callbacks of a node, in creation order of each kind."""
+    """Yield the handles of a node's callbacks, kind by kind in creation order."""
     for lists in ("subscriptions", "timers", "clients", "services", "guards"):
         for wrapper in getattr(node.wrapper, lists):
             yield wrapper.handle

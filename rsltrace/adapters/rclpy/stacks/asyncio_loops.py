@@ -1,4 +1,4 @@
-"""asyncio loops on simulated time: a loop with nothing to do is set aside like any blocked call."""
+"""asyncio loops on simulated time: a loop with nothing to do waits like any blocked call."""
 
 from __future__ import annotations
 
@@ -9,43 +9,42 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.recorded.polls import RecordedPoll
 
 _NS_PER_S = 1_000_000_000
 
 _FREE_ROUNDS = 100
 _ROUNDS_PER_POLL = 10
-"""A loop that always has something to do polls, most often an rclpy future: asyncio asks again at
-once whatever is not its own. After the first rounds, so many of them take ``POLL_NS``."""
+"""A loop that always has something to do is polling, most often an rclpy future, which asyncio asks
+again at once. After the free rounds, every tenth round takes ``POLL_NS``."""
 
 
 class SimSelector:
     """Wraps the selector of an asyncio loop: where it would wait, simulated time passes.
 
-    Descriptors are looked at whenever the loop runs. They are only waited for where they lead
-    outside of the run and what comes is recorded.
+    File descriptors are polled whenever the loop runs. They are waited for only if they lead
+    outside the run and what arrives is recorded.
     """
 
-    def __init__(self, stacks: Stacks, real: Any) -> None:
+    def __init__(self, stacks: Runtime, real: Any) -> None:
         self._stacks = stacks
         self._real = real
-        self._blocked: Wait | None = None
+        self._blocked: BlockedCall | None = None
         self._rounds = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._real, name)
 
     def select(self, timeout: float | None = None) -> Any:
-        """Return what is ready, after having waited for the loop's next timer or a wake-up."""
+        """Return what is ready after waiting for the loop's next timer or a wake-up."""
         found = self._real.select(0)
         polls = timeout is not None and timeout <= 0
         self._rounds = self._rounds + 1 if polls else 0
         if found or (polls and not self._costs_time()):
             return found
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is not self._stacks:
             return self._real.select(timeout)
         poller = getattr(self._real, "_selector", None)
@@ -55,7 +54,7 @@ class SimSelector:
                 return self._real.select(timeout)
             finally:
                 poller.step = None
-        # Rounded up, or the loop would look too early, and again without any time having passed.
+        # Rounded up, or the loop would look too early, and again without time passing.
         for_ns = None if timeout is None else int(timeout * _NS_PER_S) + 1
         self._step(POLL_NS if polls else for_ns)
         return self._real.select(0)
@@ -79,34 +78,33 @@ class SimSelector:
         rounds = self._rounds
         return rounds > _FREE_ROUNDS and rounds % _ROUNDS_PER_POLL == 0
 
-    def _keep(self, blocked: Wait) -> None:
+    def _keep(self, blocked: BlockedCall) -> None:
         self._blocked = blocked
 
     def wake(self) -> None:
-        """Let the loop look again."""
         if self._blocked is not None:
             self._blocked.release()
 
 
 @contextmanager
-def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
-    """Have asyncio loops that are made within the ``with`` block keep simulated time."""
+def simulated_event_loops(stacks: Runtime) -> Iterator[None]:
+    """Give simulated time to asyncio loops that are made within the ``with`` block."""
     base: Any = asyncio.BaseEventLoop
     selecting: Any = asyncio.selector_events.BaseSelectorEventLoop
     real_time, real_init = base.time, selecting.__init__
     real_write = selecting._write_to_self
 
     def time(self: Any) -> float:
-        if isinstance(getattr(self, "_selector", None), SimSelector) and simulated_stacks():
+        if isinstance(getattr(self, "_selector", None), SimSelector) and calling_runtime():
             return stacks.loop.now_ns / _NS_PER_S
         return float(real_time(self))
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real_init(self, *args, **kwargs)
-        if simulated_stacks() is stacks:
+        if calling_runtime() is stacks:
             self._selector = SimSelector(stacks, self._selector)
-            # In seconds since 1970 a float cannot tell 100 ns apart; a timer that is due by less
-            # than asyncio can see would never run, and time would never go on.
+            # A float of seconds since 1970 cannot represent 100 ns; a timer that is due within
+            # less than asyncio's resolution would never run, and time would never go on.
             now_s = stacks.loop.now_ns / _NS_PER_S
             self._clock_resolution = max(self._clock_resolution, 2 * math.ulp(now_s))
 
@@ -117,7 +115,7 @@ def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
 
     base.time, selecting.__init__ = time, __init__
     selecting._write_to_self = _write_to_self
-    # Who waits for child processes numbers its threads: those of another run are none of ours.
+    # The child watcher numbers its threads: do not count those of another run.
     policy: Any = asyncio.get_event_loop_policy()
     watcher = getattr(policy, "_watcher", None)
     if watcher is not None:
@@ -129,6 +127,3 @@ def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
             policy._watcher = watcher
         base.time, selecting.__init__ = real_time, real_init
         selecting._write_to_self = real_write
-
-
-__all__ = ["SimSelector", "simulated_event_loops"]

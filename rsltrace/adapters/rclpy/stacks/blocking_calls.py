@@ -1,69 +1,80 @@
-"""Calls that block become simulated waiting: time passes, other callbacks run, then they return.
+"""Blocking calls wait in simulated time: other callbacks run, then the call returns.
 
-In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RESUME`` event. How the
-stacks take turns is in ``runners.py``.
+In the trace a wait ends the event (flag ``SUSPENDED``); the rest is a ``RESUME`` event.
+``runtime.py`` switches the stacks. ``time.sleep`` and what rclpy waits with are replaced here.
 """
 
 from __future__ import annotations
 
 import os
+import random
+import sys
+import threading
+import time
+import uuid
 from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import SimpleNamespace
 from typing import Any, NoReturn
 
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks import callback_groups as groups
-from rsltrace.adapters.rclpy.stacks.runners import Patience, RunEnded, Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Patience, RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
-from rsltrace.guard.redirect import copy_of
+from rsltrace.guard.libraries import present_import
+from rsltrace.guard.recorded.processes import sleep_for_process
+from rsltrace.guard.redirect import Redirected, copy_of, replace_attribute
+from rsltrace.simulation.middleware.events.event import Event
 from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.model.texts import patience_ns
 
 POLL_NS = 1_000_000
-"""What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
+"""The time that a second poll at one instant takes (a loop of ``spin_once(timeout_sec=0)``)."""
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
 _PATIENCE = 100
-"""How often a stack may go on to wait after the end of the run before it is left where it is."""
+"""How often a stack may wait after the end of the run before it is abandoned."""
 
-# Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
-# be collected: that would raise in them once more.
+# Stacks that ignore every exception (`while True: try: ... except: pass`). They must not be
+# collected, as that would raise in them once more.
 _abandoned: list[greenlet] = []
 
 
 def wait(
-    stacks: Stacks,
+    stacks: Runtime,
     what: object,
     *,
-    until: Callable[[Wait], None] | None = None,
+    until: Callable[[BlockedCall], None] | None = None,
     for_ns: int | None = None,
     quiet: bool = False,
     patient: Patience = False,
     serve: Callable[..., bool] | None = None,
 ) -> bool:
-    """Block the present callback in simulated time; return whether it was woken (not timed out).
+    """Block the current callback in simulated time; return whether it was woken (not timed out).
 
-    ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
-    wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
-    something comes of it. A ``patient`` one may last for ever. ``serve`` runs on this stack what is
-    given to it meanwhile, and returns whether the wait is over by that.
+    ``until`` gets the BlockedCall and has its ``wake`` called later. ``what`` completes the text
+    "… waits for". A ``quiet`` wait has a RESUME event only if that has outputs. A ``patient`` one
+    may last for ever. ``serve`` runs a callback on this stack meanwhile, and returns whether the
+    wait is over.
 
     :raises RunEnded: when the run ends before the wait does.
     :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
     """
     _check_may_wait(stacks, what)
     group = _hold_group(stacks)
-    blocked = Wait(stacks.runners, what, group, quiet=quiet, patient=patient)
+    blocked = BlockedCall(stacks.runners, what, group, quiet=quiet, patient=patient)
     if until is not None:
         until(blocked)
     if for_ns is not None:
         blocked.deadline_ns = stacks.loop.now_ns + stacks.ending.grace_ns + max(for_ns, 0)
         stacks.loop.schedule(blocked.deadline_ns, blocked.time_out)
-    _end_stretch(stacks)
+    _end_event_part(stacks)
     stacks.runners.blocked[blocked] = None
     stacks.event.on_end = None
     stacks.programs.leave()
@@ -88,26 +99,26 @@ def wait(
     return not blocked.timed_out
 
 
-def _check_may_wait(stacks: Stacks, what: object) -> None:
-    """Refuse where there is no stack that can be set aside, and when the run is over."""
+def _check_may_wait(stacks: Runtime, what: object) -> None:
+    """Raise an error where no stack can wait, and when the run is over."""
     if get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         place = "thread" if getpid() == stacks.runners.process else "process"
         raise UnsupportedError(
             f"a {place} that a node has started waits for {what}, which takes simulated time: only "
-            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
-            f"there, or let a callback wait and hand the result to the {place}"
+            "callbacks, constructors and tasks can wait; use call_async with add_done_callback, "
+            f"or let a callback wait and pass the result to the {place}"
         )
     if stacks.ending.unwinding or stacks.programs.present.ended:
         _refuse(stacks)
     if stacks.event.handle is None:
         raise UnsupportedError(
-            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
-            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
+            f"code outside of all callbacks cannot wait for {what}: a stop function only reads; "
+            "with a Simulation, use sim.call(…), or run the simulation until then"
         )
 
 
-def _end_stretch(stacks: Stacks) -> None:
-    """Record the event under way as one that will go on, unless it is quiet and said nothing."""
+def _end_event_part(stacks: Runtime) -> None:
+    """Record the current event as SUSPENDED, unless it is quiet and has no outputs."""
     event = stacks.event
     if event.quiet and not stacks.dispatcher.has_outputs():
         event.quiet = False
@@ -118,12 +129,12 @@ def _end_stretch(stacks: Stacks) -> None:
 
 
 @contextmanager
-def set_aside(stacks: Stacks) -> Iterator[None]:
-    """Let other events run on this stack, between two parts of the event under way."""
+def suspended_event(stacks: Runtime) -> Iterator[None]:
+    """Let other events run on this stack between two parts of the current event."""
     event, programs, dispatcher = stacks.event, stacks.programs, stacks.dispatcher
     whose = event.handle, event.entity, event.node
     constructing, on_end = programs.constructing, event.on_end
-    _end_stretch(stacks)
+    _end_event_part(stacks)
     event.on_end = None
     try:
         yield
@@ -139,19 +150,18 @@ def set_aside(stacks: Stacks) -> Iterator[None]:
             observer.resumed()
 
 
-def _refuse(stacks: Stacks) -> NoReturn:
-    """Do not wait any more, the run is over."""
-    lose_patience(stacks)
+def _refuse(stacks: Runtime) -> NoReturn:
+    count_refused_wait(stacks)
     raise RunEnded
 
 
 def abandon(stack: greenlet) -> None:
-    """Leave a stack where it is, for ever: nothing is raised in it, nothing in it is collected."""
+    """Keep a stack for ever: nothing is raised in it, and nothing in it is collected."""
     _abandoned.append(stack)
 
 
-def lose_patience(stacks: Stacks) -> None:
-    """Count that somebody goes on although the run is over; in the end, leave it where it is."""
+def count_refused_wait(stacks: Runtime) -> None:
+    """Count the waits of a stack that goes on although the run is over; abandon it in the end."""
     stacks.ending.refused += 1
     if stacks.ending.refused > _PATIENCE and getcurrent() is not stacks.runners.main:
         stacks.ending.refused = 0
@@ -162,8 +172,8 @@ def lose_patience(stacks: Stacks) -> None:
         stacks.runners.main.switch()
 
 
-def _hold_group(stacks: Stacks) -> object:
-    """Keep the callback's group busy while it is blocked, as an executor would; return it."""
+def _hold_group(stacks: Runtime) -> object:
+    """Keep the group of a blocked callback busy, as an executor does; return it."""
     event = stacks.event
     wrapper: Any = getattr(event.handle, "wrapper", None)
     group = getattr(wrapper, "callback_group", None)
@@ -178,8 +188,8 @@ def _hold_group(stacks: Stacks) -> object:
     return group
 
 
-def end_blocked(stacks: Stacks) -> None:
-    """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
+def end_blocked(stacks: Runtime) -> None:
+    """Unwind every blocked call at the end of a run: ``finally`` blocks run."""
     stacks.ending.unwinding = True
     stacks.loop.halt()
     here = getcurrent()
@@ -190,3 +200,138 @@ def end_blocked(stacks: Stacks) -> None:
         if runner is not here and not runner.dead:
             runner.throw(RunEnded)
     stacks.runners.waiting.clear()
+
+
+class SimEvent:
+    """Stands in for ``threading.Event`` in rclpy."""
+
+    def __init__(self, stacks: Runtime, what: str = "an event to be set") -> None:
+        self._stacks = stacks
+        self._what = what
+        self._set = False
+        self._waits: list[BlockedCall] = []
+
+    def is_set(self) -> bool:
+        return self._set
+
+    def set(self) -> None:
+        self._set = True
+        waits, self._waits = self._waits, []
+        for blocked in waits:
+            blocked.wake()
+
+    def clear(self) -> None:
+        self._set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        return self.wait_ns(None if timeout is None else patience_ns(timeout))
+
+    def wait_ns(self, timeout_ns: int | None) -> bool:
+        """Wait with a timeout in nanoseconds."""
+        if not self._set:
+            wait(self._stacks, self._what, until=self._waits.append, for_ns=timeout_ns)
+            self._waits = [blocked for blocked in self._waits if blocked.waiting]
+        return self._set
+
+
+class EventSetter:
+    """A future's done callback that sets an event at once, without becoming a task."""
+
+    def __init__(self, event: SimEvent) -> None:
+        self._event = event
+
+    def __call__(self, future: Any) -> None:
+        self._event.set()
+
+
+_SHUTDOWN_NS = 10_000_000_000
+_SHORTEST_SLEEP_NS = 1_000_000
+_RATE = (
+    "the next period of a Rate, which is a timer of its node: an executor has to spin the node "
+    "meanwhile, in another thread"
+)
+_real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
+runtimes: list[Runtime] = []
+"""Those of the runs in this process, or in the process that forked it."""
+
+
+def calling_runtime() -> Runtime | None:
+    """Return the runtime of the calling code; None outside of nodes, in real threads and in other
+    processes."""
+    stacks = runtimes[-1] if runtimes else None
+    if stacks is None or get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
+        return None
+    return stacks if stacks.event.handle is not None or stacks.programs.importing else None
+
+
+def _sleep(seconds: float) -> None:
+    """Replace ``time.sleep`` during a run."""
+    library = present_import()
+    if library is not None:
+        library.passed_ns += int(seconds * 1_000_000_000)
+    stacks = calling_runtime()
+    if stacks is None or stacks.event.handle is None or library is not None:
+        _real_sleep(seconds)
+        return
+    if seconds < 0:
+        raise ValueError("sleep length must be non-negative")
+    frame = sys._getframe(1)
+    if frame.f_globals.get("__name__") == "subprocess":
+        sleep_for_process(seconds, _real_sleep, frame)
+        return
+    for_ns = patience_ns(seconds)
+    if stacks.ending.unwinding and stacks.ending.shutdown_ns < _SHUTDOWN_NS:
+        # Time stands still, but destroy_node and ``finally`` may sleep as long as ros2 launch
+        # waits between SIGINT and SIGKILL.
+        stacks.ending.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
+        return
+    wait(stacks, f"{seconds} s to pass", for_ns=for_ns)
+
+
+@contextmanager
+def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
+    """Simulate ``time.sleep`` and the modules that rclpy waits with, within the ``with`` block."""
+    import rclpy.action.client
+    import rclpy.client
+    import rclpy.node
+    import rclpy.task
+    import rclpy.timer
+
+    def now() -> float:
+        return stacks.loop.now_ns / 1_000_000_000
+
+    replaced = [
+        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
+        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
+        (rclpy.client, "threading", _threading(stacks, "the response to a service call")),
+        (rclpy.timer, "threading", _threading(stacks, _RATE)),
+        (rclpy.action.client, "threading", _threading(stacks, "an answer of an action server")),
+        (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
+        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=_goal_ids(stacks.event, seed))),
+    ]
+    with ExitStack() as stack:
+        for module, name, value in replaced:
+            replace_attribute(stack, module, name, value)
+        redirected = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
+        stack.callback(redirected.restore)
+        runtimes.append(stacks)
+        stack.callback(runtimes.remove, stacks)
+        yield
+
+
+def _goal_ids(event: Event, seed: int) -> Callable[[], uuid.UUID]:
+    """Return a ``uuid4`` that draws goal ids from a random stream of the current node."""
+    streams: dict[str, random.Random] = {}
+
+    def uuid4() -> uuid.UUID:
+        name = event.node.fully_qualified_name if event.node is not None else ""
+        stream = streams.setdefault(name, random.Random(f"goal ids {seed} {name}"))
+        return uuid.UUID(int=stream.getrandbits(128), version=4)
+
+    return uuid4
+
+
+def _threading(stacks: Runtime, what: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        Event=partial(SimEvent, stacks, what), Lock=threading.Lock, RLock=threading.RLock
+    )

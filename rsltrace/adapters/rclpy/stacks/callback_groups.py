@@ -1,9 +1,9 @@
-"""Callback groups: rclpy's two own kinds are looked at directly, others through their methods.
+"""Callback groups: rclpy's two kinds are read directly, custom ones through their methods.
 
-A plain callback runs to its end before the loop does anything else, so only a suspended coroutine
-or a blocked call ever keeps a mutually exclusive group busy. A group of the user's own is asked
-before each callback and told of its begin and end, as rclpy's executors do it. One that refuses is
-asked again when one of its callbacks has ended, and whenever nothing else is ready.
+A plain callback runs to its end before anything else, so only a suspended coroutine or a blocked
+call keeps a mutually exclusive group busy. The methods of a custom group are called as rclpy's
+executors do. A group that refuses is asked again when one of its callbacks has ended, and whenever
+nothing else is ready.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.middleware.domain import Domain
 
-# What waits for its callback group: the handle, since when (ns), and what to do when it is free.
 Parked = tuple[Dispatchable, int, Callable[[], None]]
+"""A handle that waits for its callback group, since when (ns), and the function to call then."""
 
 
 class CallbackGroups:
@@ -36,8 +36,8 @@ class CallbackGroups:
             self._loop.idle.append(self._look)
 
     def must_wait(self, handle: Any, wrapper: Any) -> bool:
-        """Return whether a callback that is ready must wait for its group; if so it is parked, and
-        is ready again when the group is free."""
+        """Return whether a ready callback must wait for its group; if so it is parked until the
+        group is free."""
         ready, group = self._loop.ready, wrapper.callback_group
         if is_custom(group):
             return not self.enter(handle, wrapper, lambda: ready.appendleft(handle))
@@ -47,27 +47,26 @@ class CallbackGroups:
         return True
 
     def enter(self, handle: Any, wrapper: Any, retry: Callable[[], None]) -> bool:
-        """Ask a group of the user's own whether a callback may begin, which it then does; its end
-        is that of the event. If not, it is parked.
+        """Begin a callback of a custom group until the event ends, or park it if the group refuses.
 
         :raises RunError: if a method of the group raised.
         """
         group = wrapper.callback_group
-        if _asked(group, "can_execute", wrapper) and _asked(group, "beginning_execution", wrapper):
+        if all(_call(group, name, wrapper) for name in ("can_execute", "beginning_execution")):
             self._event.on_end = lambda: self.end(group, wrapper)
             return True
         self.park(group, handle, retry)
         return False
 
     def begin_coroutine(self, group: Any, wrapper: Any) -> None:
-        """Mark that a coroutine begins, which says itself when it has ended."""
+        """Mark the begin of a coroutine; it marks its end itself."""
         if is_custom(group):
-            self._event.on_end = None  # it has begun
+            self._event.on_end = None  # ``enter`` has begun it
         else:
             begin(group, wrapper)
 
     def _look(self) -> bool:
-        """Ask the user's own groups once more: what they go by may have changed meanwhile."""
+        """Ask custom groups once more: their state may have changed."""
         own = [group for group in self.parked if is_custom(group)]
         if not own:
             self._loop.idle.remove(self._look)
@@ -81,15 +80,14 @@ class CallbackGroups:
 
     def _lets_any(self, group: object) -> bool:
         parked: list[Any] = [handle for handle, _, _ in self.parked[group]]
-        return any(_asked(group, "can_execute", handle.wrapper) for handle in parked)
+        return any(_call(group, "can_execute", handle.wrapper) for handle in parked)
 
     def end(self, group: Any, wrapper: Any) -> None:
-        """Mark the end of a callback, and let the events run that waited for its group, before
-        anything else that is ready."""
+        """Mark the end of a callback, and run next the events that waited for its group."""
         if group is None:
             return
         if is_custom(group):
-            _asked(group, "ending_execution", wrapper)
+            _call(group, "ending_execution", wrapper)
         else:
             group.ending_execution(wrapper)
         self._retry(group)
@@ -99,14 +97,13 @@ class CallbackGroups:
             retry()
 
     def waiting_for(self, group: object) -> int:
-        """Return how many events wait until ``group`` is free."""
         return len(self.parked.get(group, ()))
 
 
 def is_busy(group: Any, wrapper: Any) -> bool:
     """Return whether ``group`` forbids to run ``wrapper``'s callback now."""
     if is_custom(group):
-        return not _asked(group, "can_execute", wrapper)
+        return not _call(group, "can_execute", wrapper)
     active = getattr(group, "_active_entity", group)  # a mutually exclusive group has one
     if active is None:
         return False
@@ -114,7 +111,7 @@ def is_busy(group: Any, wrapper: Any) -> bool:
 
 
 def is_custom(group: object) -> bool:
-    """Return whether a group is of a class of the user's own, which has a say in what runs."""
+    """Return whether a group's class overrides the methods of rclpy's groups."""
     if group is None:
         return False
     kind = type(group)
@@ -139,7 +136,7 @@ def _has_methods_of_its_own(kind: type) -> bool:
 _METHODS = ("can_execute", "beginning_execution", "ending_execution")
 
 
-def _asked(group: Any, method: str, wrapper: Any) -> Any:
+def _call(group: Any, method: str, wrapper: Any) -> Any:
     try:
         return getattr(group, method)(wrapper)
     except Exception as error:
@@ -150,11 +147,11 @@ def _asked(group: Any, method: str, wrapper: Any) -> Any:
 
 
 def begin(group: Any, wrapper: Any) -> None:
-    """Mark that a callback is under way that may be suspended."""
+    """Mark the begin of a callback that may be suspended."""
     if group is not None:
         group.beginning_execution(wrapper)
 
 
-def exclusive(group: Any) -> object | None:
-    """Return a group if it lets only one callback run at a time."""
+def exclusive_group(group: Any) -> object | None:
+    """Return the group if it is mutually exclusive."""
     return group if hasattr(group, "_active_entity") else None

@@ -1,7 +1,7 @@
 """Coroutines of user code: started once, resumed when the future they await is done.
 
-rclpy's executors poll suspended coroutines. Here only one that awaits something else than an rclpy
-Future is polled, once after everything else at that time has run.
+rclpy's executors poll suspended coroutines. Here a coroutine is polled only if it awaits something
+other than an rclpy Future, once after everything else at that time has run.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
-from rsltrace.adapters.rclpy.stacks.code_lines import Functions
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
+from rsltrace.adapters.rclpy.stacks.code_lines import FunctionRecorder
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, describe_awaited
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import Runnable
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
@@ -28,24 +28,23 @@ class Coroutines:
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
         self.suspended: dict[TaskRun, None] = {}
-        self.functions = Functions(domain.dispatcher)
+        self.functions = FunctionRecorder(domain.dispatcher)
         self._polled: list[TaskRun] = []
         self._polls = 0
         self._stage: tuple[int, int] | None = None
         self._polling = False
 
     def poll_later(self, run: TaskRun) -> None:
-        """Give a coroutine one more try when nothing else is ready."""
+        """Resume a coroutine when nothing else is ready."""
         self._polled.append(run)
         if not self._polling:
             self._polling = True
             self.domain.loop.idle.append(self._poll)
 
     def _poll(self) -> bool:
-        """Give coroutines that await something else one more try; True if there were any.
+        """Resume the polled coroutines; return whether there were any.
 
-        Once per stretch of other work: those that yield again wait until something else has
-        happened.
+        Those that yield again wait until something else has happened.
         """
         loop = self.domain.loop
         stage = (loop.now_ns, loop.events - self._polls)
@@ -61,11 +60,8 @@ class Coroutines:
 
 
 class TaskRun:
-    """One rclpy Task under way: started once, resumed as often as it awaits.
-
-    ``called`` is what it runs, and with which arguments. ``cause_event``, ``cause_output`` and
-    ``input_hash`` belong to the next dispatch.
-    """
+    """An rclpy Task that was started. ``called`` is its function with arguments; ``cause_event``,
+    ``cause_output`` and ``input_hash`` are those of its next event."""
 
     def __init__(
         self,
@@ -90,16 +86,15 @@ class TaskRun:
         self.kind = kind
         self.label = label
         self.number = self.domain.loop.next_place()
-        """Its place in the order in which tasks are made."""
+        """Its place in the order of all tasks."""
         self.cause_event = self.domain.loop.events
         self.cause_output = 0
         self.input_hash = 0
         self._on_end = on_end
-        self._is_told = kind != _TASK  # others run their entity's callback
+        self._is_recorded = kind != _TASK  # others run their entity's callback
         self._awaited: Any = None
 
     def dispatch(self) -> None:
-        """Run the task's next stretch."""
         if self.node is not None and self.node.held is not None:
             self.node.held.append(self)
             return
@@ -123,15 +118,13 @@ class TaskRun:
 
     @property
     def oldest_first(self) -> bool:
-        """Whether rclpy's executors run the oldest task first, as those after Jazzy do."""
+        """Whether this rclpy runs the oldest task first, as releases after Jazzy do."""
         return _run_oldest_first()
 
     def describe(self) -> str:
-        """Name the task and where it came from."""
         return self.label()
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy."""
         node = self.node
         return Runnable(
             "task",
@@ -145,20 +138,22 @@ class TaskRun:
         )
 
     def execution_name(self) -> tuple[str, str]:
-        """Return (kind, name) by which execution times are given."""
+        """Return the kind and name by which execution times are configured."""
         return "task", ""
 
     def waits_for(self) -> str:
-        """Say what a suspended task waits for, and where in the code."""
+        """Describe what a suspended task waits for, and where in the code."""
         frame = getattr(self.task._handler, "cr_frame", None)
         where = f" at {frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
-        return f"{self.label()} waits{where} for {awaited(self.domain.graph, self._awaited)}"
+        return (
+            f"{self.label()} waits{where} for {describe_awaited(self.domain.graph, self._awaited)}"
+        )
 
     def _step(self) -> None:
         coroutines = self._coroutines
         coroutines.suspended.pop(self, None)
-        if not self._is_told:
-            self._is_told = True
+        if not self._is_recorded:
+            self._is_recorded = True
             coroutines.functions.run(self.entity, *self.called)
         self._awaited = None
         task = self.task
@@ -175,7 +170,7 @@ class TaskRun:
         if self._awaited is None:
             coroutines.poll_later(self)
         else:
-            self._awaited.add_done_callback(Resume(self))
+            self._awaited.add_done_callback(ResumeTask(self))
 
     def _end(self) -> None:
         self._coroutines.suspended.pop(self, None)
@@ -188,11 +183,11 @@ class TaskRun:
 def _run_oldest_first() -> bool:
     from rclpy.executors import Executor
 
-    looks = getattr(Executor, "_wait_for_ready_callbacks", None)
-    return looks is None or "reversed(tasks)" not in inspect.getsource(looks)
+    wait = getattr(Executor, "_wait_for_ready_callbacks", None)
+    return wait is None or "reversed(tasks)" not in inspect.getsource(wait)
 
 
-class Resume:
+class ResumeTask:
     """The done callback that puts a suspended task back among the tasks."""
 
     def __init__(self, run: TaskRun) -> None:

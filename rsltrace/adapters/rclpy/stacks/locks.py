@@ -1,8 +1,8 @@
-"""Locks for threads that are none: who finds one taken waits in simulated time.
+"""Locks of simulated threads: waiting for one takes simulated time.
 
-``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks;
-with these in their place all of them work. A lock that is free costs no more than a flag. Outside
-of a run, and in real threads, real locks are made.
+``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks,
+which are replaced by these. A free lock costs no more than a flag. Outside of a run, and in real
+threads, real locks are made.
 """
 
 from __future__ import annotations
@@ -18,9 +18,8 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, runtimes, wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.trace.model.texts import patience_ns
 
@@ -31,8 +30,8 @@ _LAST: Any = object()
 
 
 def _no_stack() -> Any:
-    """Stand in for ``getcurrent`` while Python ends: greenlet is over by then, but objects of nodes
-    may still lock something when they go (``__del__``, handlers of ``logging``)."""
+    """Replace ``getcurrent`` while Python exits: greenlet is gone by then, but objects of nodes may
+    still lock something (``__del__``, handlers of ``logging``)."""
     return _LAST
 
 
@@ -45,25 +44,24 @@ def _forget_stacks() -> None:
 class SimLock:
     """Stands in for ``threading.Lock``.
 
-    As in CPython, a release wakes who has waited longest, and whoever runs may take the lock again
-    before that one comes. It then waits on, and is not overtaken a second time.
+    As in CPython, a release wakes the longest waiter, and the running thread may take the lock
+    before it does. The waiter then waits on, and is not overtaken a second time.
     """
 
     __slots__ = ("__weakref__", "_called", "_owner", "_taken", "_waits")
 
     def __new__(cls) -> Any:
-        return _thread.allocate_lock() if simulated_stacks() is None else object.__new__(cls)
+        return _thread.allocate_lock() if calling_runtime() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._taken = False
         self._owner: greenlet | None = None
-        self._waits: deque[tuple[Wait, bool]] = deque()
-        """Who waits, and whether it has been overtaken."""
-        self._called: Wait | None = None
-        """Who was woken by a release and has not come yet."""
+        self._waits: deque[tuple[BlockedCall, bool]] = deque()
+        """The waiters, and whether each was overtaken."""
+        self._called: BlockedCall | None = None
+        """The waiter that a release has woken and that has not run yet."""
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take the lock, waiting for it if need be; return whether it is ours now."""
         if not self._taken:
             self._taken = True
             self._owner = getcurrent()
@@ -77,9 +75,9 @@ class SimLock:
         return self._wait(timeout)
 
     def _wait(self, timeout: float) -> bool:
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is None and getcurrent is _no_stack:
-            return True  # nobody else is left who could have it
+            return True  # no other thread is left
         if stacks is None:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
@@ -90,20 +88,22 @@ class SimLock:
         overtaken = False
         while True:
             for_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
-            what = _Holder(stacks, self._owner, for_work=in_condition)
+            what = _LockHolder(stacks, self._owner, for_work=in_condition)
             if not self._turn(stacks, what, for_ns, overtaken=overtaken):
                 return False
-            if overtaken or not self._taken:  # left taken for us, or free
+            if overtaken or not self._taken:  # kept taken for this waiter, or free
                 self._taken = True
                 self._owner = getcurrent()
                 return True
             overtaken = True
 
-    def _turn(self, stacks: Stacks, what: _Holder, for_ns: int | None, *, overtaken: bool) -> bool:
-        """Wait until a release calls; return whether one did before the time was up."""
-        mine: list[Wait] = []
+    def _turn(
+        self, stacks: Runtime, what: _LockHolder, for_ns: int | None, *, overtaken: bool
+    ) -> bool:
+        """Wait until a release wakes this waiter; return False on a timeout."""
+        mine: list[BlockedCall] = []
 
-        def join(blocked: Wait) -> None:
+        def join(blocked: BlockedCall) -> None:
             mine.append(blocked)
             (self._waits.appendleft if overtaken else self._waits.append)((blocked, overtaken))
 
@@ -116,13 +116,12 @@ class SimLock:
                 self._called = None
             if not came:
                 self._waits = deque(one for one in self._waits if one[0].waiting)
-                if called and (overtaken or not self._taken):  # raised in: the next one may have it
+                if called and (overtaken or not self._taken):  # an exception: wake the next one
                     self._taken = True
                     self.release()
         return came
 
     def release(self) -> None:
-        """Give the lock up, and wake who has waited longest for it."""
         if not self._taken:
             raise RuntimeError("release unlocked lock")
         self._owner = None
@@ -135,11 +134,9 @@ class SimLock:
                 blocked.wake()
 
     def locked(self) -> bool:
-        """Return whether somebody has the lock."""
         return self._taken
 
     def is_mine(self) -> bool:
-        """Return whether the calling stack has the lock."""
         return self._taken and self._owner is getcurrent()
 
     def __enter__(self) -> bool:
@@ -152,11 +149,11 @@ class SimLock:
         self.__init__()  # type: ignore[misc]
 
 
-class LockOfPools:
-    """Stands in for the lock that all thread pools of a process share (``concurrent.futures``).
+class PoolLock:
+    """Stands in for the lock that all thread pools share (``concurrent.futures``).
 
-    A pool starts a worker while it has it, and the worker runs first: it may well want it, too.
-    Real threads keep ``real``.
+    A pool holds it while it starts a worker, which runs first and may need it, too. Real threads
+    use ``real``.
     """
 
     def __init__(self, real: Any) -> None:
@@ -165,19 +162,19 @@ class LockOfPools:
         self._own.__init__()  # type: ignore[misc]
 
     def __enter__(self) -> bool:
-        return bool((self._real if simulated_stacks() is None else self._own).acquire())
+        return bool((self._real if calling_runtime() is None else self._own).acquire())
 
     def __exit__(self, *exc: object) -> None:
         (self._own if self._own.is_mine() else self._real).release()
 
 
 class SimRLock:
-    """Stands in for ``threading.RLock``: whoever has it may take it again."""
+    """Stands in for ``threading.RLock``."""
 
     __slots__ = ("__weakref__", "_count", "_lock", "_owner")
 
     def __new__(cls) -> Any:
-        return _real_rlock() if simulated_stacks() is None else object.__new__(cls)
+        return _real_rlock() if calling_runtime() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._lock = SimLock()
@@ -185,7 +182,6 @@ class SimRLock:
         self._count = 0
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
-        """Take the lock once more, waiting for it if somebody else has it."""
         me = getcurrent()
         if self._owner is me:
             self._count += 1
@@ -197,7 +193,6 @@ class SimRLock:
         return True
 
     def release(self) -> None:
-        """Give the lock up once."""
         if self._owner is not getcurrent():
             raise RuntimeError("cannot release un-acquired lock")
         self._count -= 1
@@ -211,7 +206,7 @@ class SimRLock:
     def __exit__(self, *exc: object) -> None:
         self.release()
 
-    # What Condition asks of a lock.
+    # Methods that Condition uses.
 
     def _is_owned(self) -> bool:
         return self._owner is getcurrent()
@@ -266,11 +261,11 @@ def _reinit(self: SimLock) -> None:
 
 
 def _become_real() -> None:
-    """Have the locks of the simulation lock real threads: a forked process has no others.
+    """Let the locks of the simulation lock real threads: a forked process has no others.
 
-    A condition keeps bound methods of its lock, so it is their code that is exchanged.
+    A condition keeps bound methods of its lock, so their code is replaced.
     """
-    if world_exists():
+    if runtimes:
         kind: Any = SimLock
         for name, real in (
             ("acquire", _acquire),
@@ -284,20 +279,18 @@ def _become_real() -> None:
 os.register_at_fork(after_in_child=_become_real)
 
 
-class _Holder:
-    """Says who has a lock, when somebody asks: for the report of a deadlock."""
+class _LockHolder:
+    """Describes the holder of a lock, for the report of a deadlock."""
 
-    def __init__(self, stacks: Stacks, owner: greenlet | None, *, for_work: bool) -> None:
+    def __init__(self, stacks: Runtime, owner: greenlet | None, *, for_work: bool) -> None:
         self._stacks = stacks
         self._owner = owner
         self._me = getcurrent()
         self._for_work = for_work
 
     def is_idle(self) -> bool:
-        """Say whether a thread waits for work (a queue, an event) that may never come.
-
-        So does a main that leaves the work to threads which spin.
-        """
+        """Return whether a thread waits for work (a queue, an event) that may never come, or a main
+        whose threads spin."""
         stacks = self._stacks
         if not self._for_work or stacks.threads.runs_on(self._me):
             return self._for_work
@@ -309,13 +302,10 @@ class _Holder:
 
     def __str__(self) -> str:
         if self._for_work:
-            return "somebody to wake it (an event, a condition, a queue, a future)"
+            return "an event, a condition, a queue or a future"
         if self._owner is self._me:
             return "a lock that it holds itself"
         for blocked in self._stacks.runners.blocked:
             if blocked.stack is self._owner:
                 return f"a lock that is held by {blocked.describe()}"
-        return "a lock that nobody will release"
-
-
-__all__ = ["LockOfPools", "SimLock", "SimRLock"]
+        return "a lock that no thread will release"

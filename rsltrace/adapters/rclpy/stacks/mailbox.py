@@ -1,8 +1,8 @@
-"""What is ready to run of a node that an executor of the user's own runs.
+"""Mailboxes: the ready callbacks of nodes that an executor of user code runs.
 
-The loop runs the nodes of a job itself. A node that user code has given to an executor of its own
-(``rclpy.spin`` in a main, ``MultiThreadedExecutor``) runs only while that executor spins: the loop
-hands what is ready over to the node's mailbox, and the executor takes it from there.
+The loop runs the nodes of a job itself. The callbacks of a node that user code gave to an executor
+(``rclpy.spin`` in a main, ``MultiThreadedExecutor``) run only while that executor spins: the loop
+puts them into the node's mailbox, and the executor takes them out.
 """
 
 from __future__ import annotations
@@ -15,16 +15,13 @@ from typing import Any, Protocol
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.graph import Graph
 
-# What somebody waits for, in words: for the message when nothing can happen any more.
-
 
 def servers_text(servers: int) -> str:
-    """Return ``1 server``, ``0 servers``."""
     return f"{servers} server{'' if servers == 1 else 's'}"
 
 
-def awaited(graph: Graph, future: object) -> str:
-    """Say what would complete a future: the service it is a request to, if it is one."""
+def describe_awaited(graph: Graph, future: object) -> str:
+    """Describe what would complete a future, such as the response of a service."""
     if future is None:
         return "something that is not an rclpy Future"
     for client in graph.all_clients():
@@ -43,11 +40,11 @@ def awaited(graph: Graph, future: object) -> str:
         what: str = action.waits_for(future)
         if what:
             return what
-    return "a Future that nobody completes"
+    return "a Future that no callback completes"
 
 
-def called_service(graph: Graph, frame: FrameType | None) -> str:
-    """Say which service a stack waits for in ``Client.call``; empty if it is not there."""
+def describe_service_call(graph: Graph, frame: FrameType | None) -> str:
+    """Describe the service that a stack waits for in ``Client.call``; empty if it does not."""
     from rclpy.client import Client
 
     while frame is not None:
@@ -59,73 +56,75 @@ def called_service(graph: Graph, frame: FrameType | None) -> str:
     return ""
 
 
-class Runs(Protocol):
-    """A stack that spins."""
+class CallbackRunner(Protocol):
+    """A spinning stack."""
 
     def runs(self, mailbox: Mailbox, item: Dispatchable) -> bool:
-        """Run what is ready at once, if that is possible."""
+        """Run an item at once, if that is possible."""
 
 
-class Spinner(Protocol):
-    """The executor that empties a mailbox while it spins."""
+class SpinningExecutor(Protocol):
+    """The driver of an executor that takes from a mailbox."""
 
     executor: Any
 
     @property
-    def standby(self) -> Runs | None:
-        """The stack that spins, if it can be given what is ready."""
+    def standby(self) -> CallbackRunner | None:
+        """The spinning stack, if it can run an item at once."""
 
     def wake(self) -> None:
-        """Look again: something has come."""
+        """Look for items again."""
 
 
 class Mailbox:
-    """What is ready and has not run yet, each with its place in the order of all arrivals."""
+    """Ready items of one node, each with its place in the order of all arrivals."""
 
     def __init__(self, loop: EventLoop) -> None:
         self._next_place = loop.next_place
-        self.pump: Spinner | None = None
-        """The executor that has the node now."""
+        self.driver: SpinningExecutor | None = None
+        """The driver of the node's executor."""
         self.closed = False
-        """Whether the process the node lived in has ended: nothing of it runs any more."""
+        """Whether the node's process has ended."""
         self.entries: deque[tuple[int, Dispatchable]] = deque()
         self.raised: BaseException | None = None
-        """What has come out of the callback that the executor runs, which raises it."""
+        """The exception of a callback, which the executor raises."""
         self.admitted: Dispatchable | None = None
-        """What was taken out and runs now."""
+        """The item that was taken out and runs now."""
 
     def keeps(self, item: Dispatchable, leave: Callable[[], None] | None = None) -> bool:
-        """Keep what the loop dispatches, or have the executor run it at once; False if that has
-        taken it out and runs it now. ``leave`` is called if it is kept."""
+        """Keep an item that the loop dispatches (and call ``leave``), or run it on a spinning
+        stack.
+
+        Returns False if the executor has taken the item, so that it runs now.
+        """
         if self.admitted is item:
             self.admitted = None
             return False
-        pump = self.pump
-        if pump is not None and pump.standby is not None and pump.standby.runs(self, item):
+        driver = self.driver
+        if driver is not None and driver.standby is not None and driver.standby.runs(self, item):
             return True
         if leave is not None:
             leave()
         if not self.closed:
             self.entries.append((self._next_place(), item))
-            if pump is not None:
-                pump.wake()
+            if driver is not None:
+                driver.wake()
         return True
 
     def run(self, item: Dispatchable) -> None:
-        """Run what was taken out, on the stack of whoever calls this."""
+        """Run an item that was taken out, on the calling stack."""
         self.admitted = item
         item.dispatch()
         self.admitted = None
 
     def close(self) -> None:
-        """Run nothing any more."""
         self.closed = True
-        self.pump = None
+        self.driver = None
         self.entries.clear()
 
 
 def mailbox_of(handle: Any) -> Mailbox | None:
-    """Return the mailbox that an event's handle is run from, None if the loop itself runs it."""
+    """Return the mailbox of a handle, None if the loop itself runs it."""
     mailbox: Mailbox | None = getattr(handle, "mailbox", None)
     if mailbox is None and getattr(handle, "node", None) is not None:
         mailbox = getattr(handle.node, "mailbox", None)

@@ -1,36 +1,79 @@
-"""How a main begins and ends: by returning, by ``sys.exit``, by an exception, or with the run.
+"""Begin and end of mains: by returning, by ``sys.exit``, by an exception, or with the run.
 
-When the run is over, every main that still waits is told as ``ros2 launch`` tells a node: its
-contexts are shut down and the call that blocks raises ``KeyboardInterrupt``. What it does then
-(``finally`` blocks, joining threads) runs to its end, while simulated time stands still.
+When the run is over, waiting mains are interrupted as by ``ros2 launch``: contexts are shut down,
+and the blocking call raises ``KeyboardInterrupt``. ``finally`` blocks and joins of threads then run
+to their end, while simulated time stands still.
 """
 
 from __future__ import annotations
 
+import atexit
 import contextlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.callback_errors import exit_status
-from rsltrace.adapters.rclpy.stacks.exit_handlers import run_exit_handlers
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.starts import Construction
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime
+from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent
+from rsltrace.adapters.rclpy.stacks.program import ExitHandler, SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.failure import text_of
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 
+
+@contextmanager
+def own_exit_handlers(stacks: Runtime) -> Iterator[None]:
+    """Give each main its own ``atexit`` handlers, which run when it ends."""
+    real_register, real_unregister = atexit.register, atexit.unregister
+
+    def of_main() -> list[ExitHandler] | None:
+        if calling_runtime() is stacks and not stacks.programs.is_hosted:
+            return stacks.programs.present.exit_handlers
+        return None
+
+    def register(function: Any, /, *args: Any, **kwargs: Any) -> Any:
+        handlers = of_main()
+        if handlers is None:
+            return real_register(function, *args, **kwargs)
+        handlers.append((function, args, kwargs))
+        return function
+
+    def unregister(function: Any, /) -> None:
+        handlers = of_main()
+        if handlers is None:
+            real_unregister(function)
+        else:
+            handlers[:] = [handler for handler in handlers if handler[0] != function]
+
+    atexit.register, atexit.unregister = register, unregister
+    try:
+        yield
+    finally:
+        atexit.register, atexit.unregister = real_register, real_unregister
+
+
+def run_exit_handlers(program: SimulatedProgram) -> None:
+    """Run a main's exit handlers, the last first, as Python does."""
+    while program.exit_handlers:
+        function, args, kwargs = program.exit_handlers.pop()
+        function(*args, **kwargs)
+
+
 _EVERY_MAIN_ENDED = "every main has ended"
 _INTERRUPTED = 130
-"""What a shell shows of a process that SIGINT, and so ``KeyboardInterrupt``, has ended."""
+"""The exit status of a process that SIGINT has ended."""
 
 
-def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO_EVENT, 0)) -> None:
-    """Run a main until it ends or blocks for the first time, as one event; ``cause`` is the event
-    and output that it follows from."""
+def begin_program(
+    stacks: Runtime, program: SimulatedProgram, cause: tuple[int, int] = (NO_EVENT, 0)
+) -> None:
+    """Run a main until it ends or first blocks, as one event; ``cause``: its event and output."""
     entities = stacks.domain.entities
     program.begun_ns = stacks.loop.now_ns
     program.entity_id = entities.new_id()
@@ -38,7 +81,7 @@ def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO
 
     def body() -> None:
         program.enter()
-        event = Construction(program.describe, program.entry)
+        event = ConstructionEvent(program.describe, program.entry)
         stacks.dispatcher.run_outside(
             event,
             EventKind.CONSTRUCT,
@@ -55,7 +98,7 @@ def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO
     program.stack.switch()
 
 
-def _run(stacks: Stacks, program: Program) -> None:
+def _run(stacks: Runtime, program: SimulatedProgram) -> None:
     assert program.entry is not None
     error: BaseException | None = None
     stacks.programs.tell("started", program.entry.key)
@@ -72,15 +115,15 @@ def _run(stacks: Stacks, program: Program) -> None:
     end_program(stacks, program, error)
 
 
-def end_program(stacks: Stacks, program: Program, error: BaseException | None) -> None:
-    """Do what the end of a process does, within the last event of its main.
+def end_program(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> None:
+    """End a process, within the last event of its main.
 
-    An exception that nobody caught is raised again: it fails the run, except while that ends.
+    An uncaught exception is raised again and fails the run, unless the run is ending.
     """
     notes = stacks.domain.outcome.notes
     program.ended = True
     _stop_threads(stacks, program)
-    failed = _judge(stacks, program, error)
+    failed = _note_main_end(stacks, program, error)
     idle = [node.fully_qualified_name for node in _nodes(stacks, program) if node.wrapper is None]
     at = format_seconds(stacks.loop.now_ns)
     ending = stacks.ending
@@ -90,15 +133,15 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
             notes.append(f"{program.label} ended at {at} s without ever spinning{never}")
         else:
             notes.append(f"{program.label} ended at {at} s")
-    _vanish(stacks, program)
+    _destroy_nodes(stacks, program)
     if failed:
         assert error is not None
         raise error
     _has_ended(stacks, program)
 
 
-def _has_ended(stacks: Stacks, program: Program) -> None:
-    """Tell of the end of a process; with the last one the run may be over."""
+def _has_ended(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Announce the end of a process; with the last one the run may be over."""
     programs = stacks.programs
     assert program.entry is not None
     programs.tell("ended", program.entry.key)
@@ -110,8 +153,8 @@ def _has_ended(stacks: Stacks, program: Program) -> None:
         stacks.loop.stop(Stop(_EVERY_MAIN_ENDED))
 
 
-def crash_program(stacks: Stacks, program: Program) -> None:
-    """Let a process be gone in the event under way; nothing of it runs any more (``Victims``)."""
+def crash_program(stacks: Runtime, program: SimulatedProgram) -> None:
+    """End a process in the current event; ``FaultedNodes`` has stopped its nodes."""
     for context in program.contexts:
         context.end()
     program.ended = True
@@ -120,19 +163,17 @@ def crash_program(stacks: Stacks, program: Program) -> None:
     _has_ended(stacks, program)
 
 
-def _finish_process(stacks: Stacks, program: Program, error: BaseException | None) -> None:
-    """Do what Python does when main is over: wait for its threads, run its exit handlers.
-
-    A main that fails ends the run at once instead.
-    """
+def _finish_process(
+    stacks: Runtime, program: SimulatedProgram, error: BaseException | None
+) -> None:
+    """Wait for threads and run exit handlers, as Python does after main, unless main failed."""
     if error is None or isinstance(error, (SystemExit, KeyboardInterrupt)):
         _wait_for_threads(stacks, program)
         run_exit_handlers(program)
 
 
-def _wait_for_threads(stacks: Stacks, program: Program) -> None:
-    """Wait for all threads that are no daemons, as a process does when its main has returned; they
-    may start more of them meanwhile."""
+def _wait_for_threads(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Wait for all threads that are not daemons; they may start more meanwhile."""
     with contextlib.suppress(RunEnded, KeyboardInterrupt):
         while True:
             own = [t for t in stacks.threads.alive if t.program is program and not t.ended]
@@ -145,16 +186,16 @@ def _wait_for_threads(stacks: Stacks, program: Program) -> None:
                     thread.join(None)
 
 
-def _stop_threads(stacks: Stacks, program: Program) -> None:
-    """Unwind the threads that are left: they end with their process."""
+def _stop_threads(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Unwind the remaining threads."""
     for blocked in list(stacks.runners.blocked):
         if blocked.program is program:
             blocked.error = RunEnded()
             blocked.release()
 
 
-def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> bool:
-    """Take note of how main ended; return whether that fails the run."""
+def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseException | None) -> bool:
+    """Note how a main ended; return whether that fails the run."""
     if error is None or isinstance(error, RunEnded):
         return False
     notes = stacks.domain.outcome.notes
@@ -171,7 +212,7 @@ def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> boo
     if over:
         if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
             kind = type(error).__qualname__
-            notes.append(f"{program.label}, told to end, raised {kind}: {text_of(error)}")
+            notes.append(f"{program.label} raised {kind} at the end of the run: {text_of(error)}")
         return False
     return True
 
@@ -182,12 +223,12 @@ def _is_external_shutdown(error: BaseException) -> bool:
     return isinstance(error, ExternalShutdownException)
 
 
-def _nodes(stacks: Stacks, program: Program) -> list[Any]:
+def _nodes(stacks: Runtime, program: SimulatedProgram) -> list[Any]:
     return [node for node in stacks.domain.graph.nodes if node.process is program]
 
 
-def _vanish(stacks: Stacks, program: Program) -> None:
-    """Take a process's nodes out of the graph, as its end does."""
+def _destroy_nodes(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Take a process's nodes out of the graph."""
     for context in program.contexts:
         context.end()
     for node in _nodes(stacks, program):
@@ -198,8 +239,8 @@ def _vanish(stacks: Stacks, program: Program) -> None:
         node.destroy()
 
 
-def end_programs(stacks: Stacks) -> None:
-    """Tell every main that is still there to end, and let it."""
+def end_programs(stacks: Runtime) -> None:
+    """Interrupt every main that still runs, and let it end."""
     if stacks.ending.closing or not stacks.programs.all:
         return
     stacks.ending.closing = True
@@ -210,9 +251,9 @@ def end_programs(stacks: Stacks) -> None:
             _let_run(stacks, program)
 
 
-def interrupt(stacks: Stacks, program: Program) -> None:
-    """Do what SIGINT does to a process; the call that its main is in raises ``KeyboardInterrupt``
-    (who is in no call has to raise it)."""
+def interrupt(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Act as SIGINT on a process: the blocking call of its main raises ``KeyboardInterrupt``. (If
+    there is none, the caller raises it.)"""
     shut_down(stacks, program)
     blocked = next((one for one in stacks.runners.blocked if one.stack is program.stack), None)
     if blocked is not None:
@@ -220,8 +261,8 @@ def interrupt(stacks: Stacks, program: Program) -> None:
         blocked.release()
 
 
-def shut_down(stacks: Stacks, program: Program) -> None:
-    """Shut a process's contexts down from outside, as rclpy's handler of signals does."""
+def shut_down(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Shut a process's contexts down, as rclpy's signal handler does."""
     for context in program.contexts:
         context.end()
     for other in list(stacks.runners.blocked):
@@ -229,16 +270,16 @@ def shut_down(stacks: Stacks, program: Program) -> None:
             other.release()
 
 
-def _let_run(stacks: Stacks, program: Program) -> None:
-    """Let a program end that has been told to, as long as ros2 launch leaves it.
+def _let_run(stacks: Runtime, program: SimulatedProgram) -> None:
+    """Let an interrupted program end, for as long as ros2 launch waits.
 
-    Time stands still meanwhile: who sleeps goes on when nobody else can.
+    Time stands still meanwhile: a sleep is over when nothing else can run.
     """
     loop = stacks.loop
     stacks.ending.grace_ns = 0
     while not program.ended:
         item = loop.tasks.popleft() if loop.tasks else loop.ready.popleft() if loop.ready else None
-        if isinstance(item, Wait):
+        if isinstance(item, BlockedCall):
             stacks.runners.waiting.append(getcurrent())
             item.stack.switch()
         elif isinstance(item, SimThread):

@@ -1,8 +1,8 @@
-"""``os._exit``, signals to oneself and the like end the process of a node, which is everybody's.
+"""``os._exit``, ``os.abort``, signals to the own process and the like, called by nodes.
 
-So for the time of a run they end what they would end natively: one main with its threads, or,
-called by a node that the job constructs, the run. As natively, no ``finally`` block and no exit
-handler runs: the stacks are left where they are. The trace is whole, and says who did it.
+During a run they end one main with its threads or, called by a node that the job constructs, the
+run. As natively, no ``finally`` block and no exit handler runs: the stacks are abandoned. The trace
+is complete, and names the caller.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ import os
 import signal
 import sys
 import threading
+from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, getpid
+from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon, calling_runtime, getpid, runtimes
 from rsltrace.adapters.rclpy.stacks.mains import end_program, interrupt, shut_down
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.process_ids import meant_id
@@ -36,21 +36,19 @@ from rsltrace.simulation.middleware.events.failure import (
     text_of,
     user_traceback,
 )
+from rsltrace.terminal import tell
 from rsltrace.trace.model.event import OutputKind
 
-# Signal handlers that nodes set: each main keeps its own, as a process does, and ours stay.
-#
-# Ctrl-C, SIGTERM and SIGHUP end a run properly, whatever one of its nodes would do about them.
-# What a node sets for other signals (of an alarm, say) works, and is taken back when the run is
-# over, as are the alarms themselves. A handler that raises does so in the code of nodes alone:
-# what interrupts rsltrace itself ends the run.
+# Signal handlers: each main has its own, and rsltrace's stay in place. Ctrl-C, SIGTERM and SIGHUP
+# end a run, whatever handlers its nodes set. Handlers for other signals (alarms) work until the run
+# is over. A handler raises only in the code of nodes; if it interrupts rsltrace, it ends the run.
 
 _SIGNALS_ENDING = frozenset((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT))
 _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)
 
 
-class _Handler:
-    """A node's signal handler, which may interrupt anything."""
+class _SignalHandler:
+    """A node's signal handler; it may interrupt any code."""
 
     def __init__(self, domain: Domain, handler: Callable[[int, FrameType | None], Any]) -> None:
         self._domain = domain
@@ -59,7 +57,7 @@ class _Handler:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         loop, outcome = self._domain.loop, self._domain.outcome
         if loop.stopped is not None:
-            return  # an alarm that rings faster than it is heard would never let the run end
+            return  # a fast alarm would never let the run end
         try:
             self.handler(number, frame)
         except BaseException as error:
@@ -72,7 +70,7 @@ class _Handler:
 
 
 def _is_in_user_code(frame: FrameType | None) -> bool:
-    """Say whether an exception there would come out of a node's code, and not out of ours."""
+    """Return whether an exception in a frame would pass through a node's code first."""
     while frame is not None and not is_own_frame(frame):
         file = frame.f_code.co_filename
         if not file.startswith("<") and is_user_file(file):
@@ -82,20 +80,20 @@ def _is_in_user_code(frame: FrameType | None) -> bool:
 
 
 @contextmanager
-def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
-    """Keep the signal handlers of nodes apart from the process's within the ``with`` block."""
+def own_signal_handlers(stacks: Runtime) -> Iterator[None]:
+    """Give each main its own signal handlers within the ``with`` block."""
     before: dict[int, Any] = {}
 
     def set_handler(number: Any, handler: Any, /) -> Any:
-        if simulated_stacks() is not stacks:
+        if calling_runtime() is not stacks:
             return real_set(number, handler)
         if getcurrent() in stacks.threads.by_stack:
             raise ValueError("signal only works in main thread of the main interpreter")
         if number not in _SIGNALS_ENDING:
-            given = _Handler(stacks.domain, handler) if callable(handler) else handler
+            given = _SignalHandler(stacks.domain, handler) if callable(handler) else handler
             replaced = real_set(number, given)
             before.setdefault(number, replaced)
-            return _own(replaced)
+            return _node_handler(replaced)
         if not callable(handler) and handler not in (signal.SIG_DFL, signal.SIG_IGN):
             raise TypeError(
                 "signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object"
@@ -105,13 +103,13 @@ def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
         return replaced
 
     def get_handler(number: Any, /) -> Any:
-        if simulated_stacks() is stacks and number in stacks.programs.present.signal_handlers:
+        if calling_runtime() is stacks and number in stacks.programs.present.signal_handlers:
             return stacks.programs.present.signal_handlers[int(number)]
-        return _own(real_get(number))
+        return _node_handler(real_get(number))
 
     def set_wakeup(fd: int, /, **options: Any) -> Any:
-        """Asyncio wants a byte of every signal for its loop; those that end a run are not its."""
-        return -1 if simulated_stacks() is stacks else real_wakeup(fd, **options)
+        """Ignore asyncio's descriptor: signals that end a run are not for its loop."""
+        return -1 if calling_runtime() is stacks else real_wakeup(fd, **options)
 
     with ExitStack() as stack:
         stack.callback(_put_back, before)
@@ -131,12 +129,12 @@ def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
         yield
 
 
-def _own(handler: Any) -> Any:
-    return handler.handler if isinstance(handler, _Handler) else handler
+def _node_handler(handler: Any) -> Any:
+    return handler.handler if isinstance(handler, _SignalHandler) else handler
 
 
 def _end_timers(armed: set[int]) -> None:
-    """End the alarms that nodes have set: nobody is left who would handle them."""
+    """End the alarms that nodes have set."""
     for timer in _TIMERS:
         if timer not in armed and signal.getitimer(timer)[0]:
             signal.setitimer(timer, 0)
@@ -152,12 +150,12 @@ def _put_back(handlers: dict[int, Any]) -> None:
 _DEADLY = (signal.SIGKILL, signal.SIGABRT)
 _ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _real: dict[str, Callable[..., Any]] = {}
-"""What the functions did before the run, which may be the guard's doing."""
+"""The functions before the run (perhaps the guard's)."""
 
 
 @contextmanager
-def own_process_ends(stacks: Stacks) -> Iterator[None]:
-    """Let nodes end their process, and not ours, within the ``with`` block."""
+def own_process_ends(stacks: Runtime) -> Iterator[None]:
+    """Let nodes end their simulated process only, within the ``with`` block."""
     targets: list[tuple[Any, Callable[..., Any]]] = [
         (os._exit, _exit),
         (os.abort, _abort),
@@ -178,39 +176,39 @@ def own_process_ends(stacks: Stacks) -> Iterator[None]:
 
 
 def _exit(status: int) -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None:
         _real["_exit"](status)
     else:
-        _leave(stacks, f"os._exit({status})", status & 0xFF)
+        _end_process(stacks, f"os._exit({status})", status & 0xFF)
 
 
 def _abort() -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None:
         _real["abort"]()
     else:
-        _leave(stacks, "os.abort()", 128 + signal.SIGABRT)
+        _end_process(stacks, "os.abort()", 128 + signal.SIGABRT)
 
 
 def _kill(pid: int, number: int, /) -> None:
     pid = meant_id(pid)
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None or pid != getpid() or not _signalled(stacks, number, "os.kill"):
         _real["kill"](pid, number)
 
 
 def _raise_signal(signalnum: int) -> None:
-    stacks = _calling()
+    stacks = _calling_node_runtime()
     if stacks is None or not _signalled(stacks, signalnum, "signal.raise_signal"):
         _real["raise_signal"](signalnum)
 
 
-def _signalled(stacks: Stacks, number: int, call: str) -> bool:
-    """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
+def _signalled(stacks: Runtime, number: int, call: str) -> bool:
+    """Act as a signal to the own process; return False to send the real signal."""
     handler = stacks.programs.present.signal_handlers.get(number)
     if number in _DEADLY or handler == signal.SIG_DFL:
-        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+        _end_process(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     if handler is None:
         return _signalled_by_default(stacks, number, call)
     if callable(handler):
@@ -218,8 +216,8 @@ def _signalled(stacks: Stacks, number: int, call: str) -> bool:
     return True
 
 
-def _signalled_by_default(stacks: Stacks, number: int, call: str) -> bool:
-    """Do what Python and rclpy do about a signal for which a main has set no handler."""
+def _signalled_by_default(stacks: Runtime, number: int, call: str) -> bool:
+    """Act as Python and rclpy on a signal for which a main has no handler."""
     program = stacks.programs.present
     if program is stacks.programs.host or number not in _ENDING:
         return False
@@ -230,7 +228,7 @@ def _signalled_by_default(stacks: Stacks, number: int, call: str) -> bool:
     elif number == signal.SIGTERM and any(context.ok() for context in program.contexts):
         shut_down(stacks, program)
     else:
-        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+        _end_process(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     return True
 
 
@@ -245,25 +243,25 @@ def _execve(path: Any, argv: Any, env: Any) -> None:
 
 
 def _refuse(call: str) -> None:
-    if _calling() is not None:
+    if _calling_node_runtime() is not None:
         raise UnsupportedError(
-            f"{call} would put another program in the place of this process, in which all nodes of "
-            "the run are: end the node instead (sys.exit), or start the program with subprocess"
+            f"{call} would replace this process, in which all nodes of the run are: end the node "
+            "instead (sys.exit), or start the program with subprocess"
         )
 
 
-def _calling() -> Stacks | None:
-    """Return the world whose node calls, or None if the process is to do what it is told."""
-    stacks = simulated_stacks()
+def _calling_node_runtime() -> Runtime | None:
+    """Return the runtime of the calling node, None if no node calls."""
+    stacks = calling_runtime()
     return stacks if stacks is not None and stacks.event.handle is not None else None
 
 
-def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
-    """End the process of the calling code: the program, or the run."""
+def _end_process(stacks: Runtime, call: str, status: int) -> NoReturn:
+    """End the simulated process of the calling code, or the run."""
     handle = stacks.event.handle
     assert handle is not None
     if stacks.ending.unwinding or stacks.ending.closing or getcurrent() is stacks.runners.main:
-        raise RunEnded  # it is ending anyway, and somebody needs this stack
+        raise RunEnded  # it is ending anyway, and this stack is needed
     program = stacks.programs.present
     if program is stacks.programs.host:
         stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, status)
@@ -284,4 +282,29 @@ def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
         _set_running_loop(None)
     abandon(getcurrent())
     stacks.runners.next().switch()
-    raise AssertionError("nobody goes back to a stack that was left")
+    raise AssertionError("an abandoned stack was resumed")
+
+
+# A process that a node forks ends with the callback that forked it: only the parent runs the
+# simulation and writes the trace. Natively it would go on as a second copy of every node.
+
+
+def _in_child() -> None:
+    for stacks in runtimes:
+        if stacks.event.handle is not None and stacks.runners.thread == get_ident():
+            stacks.dispatcher.record(None)
+            stacks.event.on_end = lambda stacks=stacks: _end(stacks)
+
+
+def _end(stacks: Runtime) -> None:
+    who = stacks.event.handle.describe() if stacks.event.handle is not None else "a node"
+    with suppress(Exception):
+        sys.stdout.flush()
+        tell(
+            f"rsltrace: note: ended a process that {who} forked: only the parent process runs the "
+            "simulation"
+        )
+    os._exit(1)
+
+
+os.register_at_fork(after_in_child=_in_child)

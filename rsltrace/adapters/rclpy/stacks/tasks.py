@@ -1,4 +1,4 @@
-"""Tasks with rclpy's semantics: ``create_task``, and callbacks that are ``async def``."""
+"""Callbacks that are ``async def``, and ``create_task``, with rclpy's semantics."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.trace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)
@@ -19,10 +19,7 @@ _is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
 
 
 def is_coroutine_function(callback: object) -> bool:
-    """Return whether calling ``callback`` gives a coroutine; about a function, look only once.
-
-    Looking costs a microsecond, and more where an audit hook is told of each look at code.
-    """
+    """Return whether calling ``callback`` gives a coroutine; cached, as ``inspect`` is slow."""
     function = callback.__func__ if type(callback) is MethodType else callback
     if type(function) is not FunctionType:
         return inspect.iscoroutinefunction(callback)
@@ -32,21 +29,38 @@ def is_coroutine_function(callback: object) -> bool:
     return known
 
 
-def is_awaited(stacks: Stacks, callback: object) -> bool:
-    """Return whether a callback is run as a coroutine: it is one, or user code has its own way."""
+def is_awaited(stacks: Runtime, callback: object) -> bool:
+    """Return whether a callback runs as a coroutine: it is one, or ``await_or_execute`` was
+    replaced."""
     return stacks.runs_callbacks is not None or is_coroutine_function(callback)
 
 
-def executor_of(stacks: Stacks, handle: Any) -> Any:
-    """Return the executor that runs a handle's node: the user's own, or the run's."""
+def executor_of(stacks: Runtime, handle: Any) -> Any:
+    """Return the executor of a handle's node: one of user code, or the run's."""
     mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
-    if mailbox is not None and mailbox.pump is not None:
-        return mailbox.pump.executor
+    if mailbox is not None and mailbox.driver is not None:
+        return mailbox.driver.executor
     return stacks.executor
 
 
+def run_callback(
+    stacks: Runtime,
+    handle: Any,
+    kind: int,
+    callback: Callable[..., Any],
+    args: tuple[Any, ...],
+    *cause: int,
+) -> None:
+    """Run an entity's callback as one event. (Hot paths look up ``is_awaited`` once instead.)"""
+    if is_awaited(stacks, callback):
+        start_callback(stacks, handle, kind, callback, args, *cause)
+    else:
+        execute = stacks.dispatcher.execute
+        execute(handle, handle.entity_id, handle.node, kind, callback, args, *cause)
+
+
 def start_callback(
-    stacks: Stacks,
+    stacks: Runtime,
     handle: Any,
     kind: int,
     callback: Callable[..., Any],
@@ -60,7 +74,7 @@ def start_callback(
 
 
 def start_coroutine(
-    stacks: Stacks,
+    stacks: Runtime,
     handle: Any,
     kind: int,
     callback: Callable[..., Any],
@@ -69,7 +83,7 @@ def start_coroutine(
     cause_output: int,
     input_hash: int,
 ) -> None:
-    """Run an entity's ``async def`` callback up to its first suspension, as one event."""
+    """Run an entity's ``async def`` callback until it first suspends, as one event."""
     from rclpy.task import Task
 
     wrapper = handle.wrapper
@@ -90,11 +104,11 @@ def start_coroutine(
     if run.mailbox is None:
         run.dispatch()
     else:
-        run.mailbox.run(run)  # the executor has it under way already
+        run.mailbox.run(run)  # its executor has taken it already
 
 
 def create_task(
-    stacks: Stacks,
+    stacks: Runtime,
     callback: Any,
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
@@ -102,9 +116,9 @@ def create_task(
     executor: Any = None,
     mailbox: Mailbox | None = None,
 ) -> Any:
-    """Make a Task that runs right after the present event; it belongs to that event's entity.
+    """Make a Task of the current event's entity that runs right after the event.
 
-    ``executor`` runs it: one of the user's own takes it from ``mailbox``, None is the run's.
+    A user's ``executor`` takes it from ``mailbox``; None is the run's own executor.
     """
     from rclpy.task import Task
 

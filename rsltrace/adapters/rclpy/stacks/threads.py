@@ -1,11 +1,9 @@
-"""Threads that user code starts run as cooperative ones, in the one thread of the simulation.
+"""Threads of user code run cooperatively, in the one real thread of the simulation.
 
-A thread is a stack of its own that runs until it blocks or spins; then somebody else goes on. As
-CPython's, ``Thread.start`` waits until the thread has begun, and goes on when that blocks; a thread
-of ``start_new_thread`` begins after the event that started it. ``threading``, ``queue`` and
-``concurrent.futures`` stay what they are: only ``Thread.start`` and its like, and the locks below
-everything, are exchanged while a run lasts. What real threads (of libraries in C) start or lock
-stays real.
+A thread is a stack that runs until it blocks or spins. As in CPython, ``Thread.start`` waits until
+the thread has begun; a thread of ``start_new_thread`` begins after the event that started it. In
+``threading``, ``queue`` and ``concurrent.futures`` only ``Thread.start`` and similar functions and
+the locks are replaced during a run. Threads and locks of C libraries stay real.
 """
 
 from __future__ import annotations
@@ -28,14 +26,14 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.locks import LockOfPools, SimLock, SimRLock
-from rsltrace.adapters.rclpy.stacks.runners import RunEnded, Stacks, Wait
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
-from rsltrace.adapters.rclpy.stacks.starts import Construction
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent
+from rsltrace.adapters.rclpy.stacks.locks import PoolLock, SimLock, SimRLock
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.libraries import present_import
+from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.interface import source_of
@@ -55,11 +53,11 @@ _real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
 
 
 class SimThread:
-    """One thread of the simulation. It is dispatched once, to begin."""
+    """A simulated thread; the loop dispatches it once, to begin."""
 
     def __init__(
         self,
-        stacks: Stacks,
+        stacks: Runtime,
         body: Callable[[], object],
         name: str,
         *,
@@ -80,8 +78,8 @@ class SimThread:
         self.entity_id = stacks.domain.entities.new_id()
         stacks.domain.entities.pending.append(self)
         self._body: Callable[[], object] | None = body
-        self._joining: list[Wait] = []
-        self._starting: Wait | None = None
+        self._joining: list[BlockedCall] = []
+        self._starting: BlockedCall | None = None
         self._cause = (
             stacks.loop.events,
             stacks.dispatcher.note(OutputKind.TASK, self.entity_id, 3),
@@ -91,22 +89,22 @@ class SimThread:
         stacks.loop.tasks.append(self)
 
     def overtake(self) -> None:
-        """Begin before those of the same process that were woken and have not gone on yet.
+        """Begin before threads of the same process that were woken and have not run yet.
 
-        As in CPython, where whoever starts a thread waits for it at once: a new thread is there
-        sooner than the kernel has woken another.
+        As in CPython, where the starter waits for a new thread at once: it begins before the kernel
+        has woken another.
         """
         tasks = self.stacks.loop.tasks
         woken: list[Any] = []
         tasks.pop()
-        while len(tasks) and self._goes_on_later(tasks[-1]):
+        while len(tasks) and self._was_woken(tasks[-1]):
             woken.append(tasks.pop())
         tasks.extend((self, *reversed(woken)))
 
     # -- the loop's view -------------------------------------------------------------------------
 
-    def _goes_on_later(self, task: object) -> bool:
-        return isinstance(task, Wait) and task.program is self.program
+    def _was_woken(self, task: object) -> bool:
+        return isinstance(task, BlockedCall) and task.program is self.program
 
     def dispatch(self) -> None:
         """Run the thread until it ends or blocks for the first time, as one event."""
@@ -131,7 +129,7 @@ class SimThread:
             self.program.enter()
         cause_event, cause_output = self._cause
         stacks.dispatcher.execute(
-            Construction(self.describe, self.program.entry),
+            ConstructionEvent(self.describe, self.program.entry),
             self.entity_id,
             self.node,
             int(EventKind.TASK),
@@ -162,21 +160,21 @@ class SimThread:
             self.end()
 
     def wait_for_begin(self) -> None:
-        """Let the thread run until it blocks, or ends: whoever starts it goes on after that.
+        """Let the thread run until it blocks or ends, before its starter goes on.
 
-        Where nobody can wait (while modules are imported, when the run is over) it begins later.
+        If the starter cannot wait (at import, or after the run) the thread begins later.
         """
         stacks = self.stacks
         if stacks.event.handle is None or stacks.ending.unwinding or self.program.ended:
             return
 
-        def begun(blocked: Wait) -> None:
+        def begun(blocked: BlockedCall) -> None:
             self._starting = blocked
 
         wait(stacks, f"thread {self.name} to begin", until=begun, quiet=True)
 
     def end(self) -> None:
-        """Take note that the thread has ended: whoever joins it goes on."""
+        """Mark the thread as ended, and wake the threads that join it."""
         self.ended = True
         self._body = None
         self.stacks.threads.alive.pop(self, None)
@@ -186,14 +184,13 @@ class SimThread:
             blocked.wake()
 
     def dismiss(self) -> None:
-        """Let the worker of a pool end when it has done its work, as Python does at its end."""
+        """Let the worker of a pool end after its work, as Python does at exit."""
         if getattr(self.thread, "_target", None) is _pool_worker:
             pool = self.thread._args[0]()  # type: ignore[union-attr]
             if pool is not None:
                 pool.shutdown(wait=False)
 
     def describe(self) -> str:
-        """Name the thread for people."""
         where = self.program.name if self.node is None else self.node.fully_qualified_name
         return f"{where}: thread {self.name}"
 
@@ -201,33 +198,24 @@ class SimThread:
         """Wait in simulated time until the thread has ended."""
         if not self.ended:
             for_ns = None if timeout is None else max(patience_ns(timeout), 0)
-            what = f"thread {self.name} to end"
-            wait(
-                self.stacks,
-                what,
-                until=self._joining.append,
-                for_ns=for_ns,
-                patient=self.is_patient,
-            )
+            what, until = f"thread {self.name} to end", self._joining.append
+            wait(self.stacks, what, until=until, for_ns=for_ns, patient=self.is_patient)
             self._joining = [blocked for blocked in self._joining if blocked.waiting]
 
     def is_patient(self) -> bool:
-        """Return whether the thread waits for what may never come, so that a join may, too."""
+        """Return whether the thread may wait for ever, so that a join may, too."""
         own = [blocked for blocked in self.stacks.runners.blocked if blocked.stack is self.stack]
         return any(blocked.is_patient() for blocked in own)
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(self.node, self.describe())
 
     # -- the trace -------------------------------------------------------------------------------
 
     def settle(self) -> bool:
-        """Return whether the owner is known."""
         return True
 
     def entity(self) -> Entity:
-        """Return the thread as the trace describes it."""
         node = self.node.entity_id if self.node is not None else 0
         now_ns = self.stacks.loop.now_ns
         source = source_of(
@@ -237,11 +225,11 @@ class SimThread:
         return Entity(self.entity_id, node, EntityKind.THREAD, self.name, "", now_ns, detail)
 
 
-# -- what stands in for Python's own functions -------------------------------------------------
+# -- replacements of Python's functions --------------------------------------------------------
 
 
 def _start(self: Any) -> None:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None or not getattr(self, "_initialized", False):
         _real["start"](self)
         return
@@ -249,17 +237,17 @@ def _start(self: Any) -> None:
         raise RuntimeError("threads can only be started once")
     library = present_import()
     if library is not None and isinstance(self, threading.Timer):
-        # Most warn of an import that takes long (to build a cache, the first time).
+        # Most warn of a slow import (that builds a cache, the first time).
         self.__dict__["_rsltrace_late"] = partial(_begin, stacks, self)
         library.at_end.append(partial(_start_late, self, sys._getframe(1)))
         return
     if library is not None:
-        _tell_of_import(self, sys._getframe(1))
+        _report_import_thread(self, sys._getframe(1))
     _begin(stacks, self)
 
 
-def _tell_of_import(thread: Any, frame: FrameType) -> None:
-    """Report a thread that a library starts while it is imported: another time it may not."""
+def _report_import_thread(thread: Any, frame: FrameType) -> None:
+    """Report a thread that a library starts at import: the next import may start none."""
     guard = engaged()
     if guard is not None and guard.mode(Source.THREAD, frame) is not Mode.ALLOW:
         call = f"threading.Thread.start() while {module_of(frame)} is imported"
@@ -267,7 +255,7 @@ def _tell_of_import(thread: Any, frame: FrameType) -> None:
 
 
 def _start_late(timer: Any, frame: FrameType | None = None) -> None:
-    """Start a timer of an import that is over, unless somebody has cancelled it by now."""
+    """Start a timer of an import that is over, unless it was cancelled."""
     begin = timer.__dict__.pop("_rsltrace_late", None)
     if begin is None:
         return
@@ -276,11 +264,11 @@ def _start_late(timer: Any, frame: FrameType | None = None) -> None:
         timer._ident = timer._native_id = 0
         _mark_stopped(timer)
     else:
-        _tell_of_import(timer, frame or sys._getframe(1))
+        _report_import_thread(timer, frame or sys._getframe(1))
         begin()
 
 
-def _begin(stacks: Stacks, self: Any) -> None:
+def _begin(stacks: Runtime, self: Any) -> None:
     def body() -> None:
         try:
             self.run()
@@ -288,7 +276,7 @@ def _begin(stacks: Stacks, self: Any) -> None:
             raise
         except BaseException:
             if threading.excepthook is not _default_hook:
-                _tell_hook(self)
+                _call_excepthook(self)
                 return
             raise
         finally:
@@ -306,12 +294,12 @@ def _begin(stacks: Stacks, self: Any) -> None:
 _default_hook = threading.excepthook
 
 
-def _tell_hook(thread: Any) -> None:
+def _call_excepthook(thread: Any) -> None:
     threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), thread)))
 
 
 def _mark_stopped(thread: Any) -> None:
-    """Let the real ``Thread`` know, for whoever asks after the run."""
+    """Mark the real ``Thread`` as stopped, for code that asks after the run."""
     threading._active.pop(thread._ident, None)  # type: ignore[attr-defined]
     if hasattr(thread, "_is_stopped"):
         thread._is_stopped = True
@@ -324,7 +312,7 @@ def _mark_stopped(thread: Any) -> None:
 def _join(self: Any, timeout: float | None = None) -> None:
     _start_late(self)
     thread: SimThread | None = self.__dict__.get("_rsltrace")
-    if thread is None or simulated_stacks() is not thread.stacks:
+    if thread is None or calling_runtime() is not thread.stacks:
         if thread is None:
             _real["join"](self, timeout)
         return
@@ -341,7 +329,7 @@ def _is_alive(self: Any) -> bool:
 
 
 def _get_ident() -> int:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is not None and stacks.threads.by_stack:
         thread = stacks.threads.by_stack.get(getcurrent())
         if thread is not None:
@@ -352,7 +340,7 @@ def _get_ident() -> int:
 def _start_new_thread(
     function: Callable[..., object], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> int:
-    stacks = simulated_stacks()
+    stacks = calling_runtime()
     if stacks is None:
         return _real_start_new_thread(function, args, kwargs or {})
     name = getattr(function, "__qualname__", "function")
@@ -361,8 +349,8 @@ def _start_new_thread(
 
 
 @contextmanager
-def cooperative_threads(stacks: Stacks) -> Iterator[None]:
-    """Make the threads that user code starts cooperative ones within the ``with`` block."""
+def cooperative_threads(stacks: Runtime) -> Iterator[None]:
+    """Simulate the threads that user code starts within the ``with`` block."""
 
     def now() -> float:
         return stacks.loop.now_ns / _NS_PER_S
@@ -387,15 +375,14 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (
             futures_thread,
             "_global_shutdown_lock",
-            LockOfPools(futures_thread._global_shutdown_lock),
+            PoolLock(futures_thread._global_shutdown_lock),
         ),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
         rebound = {id(getattr(place, name)): value for place, name, value in replaced[3:]}
         for place, name, value in replaced:
-            stack.callback(setattr, place, name, getattr(place, name))
-            setattr(place, name, value)
+            replace_attribute(stack, place, name, value)
         _rebind(stack, rebound)
         _number(stack, _Thread)
         _number(stack, futures_base.Future)
@@ -414,23 +401,23 @@ def _count() -> int:
 
 
 def _numbers(first: int = 1) -> Callable[[], int]:
-    """Return what numbers threads: those of a library's import apart from the run's."""
+    """Return a counter of threads, with other numbers for those of a library's import."""
     own, of_imports = itertools.count(first), itertools.count(_FIRST_OF_IMPORTS)
     return lambda: next(own if present_import() is None else of_imports)
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Say whether a log record of a thread pool is more than the end of a run in its workers."""
+    """Return whether a thread pool's log record is about anything but the end of the run."""
     return not (record.exc_info and record.exc_info[0] is RunEnded)
 
 
 def _number(stack: ExitStack, cls: Any) -> None:
-    """Hash the objects of a class by the order of creation: the library keeps them in sets."""
+    """Hash the objects of a class by their creation order: the library keeps them in sets."""
     number = _numbers()
     real_init = cls.__init__
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
-        if simulated_stacks() is not None:
+        if calling_runtime() is not None:
             self._rsltrace_number = number()
         real_init(self, *args, **kwargs)
 
@@ -443,15 +430,11 @@ def _number(stack: ExitStack, cls: Any) -> None:
 
 
 def _rebind(stack: ExitStack, values: dict[int, Any]) -> None:
-    """Exchange what users' modules have bound before the run: ``from threading import Lock``."""
+    """Replace names that modules of user code imported before the run."""
     for module in list(sys.modules.values()):
         file = getattr(module, "__file__", None)
         if not file or not is_user_file(file):
             continue
         for name, value in list(vars(module).items()):
             if callable(value) and id(value) in values:
-                stack.callback(setattr, module, name, value)
-                setattr(module, name, values[id(value)])
-
-
-__all__ = ["SimThread", "cooperative_threads"]
+                replace_attribute(stack, module, name, values[id(value)])

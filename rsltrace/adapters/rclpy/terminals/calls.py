@@ -1,5 +1,4 @@
-"""Calls that read from a terminal: ``input``, ``os.read``, ``select``; and whose terminal is
-descriptor 0."""
+"""Replaces calls that read from a terminal: ``input``, ``os.read``, ``select``, curses."""
 
 from __future__ import annotations
 
@@ -13,23 +12,21 @@ from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.program import Program
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
-from rsltrace.adapters.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import exchange
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.trace.model.texts import patience_ns
 
-# ``sys.stdin`` of those whom the job gives no terminal: reading from it is an error.
-
 _DEBUGGERS = ("bdb", "cmd", "code", "pdb", "IPython", "prompt_toolkit", "debugpy", "pydevd")
 
 
 class NoTerminal:
-    """Is the real stream to whoever drives the run, and to debuggers."""
+    """The ``sys.stdin`` of nodes without a terminal: reading is an error, except for debuggers and
+    code outside of nodes, which read the real stream."""
 
     def __init__(self, real: Any) -> None:
         self._real = real
@@ -39,51 +36,48 @@ class NoTerminal:
 
     @property
     def buffer(self) -> NoTerminal:
-        """The stream of bytes below."""
         return NoTerminal(self._real.buffer)
 
     def read(self, *arguments: Any) -> Any:
         """Read all, or so much."""
-        refuse("sys.stdin.read()")
+        refuse_reading("sys.stdin.read()")
         return self._real.read(*arguments)
 
     def readline(self, *arguments: Any) -> Any:
-        """Read a line."""
-        refuse("sys.stdin.readline()")
+        refuse_reading("sys.stdin.readline()")
         return self._real.readline(*arguments)
 
     def readlines(self, *arguments: Any) -> Any:
-        """Read all lines."""
-        refuse("sys.stdin.readlines()")
+        refuse_reading("sys.stdin.readlines()")
         return self._real.readlines(*arguments)
 
     def __iter__(self) -> Iterator[Any]:
-        refuse("for line in sys.stdin")
+        refuse_reading("for line in sys.stdin")
         return iter(self._real)
 
     def __next__(self) -> Any:
-        refuse("next(sys.stdin)")
+        refuse_reading("next(sys.stdin)")
         return next(self._real)
 
 
-def refuse(call: str) -> None:
-    """Raise ``UnsupportedError`` if a node's code reads (and no debugger in it)."""
-    stacks = simulated_stacks()
+def refuse_reading(call: str) -> None:
+    """Raise ``UnsupportedError`` if a node's code reads, but no debugger."""
+    stacks = calling_runtime()
     if stacks is None or stacks.event.handle is None or _is_debugged(sys._getframe(2)):
         return
     _fail(stacks, call)
 
 
-def _fail(stacks: Stacks, call: str) -> NoReturn:
+def _fail(stacks: Runtime, call: str) -> NoReturn:
     program = stacks.programs.present
     if program.entry is None:
         raise UnsupportedError(
-            f"{call}: a 'node' of a job has no terminal to read from: make it a function that "
-            "spins it (main:), and give that entry what is typed: stdin: [...]"
+            f"{call}: a 'node' of a job has no terminal: write a function that spins it (main:), "
+            "and give that entry its input: stdin: [...]"
         )
     raise UnsupportedError(
-        f"{call}: {program.label} reads from its terminal, and the job does not say what is typed "
-        "there: give its entry a file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
+        f"{call}: {program.label} reads from its terminal, but its entry has no stdin: give it a "
+        "file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
     )
 
 
@@ -95,24 +89,22 @@ def _is_debugged(frame: FrameType | None) -> bool:
     return False
 
 
-# curses reads keys in C: who waits for one waits in simulated time before that.
-
 _READS = ("getch", "getkey", "get_wch", "getstr")
 _NS_PER_MS = 1_000_000
 _FOR_EVER = -1
 _NO_KEY = -1
 
-Asking = Callable[[], "Terminal | None"]
+TerminalOfCaller = Callable[[], "Terminal | None"]
 """Returns the terminal of the main whose code runs."""
 
 
-Showing = Callable[[Terminal, bool], None]
-"""Makes a terminal the main's standard output, or no longer."""
+ShowTerminal = Callable[[Terminal, bool], None]
+"""Makes a terminal the main's standard output (True), or not (False)."""
 
 
 @contextmanager
-def simulated_curses(asking: Asking, show: Showing) -> Iterator[None]:
-    """Let windows of curses wait in simulated time within the ``with`` block."""
+def simulated_curses(caller_terminal: TerminalOfCaller, show: ShowTerminal) -> Iterator[None]:
+    """Let curses wait for keys in simulated time within the ``with`` block."""
     try:
         import _curses
     except ImportError:  # Python can be built without it
@@ -123,24 +115,26 @@ def simulated_curses(asking: Asking, show: Showing) -> Iterator[None]:
     limit = _curses.window.timeout
     with ExitStack() as stack:
         for name in _READS:
-            making = partial(_reading, asking, limits_ms, all_ms, limit)
+            making = partial(_reading, caller_terminal, limits_ms, all_ms, limit)
             exchange(stack, _curses.window, name, making)
-        exchange(stack, _curses.window, "refresh", partial(_drained, asking))
+        exchange(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
         exchange(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
         exchange(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
-        redirect(stack, _curses.doupdate, partial(_drained, asking))
+        redirect(stack, _curses.doupdate, partial(_drained, caller_terminal))
         redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
         for function in (_curses.setupterm, _curses.initscr):
-            redirect(stack, function, partial(_beginning, asking, show))
-        redirect(stack, _curses.endwin, partial(_ending, asking, show))
+            redirect(stack, function, partial(_beginning, caller_terminal, show))
+        redirect(stack, _curses.endwin, partial(_ending, caller_terminal, show))
         yield
 
 
-def _beginning(asking: Asking, show: Showing, real: Callable[..., Any]) -> Callable[..., Any]:
+def _beginning(
+    caller_terminal: TerminalOfCaller, show: ShowTerminal, real: Callable[..., Any]
+) -> Callable[..., Any]:
     def begin(*arguments: Any, **options: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is None:
-            refuse(f"curses.{real.__name__}()")
+            refuse_reading(f"curses.{real.__name__}()")
         else:
             show(terminal, True)
         return real(*arguments, **options)
@@ -148,12 +142,14 @@ def _beginning(asking: Asking, show: Showing, real: Callable[..., Any]) -> Calla
     return begin
 
 
-def _ending(asking: Asking, show: Showing, real: Callable[[], Any]) -> Callable[[], Any]:
+def _ending(
+    caller_terminal: TerminalOfCaller, show: ShowTerminal, real: Callable[[], Any]
+) -> Callable[[], Any]:
     def end() -> Any:
         try:
             return real()
         finally:
-            terminal = asking()
+            terminal = caller_terminal()
             if terminal is not None:
                 terminal.drain()
                 show(terminal, False)
@@ -161,11 +157,11 @@ def _ending(asking: Asking, show: Showing, real: Callable[[], Any]) -> Callable[
     return end
 
 
-def _drained(asking: Asking, real: Any) -> Any:
-    """Let something be shown, which is for nobody to see."""
+def _drained(caller_terminal: TerminalOfCaller, real: Any) -> Any:
+    """Discard what is shown."""
 
     def shown(*arguments: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is not None:
             terminal.drain()
         return real(*arguments)
@@ -174,14 +170,18 @@ def _drained(asking: Asking, real: Any) -> Any:
 
 
 def _reading(
-    asking: Asking, limits_ms: dict[int, int], all_ms: list[int], limit: Any, real: Any
+    caller_terminal: TerminalOfCaller,
+    limits_ms: dict[int, int],
+    all_ms: list[int],
+    limit: Any,
+    real: Any,
 ) -> Any:
     name = real.__name__
 
     def read(self: Any, *arguments: Any) -> Any:
-        terminal = asking()
+        terminal = caller_terminal()
         if terminal is None:
-            refuse(f"curses: {name}()")
+            refuse_reading(f"curses: {name}()")
             return real(self, *arguments)
         terminal.drain()
         limit_ms = limits_ms.get(id(self), all_ms[0])
@@ -201,8 +201,7 @@ def _reading(
 
 
 def _taken_already(get: Callable[[], Any]) -> Any:
-    """Return a key that curses has read before (of an escape sequence that means nothing to it),
-    or None."""
+    """Return a key that curses has read before (of an unknown escape sequence), or None."""
     import _curses
 
     try:
@@ -239,52 +238,52 @@ _close = copy_of(os.close)  # type: ignore[arg-type]
 
 
 class Terminals:
-    """The terminals of a run's mains. While a main runs, its terminal is descriptor 0 (and 1, for
+    """The terminals of mains. While a main runs, its terminal is descriptor 0 (and 1, for
     curses)."""
 
-    def __init__(self, stacks: Stacks) -> None:
+    def __init__(self, stacks: Runtime) -> None:
         self._stacks = stacks
         self._stdin = sys.stdin
         self._real: dict[int, int] = {}
         self._at: dict[int, Terminal | None] = {}
-        self._all: dict[Program, Terminal] = {}
+        self._all: dict[SimulatedProgram, Terminal] = {}
         stacks.programs.stdin_of = self.stdin_of
 
     @property
     def present(self) -> Terminal | None:
-        """The terminal of the main that runs, if it has one."""
+        """The terminal of the running main, if it has one."""
         return self._all.get(self._stacks.programs.present)
 
-    def make(self, programs: Sequence[Program], start_ns: int) -> None:
-        """Give mains their terminals; the times of what is typed count from ``start_ns``."""
+    def make(self, programs: Sequence[SimulatedProgram], start_ns: int) -> None:
+        """Make the terminals of mains; times of input count from ``start_ns``."""
         for program in programs:
             assert program.entry is not None
             if program.entry.stdin is not None:
                 self._all[program] = Terminal(self._stacks, program.entry.stdin, start_ns)
                 self._stacks.programs.on_enter = self._enter
 
-    def hand_over(self, program: Program, successor: Program) -> None:
-        """Let a main that is started again have the terminal of the one before."""
+    def hand_over(self, program: SimulatedProgram, successor: SimulatedProgram) -> None:
+        """Give the terminal of a main to the one that starts again."""
         if program in self._all:
             self._all[successor] = self._all[program]
 
-    def stdin_of(self, program: Program) -> Any:
+    def stdin_of(self, program: SimulatedProgram) -> Any:
         """Return the ``sys.stdin`` of a main."""
         terminal = self._all.get(program)
         return NoTerminal(self._stdin) if terminal is None else terminal.stream
 
     def show(self, terminal: Terminal, has_screen: bool) -> None:
-        """Let what the main that runs prints go to its terminal, or no longer."""
+        """Send the output of the running main to its terminal, or not."""
         terminal.has_screen = has_screen
         self._enter(self._stacks.programs.present)
 
-    def _enter(self, program: Program) -> None:
+    def _enter(self, program: SimulatedProgram) -> None:
         terminal = self._all.get(program)
         self._put(0, terminal)
         self._put(1, terminal if terminal is not None and terminal.has_screen else None)
 
     def _put(self, number: int, terminal: Terminal | None) -> None:
-        """Make a terminal, or what was there before the run, a standard stream of the process."""
+        """Make a terminal (None: the original) a standard stream of the process."""
         if terminal is self._at.get(number):
             return
         if number not in self._real:
@@ -311,8 +310,8 @@ class Terminals:
 
 
 @contextmanager
-def simulated_terminals(stacks: Stacks) -> Iterator[Terminals]:
-    """Let mains read from terminals of their own, and nobody from that of rsltrace."""
+def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
+    """Let mains read from their simulated terminals, and no node from the real one."""
     terminals = Terminals(stacks)
     real_stdin = sys.stdin
     with ExitStack() as stack:
@@ -322,27 +321,29 @@ def simulated_terminals(stacks: Stacks) -> Iterator[Terminals]:
         redirect(stack, builtins.input, _inputs)
         redirect(stack, os.read, lambda real: _reads(terminals, real))
         redirect(stack, select.select, lambda real: _selects(terminals, real))
-        stack.enter_context(simulated_curses(lambda: _asking(terminals), terminals.show))
+        stack.enter_context(
+            simulated_curses(lambda: _terminal_of_caller(terminals), terminals.show)
+        )
         yield terminals
 
 
-def _asking(terminals: Terminals) -> Terminal | None:
-    """Return the terminal of whoever asks, if it is a main's code that does."""
-    stacks = simulated_stacks()
+def _terminal_of_caller(terminals: Terminals) -> Terminal | None:
+    """Return the terminal of the calling main, None for other code."""
+    stacks = calling_runtime()
     return None if stacks is None or stacks.event.handle is None else terminals.present
 
 
 def _inputs(real: Callable[..., str]) -> Callable[..., str]:
     def input_(prompt: object = "", /) -> str:
-        stacks = simulated_stacks()
+        stacks = calling_runtime()
         if stacks is None or stacks.event.handle is None:
             return real(prompt)
         if isinstance(sys.stdin, NoTerminal):
-            refuse("input()")
+            refuse_reading("input()")
             return real(prompt)
-        shown_on = sys.stdout  # the node's own words, as all that it prints
-        shown_on.write(str(prompt))
-        shown_on.flush()
+        output = sys.stdout  # of the node, as all that it prints
+        output.write(str(prompt))
+        output.flush()
         line = sys.stdin.readline()
         if not line:
             raise EOFError
@@ -354,10 +355,10 @@ def _inputs(real: Callable[..., str]) -> Callable[..., str]:
 def _reads(terminals: Terminals, real: Callable[[int, int], bytes]) -> Callable[..., bytes]:
     def read(fd: int, size: int, /) -> bytes:
         if fd == 0:
-            terminal = _asking(terminals)
+            terminal = _terminal_of_caller(terminals)
             if terminal is not None:
                 return terminal.read(size)
-            refuse("os.read(0)")
+            refuse_reading("os.read(0)")
         return real(fd, size)
 
     return read
@@ -367,7 +368,7 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
     def ready(
         reads: Any, writes: Any, others: Any, timeout: float | None = None, /
     ) -> tuple[list[Any], list[Any], list[Any]]:
-        terminal = _asking(terminals)
+        terminal = _terminal_of_caller(terminals)
         waited_for = list(reads) if terminal is not None else []
         if terminal is None or not any(_is_stdin(one) for one in waited_for):
             return real(reads, writes, others, timeout)  # type: ignore[no-any-return]
@@ -394,8 +395,8 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
     return ready
 
 
-def _is_stdin(thing: Any) -> bool:
-    if isinstance(thing, int):
-        return thing == 0
-    fileno = getattr(thing, "fileno", None)
+def _is_stdin(stream: Any) -> bool:
+    if isinstance(stream, int):
+        return stream == 0
+    fileno = getattr(stream, "fileno", None)
     return fileno is not None and fileno() == 0

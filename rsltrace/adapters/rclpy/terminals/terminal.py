@@ -1,8 +1,8 @@
-"""One main's terminal: a pseudo-terminal of the system, at which the job types.
+"""A main's terminal: a pseudo-terminal of the system, with input from the job.
 
-The system's line discipline does what it does natively (lines, raw keys, ``termios``). Only when
-there is something to read is ours: keys are typed when their time has come and somebody looks for
-them, so that nothing is lost that a node flushes, and who waits for them waits in simulated time.
+The system's line discipline works as natively (lines, raw keys, ``termios``). Only the time is
+simulated: keys are typed at their time when the main reads, so that no flush loses them, and
+reading waits in simulated time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Typed
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.redirect import copy_of
 
 _END = b"\x04"
@@ -37,10 +37,10 @@ _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
 class Terminal:
-    """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. While ``has_screen``,
-    what the main prints goes there, too (curses)."""
+    """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. With ``has_screen`` the
+    main also prints there (curses)."""
 
-    def __init__(self, stacks: Stacks, typed: Sequence[Typed], start_ns: int) -> None:
+    def __init__(self, stacks: Runtime, typed: Sequence[Typed], start_ns: int) -> None:
         self._stacks = stacks
         self._typed = deque(typed)
         self._start_ns = start_ns
@@ -48,7 +48,7 @@ class Terminal:
         os.set_blocking(self._keyboard, False)
         fcntl.ioctl(self.fd, termios.TIOCSWINSZ, struct.pack("HHHH", *_SIZE, 0, 0))
         self.has_screen = False
-        self._waiting: list[Wait] = []
+        self._waiting: list[BlockedCall] = []
         self._at_end = False
         self._looked_ns = -1
         self.stream = io.TextIOWrapper(io.BufferedReader(_Input(self)), encoding="utf-8")
@@ -68,7 +68,7 @@ class Terminal:
     # -- typing ------------------------------------------------------------------------------------
 
     def offer(self) -> bool:
-        """Type what is due unless there is something to read; return whether there is."""
+        """Type what is due unless there is unread input; return whether there is input."""
         while not self._is_readable():
             if not self._typed or not self._is_due(self._typed[0][0]):
                 return False
@@ -88,7 +88,7 @@ class Terminal:
         self.drain()
 
     def drain(self) -> None:
-        """Take away what it shows, which is for nobody to see."""
+        """Discard what it shows."""
         with suppress(BlockingIOError):
             while _read(self._keyboard, 65536):
                 pass
@@ -104,7 +104,7 @@ class Terminal:
     # -- reading -----------------------------------------------------------------------------------
 
     def await_input(self, for_ns: int | None = None) -> bool:
-        """Wait in simulated time until there is something to read; return whether there is."""
+        """Wait in simulated time for input; return whether there is any."""
         stacks = self._stacks
         until_ns = None if for_ns is None else stacks.loop.now_ns + for_ns
         while not self.offer():
@@ -113,7 +113,7 @@ class Terminal:
                 return False
             if self._at_end and not self._typed and self._takes_lines():
                 wait(stacks, "the end of its input", for_ns=POLL_NS, quiet=True)
-                self._type(_END)  # the end stays the end, however often it is read
+                self._type(_END)  # every further read gets the end, too
                 continue
             wait(
                 stacks,
@@ -126,8 +126,7 @@ class Terminal:
         return True
 
     def look(self) -> bool:
-        """Return whether there is something to read. Who looks again at one instant waits a
-        millisecond: time has to pass somehow."""
+        """Return whether there is input. A second look at one instant takes a millisecond."""
         loop = self._stacks.loop
         if self.offer():
             return True
@@ -135,9 +134,9 @@ class Terminal:
         return again and self.await_input(POLL_NS)
 
     def read(self, size: int) -> bytes:
-        """Read what has been typed, as ``os.read`` does.
+        """Read the input, as ``os.read`` does.
 
-        :raises BlockingIOError: there is nothing, and the main has made it non-blocking.
+        :raises BlockingIOError: there is none, and the main has made it non-blocking.
         """
         if _get_blocking(self.fd):
             self.await_input()
@@ -148,7 +147,7 @@ class Terminal:
 
 
 def _above_standard(fd: int) -> int:
-    """Return a descriptor that is no standard stream: where rsltrace has none, it would be."""
+    """Return a descriptor above the standard streams, which rsltrace may have closed."""
     if fd > 2:
         return fd
     moved: int = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3)
@@ -157,7 +156,7 @@ def _above_standard(fd: int) -> int:
 
 
 class _Input(io.RawIOBase):
-    """What ``sys.stdin`` reads from. In the main, the terminal is descriptor 0."""
+    """The raw stream of ``sys.stdin``: in a main, the terminal is descriptor 0."""
 
     name = "<stdin>"
     mode = "rb"
@@ -166,19 +165,15 @@ class _Input(io.RawIOBase):
         self._terminal = terminal
 
     def fileno(self) -> int:
-        """Return the number of standard input."""
         return 0
 
     def isatty(self) -> bool:
-        """Return that it is a terminal."""
         return True
 
     def readable(self) -> bool:
-        """Return that one can read from it."""
         return True
 
     def readinto(self, buffer: Any, /) -> int | None:
-        """Read what there is, at most as much as fits."""
         view = memoryview(buffer).cast("B")
         try:
             data = self._terminal.read(len(view))

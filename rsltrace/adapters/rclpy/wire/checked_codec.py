@@ -1,8 +1,9 @@
-"""The careful serializer: field by field, checking everything, naming what is wrong and where.
+"""The careful serializer and deserializer: field by field, with errors that name field and place.
 
-The generated serializers (`codec_write`) are fast because they handle only what every message
-normally holds. Whatever else a user stored in a field comes here, to be converted as rclpy's
-generated C code converts it, or refused where that code raises, aborts or reads foreign memory.
+The generated functions (`encoder_source`, `decoder_source`) handle only usual messages. Other
+values that user code stored in fields come here. They are converted as by rclpy's C code, or
+refused where that raises, aborts or reads foreign memory. Bags may hold big-endian messages,
+truncated ones, or bytes of another type.
 """
 
 from __future__ import annotations
@@ -27,11 +28,6 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     least_size,
 )
 
-# The careful deserializer: either byte order, and errors that name the field and the offset.
-#
-# The generated deserializers (`codec_read`) handle well-formed little-endian messages. Everything
-# else comes here: bags may hold big-endian messages, truncated ones, or bytes of another type.
-
 _OTHER_ENCODINGS = {
     0x02: "PL_CDR",
     0x03: "PL_CDR",
@@ -45,14 +41,14 @@ _OTHER_ENCODINGS = {
 
 
 def decode(spec: Message, raw: bytes) -> Any:
-    """Return the message that CDR bytes hold, with the Python types that rclpy gives.
+    """Return the message in CDR bytes, with the Python types of rclpy.
 
-    Bytes after the end are ignored if they pad to a multiple of 4, or are those that rclpy's
-    ``serialize_message`` returns too many (and that bags written from Python hold): it allots as
-    many as it estimates, which for empty sequences and wstrings is more than it then writes.
+    Bytes after the end are ignored if they pad to a multiple of 4, or if rclpy's
+    ``serialize_message`` (and so bags written from Python) adds them: it returns as many bytes as
+    it estimates, which is too many for empty sequences and wstrings.
 
-    Raises ValueError naming the type and the offset (in bytes from the start of ``raw``) for
-    another encoding than plain CDR, truncated or over-long bytes, and wstrings that are not UTF-16.
+    Raises ValueError naming the type and the offset in ``raw``, for other encodings than plain CDR,
+    truncated or over-long bytes, and wstrings that are not UTF-16.
     """
     decoder = _Decoder(spec, bytes(raw))
     message = decoder.message(spec, "")
@@ -67,7 +63,7 @@ class _Decoder:
         self.spec = spec
         self.raw = raw
         self.position = 0
-        self.allotted = 0  # where rclpy's estimate of the size has got to: as far, or further
+        self.allotted = 0  # rclpy's estimate of the position: the same, or larger
         self.end = len(raw) - len(HEADER)
         if self.end < 0:
             raise self.wrong(f"{len(raw)} bytes are too short for a CDR message; is it empty?")
@@ -81,7 +77,6 @@ class _Decoder:
         self.order: Literal["<", ">"] = "<" if kind else ">"
 
     def finish(self) -> None:
-        """Raise ValueError if more follows the message than may."""
         if self.end not in (self.position, self.position + 3 & -4, self.allotted):
             raise self.wrong(
                 f"the message ends at offset {self.position + 4}, but there are "
@@ -145,7 +140,7 @@ class _Decoder:
     def text(self, type_: Text, path: str) -> str:
         number = self.count(path)
         if not type_.wide:
-            # As rclpy: up to the first NUL, and what is not UTF-8 is replaced.
+            # As rclpy: up to the first NUL, and invalid UTF-8 is replaced.
             return self.take(number, path).split(b"\0", 1)[0].decode("utf-8", "replace")
         start = self.position + len(HEADER)
         self.allotted += 4  # for a terminator that wstrings do not have
@@ -182,7 +177,7 @@ class _Decoder:
         return [self.value(item, f"{path}[{index}]") for index in range(number)]
 
     def plausible(self, item: Item, number: int, start: int, path: str) -> None:
-        """Refuse a count that the bytes left cannot hold, before anything is allocated for it."""
+        """Refuse a count that exceeds the remaining bytes, before memory is allocated for it."""
         if number * least_size(item) > self.end - self.position:
             raise self.wrong(
                 f"truncated: field {path!r} claims {number} items at offset {start + 4}, "
@@ -194,10 +189,10 @@ class _Decoder:
 
 
 def unpack_wide(data: bytes, order: str = "<") -> str:
-    """Return the text of a wstring's characters, each a UTF-16 unit in four bytes.
+    """Return the text of a wstring, whose characters are UTF-16 units in four bytes each.
 
-    A byte order mark is obeyed and dropped, as rclpy does. Raises UnicodeDecodeError for what is
-    not UTF-16, OverflowError for characters beyond 16 bits.
+    As in rclpy, a byte order mark is obeyed and dropped. Raises UnicodeDecodeError if it is not
+    UTF-16, OverflowError for characters beyond 16 bits.
     """
     units = np.frombuffer(data, order + "u4")
     if len(units) and units.max() > 0xFFFF:
@@ -212,10 +207,8 @@ _LONG = 1 << 63
 def encode(spec: Message, message: Any, *, fill: int = 0) -> bytes:
     """Return the CDR bytes of a message, with ``fill`` (0 to 255) as padding.
 
-    Bytes encoded with two different fills differ exactly where there is padding.
-
-    Raises TypeError or ValueError naming the message, the field and what it holds, when a field
-    holds something that rclpy cannot serialize either.
+    Raises TypeError or ValueError naming message, field and value, if rclpy cannot serialize it
+    either.
     """
     encoder = _Encoder(spec.type_name, fill)
     if not _is_instance(message, spec):
@@ -340,7 +333,7 @@ class _Encoder:
         items = self.items(value, path)
         if len(items) < type_.length:
             raise self.wrong_value(path, f"has {len(items)} items instead of {type_.length}")
-        # rclpy takes the first ones and does not look at the others.
+        # rclpy takes the first ones and ignores the others.
         self.each(type_.item, items[: type_.length], path)
 
     def numbers(self, item: Primitive, length: int, value: Any, path: str) -> bytes:
@@ -372,7 +365,7 @@ class _Encoder:
         self.each(type_.item, items, path)
 
     def raw_items(self, item: Item, value: Any, path: str) -> bytes | None:
-        """Return the bytes of a buffer, which rclpy copies as they are; None if it is not one."""
+        """Return the bytes of a buffer, which rclpy copies; None if it is not one."""
         if not isinstance(item, Primitive):
             return None
         try:
@@ -419,10 +412,8 @@ class _Encoder:
 
 
 def pack_wide(value: str) -> bytes:
-    """Return the characters of a wstring: each UTF-16 unit in four bytes.
-
-    Raises UnicodeEncodeError for surrogates that are no pair, as rclpy does.
-    """
+    """Return a wstring's UTF-16 units in four bytes each; raise UnicodeEncodeError for lone
+    surrogates, as rclpy does."""
     units = np.frombuffer(str.encode(value, "utf-16-le"), "<u2")
     return units.astype("<u4").tobytes()
 

@@ -1,9 +1,8 @@
-"""Messages to bytes and back: canonical CDR, one pair of generated functions per message class.
+"""Messages to bytes and back: canonical CDR, with generated functions per message class.
 
-rclpy's own serializer leaves alignment padding uninitialised, so that equal messages give unequal
-bytes. What is hashed, recorded and compared must be a function of the message alone: these codecs
-give byte for byte what rclpy gives, with zeros for padding and nothing after the last field. They
-are also several times as fast, which matters because a simulation does little else.
+rclpy's serializer leaves padding uninitialised, so that equal messages give different bytes. These
+codecs give the bytes of rclpy, with zeros as padding and nothing after the last field, so that
+bytes can be hashed and compared. They are also several times as fast.
 """
 
 from __future__ import annotations
@@ -27,10 +26,10 @@ from rsltrace.adapters.rclpy.wire.source_text import packer
 
 
 class Codec:
-    """How messages of one class are written and read. ``type_name`` is ``std_msgs/msg/UInt64``.
+    """Serializes and deserializes messages of one class (``type_name``: ``std_msgs/msg/UInt64``).
 
-    Each function is generated when it is first asked for (most nodes never use most of their
-    parameter services); whoever calls one often should keep it.
+    Each function is generated on first use, as most nodes never use their parameter services. Keep
+    a function that you call often.
     """
 
     def __init__(self, spec: Message) -> None:
@@ -39,37 +38,33 @@ class Codec:
 
     @cached_property
     def serialize(self) -> Callable[[Any], bytes]:
-        """From a message to its canonical CDR bytes, 4-byte header included.
+        """From a message to its canonical CDR bytes with the 4-byte header.
 
-        It raises TypeError or ValueError naming the field when one holds what rclpy cannot
-        serialize either.
+        Raises TypeError or ValueError naming the field, if rclpy cannot serialize it either.
         """
         return make_serializer(self._spec)
 
     @cached_property
     def deserialize(self) -> Callable[[bytes], Any]:
-        """From CDR bytes (or any bytes-like object) to a new message that shares no memory with it.
+        """From CDR bytes of either byte order to a new message that shares no memory with them.
 
-        It raises ValueError naming the type and the offset when the bytes are not a whole message
-        of this type in plain CDR, of either byte order. As in rclpy, what is not UTF-8 in strings
-        is replaced, and the bounds of bounded types are not checked.
+        Raises ValueError naming type and offset, if they are no whole message of this type in plain
+        CDR. As in rclpy, invalid UTF-8 is replaced, and bounds are not checked.
         """
         return make_deserializer(self._spec)
 
     @cached_property
     def canonical(self) -> Callable[[bytes], bytes]:
-        """From CDR bytes to those of ``serialize(deserialize(raw))``: the same message,
-        little-endian, with zeros for padding. It raises what those do.
-        """
+        """Shortcut for ``serialize(deserialize(raw))``: the canonical bytes of a message."""
         return _make_canonical(self._spec, self)
 
 
 @cache
 def codec_for(message_class: type) -> Codec:
-    """Return the codec of a message class, or of a part of a service or action (made once).
+    """Return the codec of a message class, or of a part of a service or action.
 
-    Raises TypeError if rosidl did not generate the class or it holds a type that rclpy cannot
-    convert, and SetupError if the package of a nested message is missing.
+    Raises TypeError if rosidl did not generate the class or rclpy cannot convert a field,
+    SetupError if the package of a nested message is missing.
     """
     return Codec(message_spec(message_class))
 

@@ -1,8 +1,7 @@
-"""Generates the deserializer of a message class as Python source; the mirror of `codec_write`.
+"""Generates the deserializer of a message class as Python source; the mirror of `encoder_source`.
 
-Instances are made without calling the constructor: it would build every default value and pass each
-through a checking property. Slots are set instead, to values of exactly the types rclpy gives.
-For ``std_msgs/msg/Header`` it reads about so::
+The constructor is not called, as it would set every default through a checking property. Slots are
+set instead, to values of the types that rclpy gives. For ``std_msgs/msg/Header`` it is about::
 
     def deserialize(raw):
         try:
@@ -21,8 +20,8 @@ For ``std_msgs/msg/Header`` it reads about so::
             pass
         return careful(raw)
 
-Whatever is not as usual (big-endian, truncated, text that is not UTF-8, trailing bytes) is left to
-the careful deserializer (`codec_decode`), which also words the error.
+Unusual bytes (big-endian, truncated, text that is not UTF-8, trailing bytes) are left to the
+careful deserializer (`checked_codec.decode`), which also raises the errors.
 """
 
 from __future__ import annotations
@@ -43,10 +42,10 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     START,
     Array,
     FieldType,
+    FixedValue,
     Item,
+    KnownOffset,
     Message,
-    Part,
-    Place,
     Primitive,
     Sequence,
     Text,
@@ -56,21 +55,21 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     lay_out,
     steady,
 )
-from rsltrace.adapters.rclpy.wire.source_text import Source, packer
+from rsltrace.adapters.rclpy.wire.source_text import FunctionSource, packer
 
 _LARGE = 4096
-"""Sequences of more bytes than this are copied once, by way of a memoryview."""
+"""Longer sequences are copied only once, through a memoryview."""
 
 _OCTETS = tuple(bytes((value,)) for value in range(256))
 
 
 def make_deserializer(spec: Message) -> Callable[[bytes], Any]:
-    """Return a function from CDR bytes to a message; it raises what `decode` raises."""
+    """Return a function from CDR bytes to a message, with the errors of `decode`."""
     return _Reader(spec).function()
 
 
 class _Value(NamedTuple):
-    """A value of a run, and the lines that make of it what the field holds."""
+    """A value of a run, and the lines that convert it for its field."""
 
     name: str
     conversion: tuple[str, ...] = ()
@@ -85,11 +84,11 @@ class _Tree(NamedTuple):
 
 class _Reader:
     """Writes the source. The offset in ``raw`` is the variable named ``base`` (if any) plus
-    ``ahead``; ``place`` is what is known of it, counted from after the header as alignment is."""
+    ``ahead``; ``place`` is what is known of it, counted from after the header."""
 
     def __init__(self, spec: Message) -> None:
         self.spec = spec
-        self.source = Source(
+        self.source = FunctionSource(
             {
                 "unpack_wide": unpack_wide,
                 "large": _large_array,
@@ -122,13 +121,13 @@ class _Reader:
 
     def message(self, spec: Message) -> _Tree:
         if not spec.fields:
-            self.run.append(Part("x", 1, 1))
+            self.run.append(FixedValue("x", 1, 1))
         return _Tree(spec, [self.value(field.type) for field in spec.fields])
 
     def value(self, type_: FieldType) -> str | _Tree:
         if isinstance(type_, Primitive):
             conversion = "{0} = {0}.decode('ascii')" if type_.name == "char" else ""
-            return self.put(Part(type_.code, type_.size, type_.size), conversion)
+            return self.put(FixedValue(type_.code, type_.size, type_.size), conversion)
         if isinstance(type_, Text):
             return self.text(type_)
         if isinstance(type_, Message):
@@ -138,7 +137,7 @@ class _Reader:
         return self.sequence(type_)
 
     def text(self, type_: Text) -> str:
-        number = self.put(Part("I", 4, 4))
+        number = self.put(FixedValue("I", 4, 4))
         self.flush()
         value, end = self.source.variable("v"), self.source.variable("e")
         here = self.offset()
@@ -147,7 +146,7 @@ class _Reader:
             self.source.line(f"{value} = unpack_wide(raw[{here}:{end}])")
             self.jump(end, self.place.moved_by_multiple(4))
             return value
-        # An index past the end raises, so this needs no check of the length of its own.
+        # No check of the length: an index past the end raises.
         self.source.line(f"{end} = {here} + {number}")
         self.source.line(f"{value} = raw[{here}:{end} - 1].decode()")
         self.source.line(f"if '\\0' in {value} or raw[{end} - 1]: raise Unusual")
@@ -161,20 +160,22 @@ class _Reader:
             return self.loop(item, str(length), steady(item, self.place))
         size = item.size * length
         if not item.typecode:
-            return self.put(Part(f"{size}s", size, 1), "{0} = " + _LISTS[item.name].format("{0}"))
+            return self.put(
+                FixedValue(f"{size}s", size, 1), "{0} = " + _LISTS[item.name].format("{0}")
+            )
         fill = self.source.constant(packer(f"{size}s").pack_into)
         data = self.source.variable("b")
         value = self.source.variable("v")
-        self.run.append(Part(f"{size}s", size, item.size))
+        self.run.append(FixedValue(f"{size}s", size, item.size))
         dtype = self.source.constant(item.dtype)
-        # Twice as quick as frombuffer and copy, for the few numbers that arrays mostly hold.
+        # Twice as fast as frombuffer and copy, for the usual short arrays.
         lines = (f"{value} = empty({length}, {dtype})", f"{fill}({value}, 0, {data})")
         self.values.append(_Value(data, lines))
         return value
 
     def sequence(self, type_: Sequence) -> str:
         item = type_.item
-        number = self.put(Part("I", 4, 4))
+        number = self.put(FixedValue("I", 4, 4))
         self.flush()
         if isinstance(item, Primitive):
             place = after_items(item, self.place)
@@ -198,7 +199,7 @@ class _Reader:
         return self.loop(item, number, steady(item, self.place))
 
     def strided(self, item: Message, number: str, size: int, widest: int) -> str:
-        """Read items that all have the same layout, one after the other without padding."""
+        """Read items of the same layout, without padding between them."""
         place = after_items(item, self.place)
         start, end = self.items(number, size, widest)
         values, add = self.new_list()
@@ -213,7 +214,7 @@ class _Reader:
         return values
 
     def items(self, number: str, size: int, alignment: int) -> tuple[str, str]:
-        """Find the offsets of the first and after the last of so many items."""
+        """Return the offsets of the first item and after the last one."""
         start = here = self.offset()
         if self.place.aligned(alignment) != self.place:
             start = self.source.variable("s")
@@ -226,8 +227,8 @@ class _Reader:
         self.source.line(f"{end} = {start} + {size}")
         self.source.line(f"if {end} > end: raise Unusual")
 
-    def loop(self, item: Item, number: str, place: Place) -> str:
-        """Read items of any size one by one; ``place`` holds at the start of every turn."""
+    def loop(self, item: Item, number: str, place: KnownOffset) -> str:
+        """Read items one by one; ``place`` holds at the start of every turn."""
         values, add = self.new_list()
         self.settle(place)
         with self.source.block(f"for _ in range({number}):"):
@@ -244,7 +245,7 @@ class _Reader:
         return values, add
 
     def build(self, value: str | _Tree) -> str:
-        """Write the construction of a message and return the name of it."""
+        """Write the construction of a message; return its name."""
         if isinstance(value, str):
             return value
         names = [self.build(part) for part in value.values]
@@ -258,7 +259,7 @@ class _Reader:
 
     # -- bytes --------------------------------------------------------------------------------
 
-    def put(self, part: Part, conversion: str = "") -> str:
+    def put(self, part: FixedValue, conversion: str = "") -> str:
         name = self.source.variable("v")
         self.run.append(part)
         lines = (conversion.format(name),) if conversion else ()
@@ -276,11 +277,11 @@ class _Reader:
             return f"{self.offset()} + {size - 1} & -{size}"
         return f"({self.offset()} + 3 & -8) + 4"
 
-    def jump(self, base: str, place: Place) -> None:
-        """Go on at the offset that the variable ``base`` holds."""
+    def jump(self, base: str, place: KnownOffset) -> None:
+        """Go on at the offset in the variable ``base``."""
         self.base, self.ahead, self.place = base, 0, place
 
-    def settle(self, place: Place) -> None:
+    def settle(self, place: KnownOffset) -> None:
         """Put the offset into ``p`` and forget all else but ``place``, at the edges of a loop."""
         assert self.place.joined(place) == place, "a loop's invariant does not hold"
         if self.offset() != "p":
@@ -288,7 +289,7 @@ class _Reader:
         self.jump("p", place)
 
     def flush(self, whole: bool = False) -> None:
-        """Read the run of fixed-size values gathered so far; ``whole`` if it is all of ``raw``."""
+        """Read the gathered run of fixed-size values; ``whole`` if it is all of ``raw``."""
         if not self.run:
             return
         widest = max(part.alignment for part in self.run)
@@ -327,7 +328,7 @@ class _Reader:
         return ", ".join(value.name for value in self.values) + ","
 
     def convert(self) -> None:
-        """Write what makes field values of the run just read, and begin a new one."""
+        """Write the conversions of the run just read, and begin a new one."""
         for value in self.values:
             for text in value.conversion:
                 self.source.line(text)
@@ -339,7 +340,7 @@ _LISTS = {
     "octet": "[OCTETS[octet] for octet in {}]",
     "char": "list({}.decode('ascii'))",
 }
-"""How the bytes of an array or sequence become the list that rclpy gives."""
+"""Conversions of an array's or sequence's bytes to the list that rclpy gives."""
 
 
 @cache

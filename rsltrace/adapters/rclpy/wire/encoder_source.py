@@ -1,9 +1,9 @@
 """Generates the serializer of a message class as Python source.
 
-Serializing is the hottest code of a simulation, so each class gets a function of its own: nested
-messages are flattened, values of fixed size that follow each other become one precompiled
-`struct.Struct` (padding included, always zero), and what follows a string or sequence picks among
-precompiled ones by its position modulo 8. For ``std_msgs/msg/Header`` it reads about so::
+Serializing is the hottest code of a simulation, so each class gets its own function. Nested
+messages are flattened, and adjacent values of fixed size become one precompiled `struct.Struct`
+with zeros as padding. After a string or sequence, the position modulo 8 selects the struct. For
+``std_msgs/msg/Header`` it is about::
 
     def serialize(m):
         try:
@@ -20,7 +20,7 @@ precompiled ones by its position modulo 8. For ``std_msgs/msg/Header`` it reads 
             pass
         return careful(m)
 
-Whatever is not as usual is left to the careful serializer (`codec_encode`).
+Unusual values are left to the careful serializer (`checked_codec.encode`).
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     START,
     Array,
     FieldType,
+    FixedValue,
     Item,
+    KnownOffset,
     Message,
-    Part,
-    Place,
     Primitive,
     Sequence,
     Text,
@@ -51,13 +51,13 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     lay_out,
     steady,
 )
-from rsltrace.adapters.rclpy.wire.source_text import Source, packer
+from rsltrace.adapters.rclpy.wire.source_text import FunctionSource, packer
 
 _ONLY_BOOL = frozenset({bool})
 
 
 def make_serializer(spec: Message) -> Callable[[Any], bytes]:
-    """Return a function from a message to its CDR bytes; it raises what `encode` raises."""
+    """Return a function from a message to its CDR bytes, with the errors of `encode`."""
     return _Writer(spec).function()
 
 
@@ -67,7 +67,7 @@ class _Writer:
 
     def __init__(self, spec: Message) -> None:
         self.spec = spec
-        self.source = Source(
+        self.source = FunctionSource(
             {
                 "encode": str.encode,
                 "pack_wide": pack_wide,
@@ -78,7 +78,7 @@ class _Writer:
         )
         self.place = START
         self.ahead = 0
-        self.run: list[Part] = []
+        self.run: list[FixedValue] = []
         self.arguments: list[str] = []
         self.checks: list[str] = []
         self.parts: list[str] = []
@@ -107,7 +107,7 @@ class _Writer:
 
     def message(self, spec: Message, name: str) -> None:
         if not spec.fields:
-            self.put(Part("x", 1, 1))
+            self.put(FixedValue("x", 1, 1))
         for field in spec.fields:
             value = self.source.variable("v")
             self.source.line(f"{value} = {name}.{field.slot}")
@@ -128,29 +128,29 @@ class _Writer:
 
     def primitive(self, type_: Primitive, value: str) -> None:
         if type_.name == "char":
-            self.checks.append("False")  # only IDL files can have it; not worth fast code
+            self.checks.append("False")  # only IDL files can have it; no fast code
         elif type_.name == "boolean":
             self.checks.append(f"type({value}) is bool")
         elif type_.name != "octet":  # struct itself insists on bytes of length 1
             self.checks.append(f"isinstance({value}, {'float' if type_.code in 'fd' else 'int'})")
-        self.put(Part(type_.code, type_.size, type_.size), value)
+        self.put(FixedValue(type_.code, type_.size, type_.size), value)
 
     def text(self, type_: Text, value: str) -> None:
         data = self.source.variable("b")
         if type_.wide:
             self.source.line(f"{data} = pack_wide({value})")
-            self.put(Part("I", 4, 4), f"len({data}) // 4")
+            self.put(FixedValue("I", 4, 4), f"len({data}) // 4")
             self.flush()
             self.emit(data)
             self.move(f"len({data})", 4)
             return
         self.source.line(f"{data} = encode({value})")
         self.checks.append(f"0 not in {data}")
-        self.put(Part("I", 4, 4), f"len({data}) + 1")
+        self.put(FixedValue("I", 4, 4), f"len({data}) + 1")
         self.flush()
         self.emit(data)
         self.move(f"len({data})", 1)
-        self.put(Part("x", 1, 1))  # the NUL; it joins what follows
+        self.put(FixedValue("x", 1, 1))  # the NUL; it joins what follows
 
     def array(self, type_: Array, value: str) -> None:
         item, length = type_.item, type_.length
@@ -162,12 +162,12 @@ class _Writer:
                 f"len({value}) == {length}",
             ]
             size = item.size * length
-            self.put(Part(f"{size}s", size, item.size), f"{value}.tobytes()")
+            self.put(FixedValue(f"{size}s", size, item.size), f"{value}.tobytes()")
             return
         self.need_list(value)
         self.source.line(f"if len({value}) != {length}: raise Unusual")
         if isinstance(item, Primitive):
-            self.put(Part(f"{length}s", length, 1), self.flags(item, value))
+            self.put(FixedValue(f"{length}s", length, 1), self.flags(item, value))
         else:
             self.flush()
             self.loop(item, value, steady(item, self.place))
@@ -186,7 +186,7 @@ class _Writer:
             self.need_list(value)
         if type_.bound is not None:
             self.checks.append(f"len({value}) <= {type_.bound}")
-        self.put(Part("I", 4, 4), f"len({value})")
+        self.put(FixedValue("I", 4, 4), f"len({value})")
         self.flush()
         if isinstance(item, Primitive) and item.size < 8:
             self.emit(value if numbers else self.flags(item, value), bulk=True)
@@ -225,8 +225,8 @@ class _Writer:
         self.ahead = 0
         self.place = place.joined(START)
 
-    def loop(self, item: Item, sequence: str, place: Place) -> None:
-        """Write a loop over items, at whose every turn ``place`` holds."""
+    def loop(self, item: Item, sequence: str, place: KnownOffset) -> None:
+        """Write a loop over items; ``place`` holds at every turn."""
         if not self.begun:
             self.emit(repr(HEADER))
             self.begun = True
@@ -252,14 +252,14 @@ class _Writer:
         return data
 
     def need_list(self, value: str) -> None:
-        # At once, not with the other checks: what follows walks through it.
+        # At once, not with the other checks, as the next lines iterate over it.
         self.source.line(
             f"if type({value}) is not list and type({value}) is not tuple: raise Unusual"
         )
 
     # -- bytes --------------------------------------------------------------------------------
 
-    def put(self, part: Part, argument: str | None = None) -> None:
+    def put(self, part: FixedValue, argument: str | None = None) -> None:
         self.run.append(part)
         if argument is not None:
             self.arguments.append(argument)
@@ -277,7 +277,7 @@ class _Writer:
         self.parts.append(part)
 
     def flush(self) -> None:
-        """Emit the checks and the run of fixed-size values gathered so far."""
+        """Emit the gathered checks and the run of fixed-size values."""
         if self.checks:
             self.source.line(f"if not ({' and '.join(self.checks)}): raise Unusual")
             self.checks = []
@@ -333,7 +333,7 @@ class _Writer:
             self.source.shift(f"p += {self.ahead % 8}{f' + {size}' if size else ''}")
         self.ahead = 0
 
-    def settle(self, place: Place) -> None:
+    def settle(self, place: KnownOffset) -> None:
         """Forget all about the position but ``place``, at the edges of a loop."""
         assert self.place.joined(place) == place, "a loop's invariant does not hold"
         if place.modulus < 8:

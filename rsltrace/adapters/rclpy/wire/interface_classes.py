@@ -1,10 +1,7 @@
-"""From names of interfaces to their classes and back, importing nothing before it is asked for.
+"""Names of interfaces and their classes; imports each package on first use.
 
-A job can be checked, and a missing package named, before rclpy is loaded.
-
-A name has three parts, ``package/kind/Type`` with kind ``msg``, ``srv`` or ``action``. Parts of a
-service or an action are named as rosidl does: ``std_srvs/srv/Trigger_Request``,
-``test_msgs/action/Fibonacci_SendGoal_Response``.
+A name is ``package/kind/Type``, with kind ``msg``, ``srv`` or ``action``. Parts of a service or an
+action are named as by rosidl: ``std_srvs/srv/Trigger_Request``.
 """
 
 from __future__ import annotations
@@ -24,10 +21,9 @@ _NAME = re.compile(r"(?P<package>[a-z]\w*)/(?P<kind>msg|srv|action)/(?P<type>[A-
 
 
 def get_message_class(name: str) -> type:
-    """Return the Python class of a message, or of a message that is part of a service or action.
+    """Return the class of a message, or of a message that is part of a service or action.
 
-    Raises SetupError, saying what to install, when the name is malformed, its package is missing or
-    cannot be imported, or the package has no such message.
+    Raises SetupError, saying what to install, if there is no such message.
     """
     found = _find(name)
     if not hasattr(found, "SLOT_TYPES"):
@@ -36,10 +32,7 @@ def get_message_class(name: str) -> type:
 
 
 def get_service_class(name: str) -> type:
-    """Return the Python class of a service (the one with ``Request`` and ``Response``).
-
-    Raises SetupError as `get_message_class` does.
-    """
+    """Return the class of a service, as `get_message_class` does."""
     found = _find(name)
     if not (hasattr(found, "Request") and hasattr(found, "Response")):
         raise SetupError(f"{name} is not a service{_parts_hint(name, found)}")
@@ -47,10 +40,7 @@ def get_service_class(name: str) -> type:
 
 
 def type_name(interface: type) -> str:
-    """Return the full name of an interface class: ``std_msgs/msg/UInt64``.
-
-    Raises TypeError if rosidl did not generate the class.
-    """
+    """Return the full name of an interface class; TypeError if rosidl did not generate it."""
     parts = interface.__module__.split(".")
     if len(parts) != 3 or parts[1] not in ("msg", "srv", "action"):
         raise TypeError(f"{interface!r} is not a ROS interface: rosidl did not generate it")
@@ -58,20 +48,17 @@ def type_name(interface: type) -> str:
 
 
 def class_of(publisher: Any) -> type:
-    """Return the message class of a publisher, which may have only the name of its type."""
+    """Return a publisher's message class, also if it has only the type's name."""
     return getattr(publisher, "msg_type", None) or get_message_class(publisher.type_name)
 
 
 def nested_class(namespaces: list[str], name: str) -> type:
-    """Return the message class that a field of rosidl's ``NamespacedType(namespaces, name)`` holds.
-
-    Raises SetupError like `get_message_class`.
-    """
+    """Return the message class of rosidl's ``NamespacedType(namespaces, name)``."""
     return get_message_class("/".join([*namespaces, name]))
 
 
 def forget_interfaces() -> None:
-    """Look for every class anew: packages are gone that were there for one run only."""
+    """Clear the cache of classes: packages of one run are gone."""
     _find.cache_clear()
 
 
@@ -87,8 +74,8 @@ def _find(name: str) -> type:
     module = _import_kind(name, package, kind)
     found = getattr(module, type_, None)
     if found is None and "_" in type_:
-        # Goals, results and feedback are not exported by the package, but stand in the module of
-        # their action. Names of interfaces hold no underscore, so the first part is the whole's.
+        # The package does not export goals, results and feedback: they are in the module of their
+        # action. Names of interfaces have no underscore, so the first part is the action's.
         whole = getattr(module, type_.split("_", 1)[0], None)
         if whole is not None:
             found = getattr(sys.modules[whole.__module__], type_, None)

@@ -1,6 +1,6 @@
-"""Interfaces by name, and what a trace keeps about them: the whole public surface of this topic.
+"""Interfaces by name, and their definitions and type hashes for traces.
 
-Nothing of ROS is imported before it is asked for.
+Nothing of ROS is imported before it is needed.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 from rsltrace.adapters.rclpy.wire.interface_classes import (
@@ -32,10 +33,8 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
 )
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 
-# Finds the definition files that rosidl installs beside the classes it generates.
-#
-# ``<prefix>/share/<package>/<kind>/<Name>.msg`` (or ``.srv``, ``.action``) is what the author
-# wrote, comments and all; ``<Name>.json`` is the type description whose hash ROS 2 compares.
+# rosidl installs ``<prefix>/share/<package>/<kind>/<Name>.msg`` (or ``.srv``, ``.action``), the
+# author's text, and ``<Name>.json``, the type description whose hash ROS 2 compares.
 
 SEPARATOR = "---"
 _SECTIONS = {
@@ -43,14 +42,12 @@ _SECTIONS = {
     "srv": {"Request": 0, "Response": 1},
     "action": {"Goal": 0, "Result": 1, "Feedback": 2},
 }
-"""Which section of its file holds a part. Parts not listed are made by rosidl, not the author."""
+"""The section of the file that holds a part. Parts not listed are made by rosidl."""
 
 
 def installed_definition(name: str) -> str | None:
-    """Return the text that defines a message or a part of a service or action, as installed.
-
-    ``name`` is a full name such as ``std_srvs/srv/Trigger_Request``. None if no file defines it.
-    """
+    """Return the installed text that defines a message or a part of a service or action, or
+    None."""
     package, kind, type_ = name.split("/")
     whole, _, part = type_.partition("_")
     index = _SECTIONS[kind].get(part)
@@ -69,7 +66,6 @@ def installed_definition(name: str) -> str | None:
 
 
 def installed_type_hash(name: str) -> str | None:
-    """Return the ``RIHS01_...`` hash of an interface by its full name, or None."""
     package, kind, type_ = name.split("/")
     path = _installed_file(package, kind, f"{type_.partition('_')[0]}.json")
     if path is None:
@@ -78,18 +74,20 @@ def installed_type_hash(name: str) -> str | None:
         hashes = json.loads(path.read_text("utf-8"))["type_hashes"]
         return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name), None)
     except (ValueError, KeyError, TypeError):
-        return None  # of a ROS version that describes types otherwise
+        return None  # a ROS release with another format
 
 
 def installed_description(name: str) -> Any:
-    """Return the type description of an interface by its full name, as JSON has it, or None."""
+    """Return the type description in an interface's JSON file, as attributes, or None."""
     package, kind, type_ = name.split("/")
     path = _installed_file(package, kind, f"{type_}.json")
-    return None if path is None else json.loads(path.read_text("utf-8"))
+    if path is None:
+        return None
+    return json.loads(path.read_text("utf-8"), object_hook=lambda item: SimpleNamespace(**item))
 
 
 def installed_file_text(name: str) -> str | None:
-    """Return the whole text of the file that an interface is defined in, or None."""
+    """Return the text of the file that defines an interface, or None."""
     package, kind, type_ = name.split("/")
     path = _installed_file(package, kind, f"{type_.partition('_')[0]}.{kind}")
     return None if path is None else path.read_text("utf-8", "replace")
@@ -104,7 +102,7 @@ def _installed_file(package: str, kind: str, file: str) -> Path | None:
 
 
 def _prefixes(package: str) -> Iterator[Path]:
-    # First the prefix that the class comes from: an overlay's definition may differ.
+    # First the prefix of the class: an overlay's definition may differ.
     spec = find_spec(package)
     for location in (spec.submodule_search_locations or []) if spec is not None else []:
         # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper
@@ -115,11 +113,8 @@ def _prefixes(package: str) -> Iterator[Path]:
     yield Path(sys.prefix)
 
 
-# The message definition a trace carries for each topic, so that it can be read without ROS.
-#
-# It is what rosbag2 and the ``ros2msg`` encoding of MCAP call a concatenated definition: the text
-# of the message, then of every message in it, each after a line of 80 ``=`` and ``MSG:
-# package/Type``.
+# A trace holds the concatenated definition of each topic's type (``ros2msg`` of MCAP): the text of
+# the message, then of every message in it, each after a line of 80 ``=`` and ``MSG: package/Type``.
 
 _RULE = "=" * 80
 _FIELD = re.compile(r"\s*(?P<type>[^\s#]+)\s+(?P<name>[a-zA-Z]\w*)\s*(?P<constant>=)?", re.ASCII)
@@ -128,12 +123,10 @@ _TEXT_NAMES = {"boolean": "bool", "octet": "byte", "float": "float32", "double":
 
 @cache
 def schema_text(cls: type) -> str:
-    """Return the concatenated ``ros2msg`` definition of a message class or part of a service.
+    """Return the concatenated definition of a message class or part of a service.
 
-    The definitions are those installed with the classes, or, where there is none (action wrappers,
-    messages defined in IDL), made from the class: fields only, no comments or constants.
-
-    Raises TypeError if rosidl did not generate the class.
+    If no definition is installed (action wrappers, messages defined in IDL), it is made from the
+    class, without comments and constants. Raises TypeError if rosidl did not generate the class.
     """
     root = message_spec(cls)
     pieces = [_definition(root)]
@@ -144,39 +137,37 @@ def schema_text(cls: type) -> str:
 
 @cache
 def type_hash(cls: type) -> str | None:
-    """Return the type hash of an interface class (``RIHS01_`` and 64 hex digits).
-
-    None if its type description is not installed. Raises TypeError if rosidl did not generate it.
-    """
+    """Return the type hash of an interface class (``RIHS01_`` and 64 hex digits), None if its
+    description is not installed."""
     return installed_type_hash(type_name(cls))
 
 
 @cache
 def message_type(cls: type) -> MessageType:
-    """Return a message class as the middleware knows it: by name."""
+    """Return the middleware's description of a message class."""
     return MessageType(type_name(cls), lambda: (schema_text(cls), type_hash(cls) or ""))
 
 
 @cache
 def service_type(cls: Any) -> ServiceType:
-    """Return a service class as the middleware knows it: by name."""
+    """Return the middleware's description of a service class."""
     request, response = message_type(cls.Request), message_type(cls.Response)
     return ServiceType(request.name.removesuffix("_Request"), request, response)
 
 
 def _definition(spec: Message) -> str:
     text = installed_definition(spec.type_name)
-    # A file of another version than the class would make every reader misread the messages.
+    # Do not use a file of another version than the class.
     if text is not None and _field_names(text) == [field.name for field in spec.fields]:
         return text if "/msg/" in spec.type_name else _with_full_types(text, spec)
     return "\n".join(f"{_written(field.type)} {field.name}" for field in spec.fields)
 
 
 def _with_full_types(text: str, spec: Message) -> str:
-    """Write out the package of types that stand there without one.
+    """Add the package to types without one.
 
-    In a ``.srv`` or ``.action`` file these are messages of the same package, but readers that know
-    of messages only take them for parts of the same service or action.
+    In a ``.srv`` or ``.action`` file these are messages of the same package, but readers would take
+    them for parts of the same service or action.
     """
     packages = {
         field.name: _short_name(item).rpartition("/")[0] + "/"
@@ -200,7 +191,7 @@ def _field_names(text: str) -> list[str]:
 
 
 def _dependencies(root: Message) -> list[Message]:
-    """Return every message inside ``root`` once, in the order in which they are met."""
+    """Return every message inside ``root`` once, in order of appearance."""
     found: dict[str, Message] = {}
 
     def visit(type_: FieldType) -> None:
@@ -222,7 +213,7 @@ def _short_name(spec: Message) -> str:
 
 
 def _written(type_: FieldType) -> str:
-    """Return a type as a ``.msg`` file has it."""
+    """Return a type in the syntax of ``.msg`` files."""
     if isinstance(type_, Primitive):
         return _TEXT_NAMES.get(type_.name, type_.name)
     if isinstance(type_, Text):

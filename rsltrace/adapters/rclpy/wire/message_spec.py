@@ -1,8 +1,4 @@
-"""What a message class holds, read once from its ``SLOT_TYPES`` into plain values.
-
-rosidl's own description objects are many small classes behind a parser; the code generators want
-to ask one thing only: of what is this field made?
-"""
+"""The fields of a message class, read once from its ``SLOT_TYPES`` into plain values."""
 
 from __future__ import annotations
 
@@ -15,7 +11,7 @@ import numpy as np
 from rsltrace.adapters.rclpy.wire.interface_classes import nested_class, type_name
 
 HEADER = b"\x00\x01\x00\x00"
-"""Encapsulation of plain little-endian CDR. Positions (and alignment) count from after it."""
+"""Encapsulation header of plain little-endian CDR; positions count from after it."""
 
 HEADER_VALUE = int.from_bytes(HEADER, "little")
 CHECK_SLOT = "_check_fields"
@@ -26,7 +22,7 @@ class Primitive:
     """A value of fixed size. ``code`` is its letter in `struct`, ``size`` its bytes and alignment.
 
     ``typecode`` is its letter in `array.array`, which rclpy uses for sequences of numbers; empty
-    for ``boolean``, ``octet`` and ``char``, of which rclpy makes lists.
+    for ``boolean``, ``octet`` and ``char``, for which rclpy uses lists.
     """
 
     name: str
@@ -44,8 +40,7 @@ class Primitive:
 
 @dataclass(frozen=True, slots=True)
 class Text:
-    """A string, or wstring if ``wide``. Its ``bound`` in characters is for information: rclpy's
-    serializer does not enforce it."""
+    """A string, or wstring if ``wide``; rclpy does not enforce its ``bound``."""
 
     wide: bool
     bound: int | None
@@ -68,7 +63,7 @@ class Sequence:
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class FieldSpec:
     """A field of a message; ``slot`` is the attribute behind its property."""
 
     name: str
@@ -80,14 +75,13 @@ class Field:
 class Message:
     """A message class. ``python_name`` is ``module.Class``, by which rclpy recognises instances.
 
-    ``check_fields`` is what a default-constructed instance holds in its ``_check_fields`` slot;
-    None if the class has no such slot.
+    ``check_fields`` is the default of the ``_check_fields`` slot; None if there is no such slot.
     """
 
     type_name: str
     python_name: str
     cls: type
-    fields: tuple[Field, ...]
+    fields: tuple[FieldSpec, ...]
     check_fields: bool | None
 
 
@@ -118,9 +112,8 @@ PRIMITIVES = {
 def message_spec(cls: type) -> Message:
     """Describe a message class.
 
-    Raises TypeError if rosidl did not generate the class, or if a field is of a type that rclpy
-    cannot convert either (``wchar``, ``long double``), and SetupError if the package of a nested
-    message is missing.
+    Raises TypeError if rosidl did not generate the class or rclpy cannot convert a field
+    (``wchar``, ``long double``), SetupError if the package of a nested message is missing.
     """
     name = type_name(cls)
     slot_types = getattr(cls, "SLOT_TYPES", None)
@@ -130,7 +123,7 @@ def message_spec(cls: type) -> Message:
     fields = []
     for field_name, slot_type in zip(names, slot_types, strict=True):
         try:
-            fields.append(Field(field_name, f"_{field_name}", _field_type(slot_type)))
+            fields.append(FieldSpec(field_name, f"_{field_name}", _field_type(slot_type)))
         except TypeError as error:
             raise TypeError(f"{name}: field {field_name!r}: {error}") from None
     return Message(
@@ -145,7 +138,7 @@ def message_spec(cls: type) -> Message:
 def _default_check(cls: type) -> bool | None:
     if not hasattr(cls, CHECK_SLOT):
         return None
-    # What the generated __init__ would set depends on the environment at import; ask it.
+    # The default depends on the environment at import.
     return bool(getattr(cls(), CHECK_SLOT))
 
 
@@ -174,58 +167,52 @@ def _item(slot_type: Any) -> Item:
     raise TypeError(f"type {getattr(slot_type, 'typename', slot_type)!s} is not supported by rclpy")
 
 
-# Where CDR puts padding, worked out while generating code so that it costs little at run time.
-#
-# CDR aligns each primitive to its size, counted from the end of the 4-byte encapsulation header.
-# What follows a string or a sequence stands at a position known only at run time; but often enough
-# of it is known (a multiple of 4, say) to lay the rest out beforehand.
+# Padding. CDR aligns each primitive to its size. The position after a string or sequence is known
+# only at run time, but often enough of it is known in advance (a multiple of 4, say) to lay out the
+# rest.
 
 
-class Place(NamedTuple):
-    """All that is known about a position: it is ``rest`` modulo ``modulus`` (1, 2, 4 or 8)."""
+class KnownOffset(NamedTuple):
+    """What is known about a position: it is ``rest`` modulo ``modulus`` (1, 2, 4 or 8)."""
 
     modulus: int
     rest: int
 
-    def moved(self, size: int) -> Place:
-        """The place ``size`` bytes further on."""
-        return Place(self.modulus, (self.rest + size) % self.modulus)
+    def moved(self, size: int) -> KnownOffset:
+        return KnownOffset(self.modulus, (self.rest + size) % self.modulus)
 
-    def moved_by_multiple(self, unit: int) -> Place:
-        """The place some multiple of ``unit`` bytes further on."""
+    def moved_by_multiple(self, unit: int) -> KnownOffset:
         return self.reduced(min(self.modulus, unit))
 
-    def aligned(self, size: int) -> Place:
-        """The place after padding to a multiple of ``size`` bytes."""
+    def aligned(self, size: int) -> KnownOffset:
         if self.modulus < size:
-            return Place(size, 0)
+            return KnownOffset(size, 0)
         return self.moved(-self.rest % size)
 
-    def reduced(self, modulus: int) -> Place:
-        """The same place, knowing less."""
-        return Place(modulus, self.rest % modulus)
+    def reduced(self, modulus: int) -> KnownOffset:
+        return KnownOffset(modulus, self.rest % modulus)
 
-    def joined(self, other: Place) -> Place:
-        """What is known when it is either of two places."""
+    def joined(self, other: KnownOffset) -> KnownOffset:
+        """What is known of a position that is one of two."""
         modulus = min(self.modulus, other.modulus)
         while (self.rest - other.rest) % modulus:
             modulus //= 2
-        return Place(modulus, self.rest % modulus)
+        return KnownOffset(modulus, self.rest % modulus)
 
 
-START = Place(8, 0)
+START = KnownOffset(8, 0)
 
 
-class Part(NamedTuple):
-    """One item of a run of fixed-size values: its `struct` letters, bytes and alignment."""
+class FixedValue(NamedTuple):
+    """A value in a run of fixed-size values: its `struct` letters, bytes and alignment."""
 
     code: str
     size: int
     alignment: int
 
 
-def lay_out(parts: list[Part], rest: int) -> tuple[str, int]:
-    """Return (`struct` format without byte order, bytes) of a run at ``rest`` modulo 8."""
+def lay_out(parts: list[FixedValue], rest: int) -> tuple[str, int]:
+    """Return the `struct` format (without byte order) and bytes of a run at ``rest`` modulo 8."""
     codes, position = [], rest
     for part in parts:
         gap = -position % part.alignment
@@ -236,23 +223,23 @@ def lay_out(parts: list[Part], rest: int) -> tuple[str, int]:
     return "".join(codes), position - rest
 
 
-HEADER_PART = Part("I", 4, 1)
+HEADER_PART = FixedValue("I", 4, 1)
 HEADER_PLACE = START.moved(-4)
 """The encapsulation header as the first part of a run that begins with it."""
 
 
-def fixed_parts(type_: FieldType) -> list[Part] | None:
-    """Return a value as one run; None if its size varies or it holds an array of messages."""
+def fixed_parts(type_: FieldType) -> list[FixedValue] | None:
+    """Return a type as one run; None if its size varies or it holds an array of messages."""
     if isinstance(type_, Primitive):
-        return [Part(type_.code, type_.size, type_.size)]
+        return [FixedValue(type_.code, type_.size, type_.size)]
     if isinstance(type_, Array) and isinstance(type_.item, Primitive):
         size = type_.item.size * type_.length
-        return [Part(f"{size}s", size, type_.item.size)]
+        return [FixedValue(f"{size}s", size, type_.item.size)]
     if not isinstance(type_, Message):
         return None
     if not type_.fields:
-        return [Part("x", 1, 1)]
-    parts: list[Part] = []
+        return [FixedValue("x", 1, 1)]
+    parts: list[FixedValue] = []
     for field in type_.fields:
         inner = fixed_parts(field.type)
         if inner is None:
@@ -262,13 +249,13 @@ def fixed_parts(type_: FieldType) -> list[Part] | None:
 
 
 def fixed_size(spec: Message) -> int | None:
-    """Return the bytes of every message of this class with its header; None if not one run."""
+    """Return the size of a message with its header; None if it varies."""
     parts = fixed_parts(spec)
     return None if parts is None else lay_out([HEADER_PART, *parts], HEADER_PLACE.rest)[1]
 
 
-def after(type_: FieldType, place: Place) -> Place:
-    """Return where a value of this type ends that begins at ``place``."""
+def after(type_: FieldType, place: KnownOffset) -> KnownOffset:
+    """Return where a value ends that begins at ``place``."""
     if isinstance(type_, Primitive):
         return place.aligned(type_.size).moved(type_.size)
     if isinstance(type_, Text):
@@ -287,15 +274,15 @@ def after(type_: FieldType, place: Place) -> Place:
     return after_items(type_.item, place.aligned(4).moved(4))
 
 
-def after_items(item: FieldType, place: Place) -> Place:
-    """Return where any number of items end that begin at ``place``; none need no alignment."""
+def after_items(item: FieldType, place: KnownOffset) -> KnownOffset:
+    """Return where any number of items end that begin at ``place``."""
     if isinstance(item, Primitive):
         return place.joined(place.aligned(item.size).moved_by_multiple(item.size))
     return steady(item, place)
 
 
-def steady(item: FieldType, place: Place) -> Place:
-    """Return what is known at the start of every turn of a loop over items that begins here."""
+def steady(item: FieldType, place: KnownOffset) -> KnownOffset:
+    """Return what is known at every turn of a loop over items that begins at ``place``."""
     while True:
         joined = place.joined(after(item, place))
         if joined == place:
@@ -304,7 +291,6 @@ def steady(item: FieldType, place: Place) -> Place:
 
 
 def first_alignment(type_: FieldType) -> int:
-    """Return the alignment of the first byte of a value."""
     if isinstance(type_, Primitive):
         return type_.size
     if isinstance(type_, Message):
@@ -315,7 +301,7 @@ def first_alignment(type_: FieldType) -> int:
 
 
 def least_size(type_: FieldType) -> int:
-    """Return the least number of bytes a value takes; never 0, so it limits how many can be."""
+    """Return the smallest size of a value, at least 1: it limits the number of items."""
     if isinstance(type_, Primitive):
         return type_.size
     if isinstance(type_, Message):

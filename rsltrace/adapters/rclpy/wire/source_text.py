@@ -1,8 +1,7 @@
-"""Python source under construction: constants, indented blocks, and updates of the position.
+"""Generated Python source: constants, indented blocks, and updates of the position.
 
-Both code generators keep the position in the message in a variable ``p``. Most of the updates they
-write turn out to be of no use, because what follows does not depend on the position; those are left
-out here, at the end, when that is known.
+Both code generators keep the position in the message in a variable ``p``. Most updates of it turn
+out to be useless, as no later line reads it; they are removed at the end.
 """
 
 from __future__ import annotations
@@ -16,13 +15,12 @@ from typing import Any
 
 
 class Unusual(Exception):
-    """Raised and caught in generated code: this message needs the careful function."""
+    """Raised and caught in generated code: use the careful function."""
 
 
 @dataclass(slots=True)
 class _Line:
-    """A line of source. ``reads`` and ``writes`` tell whether it does so to ``p``; a line that only
-    updates ``p`` may be left out."""
+    """A line of source, and whether it ``reads`` and ``writes`` ``p``."""
 
     text: str
     reads: bool = False
@@ -37,7 +35,7 @@ class _Block:
     body: list[_Line | _Block] = field(default_factory=list)
 
 
-class Source:
+class FunctionSource:
     """The body of one function."""
 
     def __init__(self, constants: dict[str, Any]) -> None:
@@ -49,7 +47,7 @@ class Source:
     # -- writing ------------------------------------------------------------------------------
 
     def line(self, text: str) -> None:
-        """Add a line that has nothing to do with ``p``."""
+        """Add a line that does not use ``p``."""
         self._body.append(_Line(text))
 
     def use(self, text: str) -> None:
@@ -66,7 +64,7 @@ class Source:
 
     @contextmanager
     def block(self, header: str) -> Iterator[None]:
-        """Put what is written meanwhile into a loop."""
+        """Put the lines added within the ``with`` block into a loop."""
         outer, block = self._body, _Block(header)
         outer.append(block)
         self._body = block.body
@@ -91,10 +89,10 @@ class Source:
     def compile(
         self, name: str, argument: str, careful: Callable[[Any], Any], title: str
     ) -> Callable[[Any], Any]:
-        """Return the function ``name(argument)``; if anything in it raises, it asks ``careful``."""
+        """Return the function ``name(argument)``; it calls ``careful`` if anything raises."""
         body, _ = _without_idle_updates(self._body, False)
         lines = [f"def {name}({argument}):", "    try:", *_indented(body or [_Line("pass")], 2)]
-        # Not called inside the handler: its own error would show ours as its context.
+        # Not called in the handler: its error would have ours as its context.
         lines += ["    except Exception:", "        pass", f"    return careful({argument})"]
         text = "\n".join(lines) + "\n"
         namespace = self._constants | {"careful": careful, "Unusual": Unusual}
@@ -113,10 +111,8 @@ def packer(codes: str) -> struct.Struct:
 def _without_idle_updates(
     body: list[_Line | _Block], needed: bool
 ) -> tuple[list[_Line | _Block], bool]:
-    """Return the body without updates of ``p`` that nothing reads, and whether it needs ``p``.
-
-    ``needed`` tells whether what comes after the body does.
-    """
+    """Return the body without useless updates of ``p``, and whether it needs ``p``. ``needed``:
+    the code after the body needs it."""
     kept: list[_Line | _Block] = []
     for item in reversed(body):
         if isinstance(item, _Block):

@@ -1,8 +1,7 @@
-"""What an interface is made of, as ``~/get_type_description`` answers it.
+"""Descriptions of interfaces for ``~/get_type_description``.
 
-rosidl compiles the description of every interface into its type support library. It is read from
-there, through the same pointers that rcl follows: the answer is that of a native node, whether or
-not definition files are installed. Interfaces that nobody has built have it in a file.
+rosidl compiles them into the type support libraries; they are read through the same pointers that
+rcl follows. Those of interfaces that are not built are in a file.
 """
 
 from __future__ import annotations
@@ -75,7 +74,7 @@ _GET_HASH = CFUNCTYPE(POINTER(_Hash), c_void_p)
 _GET_DESCRIPTION = CFUNCTYPE(POINTER(_Description), c_void_p)
 _GET_SOURCES = CFUNCTYPE(POINTER(_sequence_of(_Source)), c_void_p)
 
-# How many pointers stand before the three functions in rosidl's type support structures.
+# The number of pointers before the three functions in rosidl's type support structures.
 _BEFORE = {"message": 3, "service": 8, "action": 5}
 
 
@@ -124,7 +123,7 @@ def _pointer(capsule: Any) -> int:
 
 @cache
 def type_description(interface: Any) -> TypeDescription | None:
-    """Describe a message, service or action class; None if its type support cannot tell."""
+    """Describe a message, service or action class; None if its type support has no description."""
     metaclass = type(interface)
     if metaclass._TYPE_SUPPORT is None:
         metaclass.__import_type_support__()
@@ -156,34 +155,15 @@ def type_description(interface: Any) -> TypeDescription | None:
 
 
 def _from_file(name: str) -> TypeDescription | None:
-    """Read what rosidl has written down of an interface whose type support is not compiled."""
+    """Read rosidl's description of an interface whose type support is not compiled."""
     read = installed_description(name)
     if read is None:
         return None
-    whole, hashes = read["type_description_msg"], read["type_hashes"]
-    types = [whole["type_description"], *whole["referenced_type_descriptions"]]
-    text = installed_file_text(name)
-    kind = name.split("/")[1]
+    whole, text = read.type_description_msg, installed_file_text(name)
     return TypeDescription(
-        type_hash=next(h["hash_string"] for h in hashes if h["type_name"] == name),
-        types=tuple(
-            (
-                described["type_name"],
-                tuple(
-                    (
-                        field["name"],
-                        field["type"]["type_id"],
-                        field["type"]["capacity"],
-                        field["type"]["string_capacity"],
-                        field["type"]["nested_type_name"],
-                        field["default_value"],
-                    )
-                    for field in described["fields"]
-                ),
-            )
-            for described in types
-        ),
-        sources=() if text is None else ((name, kind, text),),
+        type_hash=next(h.hash_string for h in read.type_hashes if h.type_name == name),
+        types=tuple(map(_type, [whole.type_description, *whole.referenced_type_descriptions])),
+        sources=() if text is None else ((name, name.split("/")[1], text),),
     )
 
 
@@ -202,15 +182,19 @@ def _type(described: Any) -> tuple[str, tuple[tuple[str, int, int, int, str, str
 
 
 def _items(sequence: Any) -> list[Any]:
+    if isinstance(sequence, list):  # from a file
+        return sequence
     return [sequence.data[index] for index in range(sequence.size)]
 
 
 def _text(string: Any) -> str:
+    if isinstance(string, str):  # from a file
+        return string
     return string_at(string.data, string.size).decode() if string.data else ""
 
 
-def answer(request: Any, response_type: Any, interfaces: Iterable[Any]) -> Any:
-    """Answer a GetTypeDescription request from the interfaces that a node uses, as rcl does."""
+def answer_request(request: Any, response_type: Any, interfaces: Iterable[Any]) -> Any:
+    """Answer a GetTypeDescription request about a node's interfaces, as rcl does."""
     from type_description_interfaces.msg import TypeSource
 
     wanted = str(request.type_hash)

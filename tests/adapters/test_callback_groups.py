@@ -15,7 +15,7 @@ from rclpy.node import Node
 
 from rsltrace import NodeSpec
 from rsltrace.errors import RunError
-from tests.doors.callback_groups_program import Alternating, Counting, Gate
+from tests.adapters.callback_groups_program import Alternating, Counting, Gate
 
 pytestmark = pytest.mark.ros
 

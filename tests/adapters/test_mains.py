@@ -568,7 +568,7 @@ def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
 
 @pytest.mark.long
 def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
-    from rsltrace.adapters.rclpy.stacks.program import _FAILURES_MAX, Program
+    from rsltrace.adapters.rclpy.stacks.program import _FAILURES_MAX, SimulatedProgram
 
     kept: list[int] = []
 
@@ -595,7 +595,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
         import gc
 
         gc.unfreeze()
-        held = [each for each in gc.get_objects() if isinstance(each, Program)]
+        held = [each for each in gc.get_objects() if isinstance(each, SimulatedProgram)]
         kept.extend(len(each.failures) for each in held if each.entry and each.failures)
         rclpy.shutdown()
 

@@ -61,8 +61,8 @@ from rsltrace.adapters.rclpy.wire.message_spec import (  # noqa: E402  # noqa: E
     HEADER,
     START,
     Array,
+    KnownOffset,
     Message,
-    Place,
     Primitive,
     Text,
     message_spec,
@@ -722,9 +722,9 @@ def test_a_wstring_that_is_not_utf_16_is_refused(unit: str) -> None:
 
 
 def test_what_is_known_of_a_place_is_true_of_every_position_it_stands_for() -> None:
-    places = [Place(modulus, rest) for modulus in (1, 2, 4, 8) for rest in range(modulus)]
+    places = [KnownOffset(modulus, rest) for modulus in (1, 2, 4, 8) for rest in range(modulus)]
 
-    def positions(place: Place) -> set[int]:
+    def positions(place: KnownOffset) -> set[int]:
         return {p for p in range(64) if p % place.modulus == place.rest}
 
     for place in places:
@@ -735,7 +735,7 @@ def test_what_is_known_of_a_place_is_true_of_every_position_it_stands_for() -> N
                 assert (position + size) % 64 in positions(place.moved(size))
         for other in places:
             assert positions(place) | positions(other) <= positions(place.joined(other))
-    assert START.joined(Place(8, 4)) == Place(4, 0)
+    assert START.joined(KnownOffset(8, 4)) == KnownOffset(4, 0)
 
 
 # -- other readers ---------------------------------------------------------------------------------

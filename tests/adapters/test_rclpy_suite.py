@@ -78,7 +78,10 @@ def test_every_outcome_is_told(tmp_path: Path) -> None:
     name = "test/test_node.py::TestAll::test_"
     assert "test_node.py: 2 of 6" in said
     assert f"failed {name}b_fails: call: AssertionError: assert 'all' == 'nobody'" in said
-    assert f"hung {name}c_hangs: nothing can happen any more, but somebody waits" in said
+    assert (
+        f"hung {name}c_hangs: deadlock: nothing can happen any more, and these calls still wait"
+        in said
+    )
     assert f"crashed {name}d_crashes: the process ended with status -11" in said
     assert f"skipped {name}e_is_skipped" in said
     assert (tmp_path / "passed.txt").read_text().split() == [

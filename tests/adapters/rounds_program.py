@@ -1,6 +1,6 @@
 """Nodes on one executor of rclpy's, whose callbacks make others ready as a seed says.
 
-    python tests/doors/rounds_program.py SEED…
+    python tests/adapters/rounds_program.py SEED…
 
 prints who ran, in order, a line for each seed. Run by Python (over DDS) and by rsltrace. A callback
 that makes timers sleeps until they are due, so that the order does not depend on how fast the

@@ -18,7 +18,7 @@ from rclpy.node import Node
 
 import rsltrace
 from rsltrace.errors import UnsupportedError
-from tests.doors.test_mains import main_spec
+from tests.adapters.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 

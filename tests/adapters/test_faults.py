@@ -364,6 +364,6 @@ def test_what_cannot_happen_is_told() -> None:
     )
     assert "there was no node /talkr at 0.001000000 s" in notes
     assert "no node fits '/talkr'; did you mean '/talker'" in notes
-    assert "faults[1]: this fault did not happen: it has not come to that" in notes
+    assert "faults[1]: this fault did not happen: the run ended before it" in notes
     assert "faults[2]: this fault did not happen: there were 3 messages on /count" in notes
     assert result({"drop": "/count", "message": 1}).notes == ()

@@ -1,9 +1,8 @@
-"""rclpy's executors on simulated time: what they wait for, and what they get to run.
+"""rclpy's executors on simulated time.
 
-All of rclpy's executors, and those that users derive from ``rclpy.executors.Executor``, ask
-``wait_for_ready_callbacks`` for the next thing to do. Here that is answered from the mailboxes of
-the executor's nodes; if they are empty, the stack is set aside until something comes. Everything
-else (``spin``, ``spin_once``, worker threads, when exceptions come out where) is rclpy's own code.
+All executors ask ``wait_for_ready_callbacks`` for the next callback. It is answered from the
+mailboxes of the executor's nodes; if they are empty, the call blocks in simulated time. Everything
+else (``spin``, ``spin_once``, worker threads, exceptions) is rclpy's own code.
 """
 
 from __future__ import annotations
@@ -12,12 +11,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rsltrace.adapters.rclpy.executors.standby import Ran, Standby, standby_of
+from rsltrace.adapters.rclpy.executors.standby import FinishedTask, Standby, standby_of
 from rsltrace.adapters.rclpy.handles.wait_set import activate_node
-from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
+from rsltrace.adapters.rclpy.stacks.blocking_calls import (
+    POLL_NS,
+    count_refused_wait,
+    suspended_event,
+    wait,
+)
 from rsltrace.adapters.rclpy.stacks.callback_groups import begin, is_busy, is_custom
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, awaited
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, describe_awaited
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.middleware.graph import Graph
@@ -25,10 +29,10 @@ from rsltrace.simulation.middleware.graph import Graph
 _WORK = "work for its executor"
 
 
-class Pump:
-    """The simulated part of one executor."""
+class ExecutorDriver:
+    """Feeds one executor of user code with the callbacks that are ready."""
 
-    def __init__(self, stacks: Stacks, executor: Any) -> None:
+    def __init__(self, stacks: Runtime, executor: Any) -> None:
         from rclpy import executors
         from rclpy.utilities import timeout_sec_to_nsec
 
@@ -38,12 +42,12 @@ class Pump:
         self._in_ns: Any = timeout_sec_to_nsec
         self.nodes: dict[Any, Mailbox] = {}
         self.tasks = Mailbox(stacks.loop)
-        self.tasks.pump = self
-        self.waits: list[Wait] = []
+        self.tasks.driver = self
+        self.waits: list[BlockedCall] = []
         self.standby: Standby | None = None
         """The stack that spins, while it can be given what is ready."""
         self.woken = False
-        """Whether there has been a reason to look again."""
+        """Whether there was a reason to look again."""
         self._looked_ns = -1
         self._name = f"executor {stacks.loop.next_place()}"
         self._asked: tuple[Any, ...] = ()
@@ -53,7 +57,7 @@ class Pump:
         handle = node.handle
         if handle.mailbox is None:
             handle.mailbox = Mailbox(self.stacks.loop)
-        handle.mailbox.pump = self
+        handle.mailbox.driver = self
         self.nodes[node] = handle.mailbox
         if handle.wrapper is not node:
             handle.wrapper = node
@@ -61,21 +65,21 @@ class Pump:
         self.wake()
 
     def remove(self, node: Any) -> None:
-        """Leave what is ready of a node in its mailbox, for whoever spins it next."""
+        """Stop running a node's callbacks; ready ones stay in its mailbox."""
         mailbox = self.nodes.pop(node, None)
-        if mailbox is not None and mailbox.pump is self:
-            mailbox.pump = None
+        if mailbox is not None and mailbox.driver is self:
+            mailbox.driver = None
         self.wake()
 
     def close(self) -> None:
-        """Take no more part: the executor is shut down."""
+        """Give up all nodes: the executor is shut down."""
         for node in list(self.nodes):
             self.remove(node)
         self.tasks.close()
         self.wake()
 
     def wake(self) -> None:
-        """Let who waits look again: something has come, or changed."""
+        """Let every waiting spin look again."""
         self.woken = True
         standby, self.standby = self.standby, None
         if standby is not None:
@@ -87,9 +91,9 @@ class Pump:
     def next(
         self, timeout: Any, nodes: list[Any] | None, condition: Callable[[], bool]
     ) -> tuple[Any, Any, Any]:
-        """Do ``wait_for_ready_callbacks``: return a task that runs the next callback.
+        """Implement ``wait_for_ready_callbacks``: return a task that runs the next callback.
 
-        :raises: rclpy's exceptions for a timeout, a shutdown, and a condition that has come true.
+        :raises: rclpy's exceptions for a timeout, a shutdown, or a condition that is met.
         """
         executors = self._rclpy
         self.stacks.programs.present.spun = True
@@ -108,7 +112,7 @@ class Pump:
                 raise executors.ConditionReachedException
             if not self.executor.context.ok():
                 if self.stacks.ending.closing:
-                    lose_patience(self.stacks)
+                    count_refused_wait(self.stacks)
                 raise executors.ExternalShutdownException
             taken = self._take(nodes)
             if taken is not None:
@@ -117,11 +121,8 @@ class Pump:
             standby = standby_of(self.stacks, self, nodes, condition, has_limit=has_limit)
             if until_ns is None:
                 patient = _is_always(condition) and not self.stacks.dispatcher.in_callback()
-                what = (
-                    _WORK
-                    if _is_always(condition)
-                    else _Awaited(self.stacks.domain.graph, condition)
-                )
+                graph = self.stacks.domain.graph
+                what = _WORK if _is_always(condition) else _AwaitedFuture(graph, condition)
                 self._wait(None, what=what, patient=patient, standby=standby)
             elif loop.now_ns < until_ns:
                 self._wait(until_ns - loop.now_ns, what=_WORK, standby=standby)
@@ -131,10 +132,10 @@ class Pump:
                 looked = True
                 self._wait(self._look_ns(), what="its turn", standby=standby)
             if standby is not None and standby.is_over:
-                return Ran(standby.failure), None, None
+                return FinishedTask(standby.failure), None, None
 
     def _look_ns(self) -> int:
-        """Return how long a look without a timeout takes: nothing, for the first at an instant."""
+        """Return how long a poll takes: 0 for the first one at an instant."""
         now_ns = self.stacks.loop.now_ns
         again, self._looked_ns = self._looked_ns == now_ns, now_ns
         return POLL_NS if again else 0
@@ -157,8 +158,8 @@ class Pump:
         self.waits = [blocked for blocked in self.waits if blocked in self.stacks.runners.blocked]
 
     def _take(self, nodes: list[Any] | None) -> tuple[Any, Mailbox, Dispatchable] | None:
-        """Take out what is next: tasks first, as in rclpy, then in the order of arrival; or what
-        the policy chooses, if it is asked for that."""
+        """Take the next item: tasks first, as in rclpy, then in order of arrival; or the policy's
+        choice, if the policy polls."""
         if isinstance(self.stacks.loop, OrderedLoop) and self.stacks.loop.polls:
             return self._choose(self.stacks.loop, nodes)
         if self.tasks.entries:
@@ -180,7 +181,7 @@ class Pump:
     def _choose(
         self, loop: OrderedLoop, nodes: list[Any] | None
     ) -> tuple[Any, Mailbox, Dispatchable] | None:
-        """Take out what the policy chooses of all that is ready by now."""
+        """Take the item that the policy chooses among all that are ready."""
         loop.hand_over()
         ready = [(None, self.tasks, entry) for entry in self.tasks.entries]
         for node, mailbox in self.nodes.items():
@@ -203,7 +204,7 @@ class Pump:
         return node, mailbox, entry[1]
 
     def _parked(self, mailbox: Mailbox, place: int, item: Any) -> bool:
-        """Keep what its callback group does not let run now until the group is free."""
+        """Park an item whose callback group is busy until the group is free."""
         wrapper = getattr(item, "wrapper", None)
         group = getattr(wrapper, "callback_group", None)
         if group is None or not is_busy(group, wrapper):
@@ -211,8 +212,8 @@ class Pump:
 
         def retry() -> None:
             mailbox.entries.appendleft((place, item))
-            if mailbox.pump is not None:
-                mailbox.pump.wake()
+            if mailbox.driver is not None:
+                mailbox.driver.wake()
 
         self.stacks.groups.park(group, item, retry)
         return True
@@ -222,10 +223,10 @@ class Pump:
         return task, getattr(item, "wrapper", None), node
 
     def _run(self, mailbox: Mailbox, item: Dispatchable) -> None:
-        """Run one callback as an event, on the stack that spins."""
+        """Run one callback as an event, on the spinning stack."""
         stacks = self.stacks
         stacks.event.took_ns = 0
-        with set_aside(stacks):
+        with suspended_event(stacks):
             mailbox.run(item)
         failure, mailbox.raised = mailbox.raised, None
         if stacks.event.took_ns:
@@ -234,7 +235,7 @@ class Pump:
             raise failure
 
     def _be_busy(self, item: Any, for_ns: int) -> None:
-        """Let the execution time of a callback pass, on the stack and in the group that ran it."""
+        """Let the callback's execution time pass, with its stack and group busy."""
         wrapper = getattr(item, "wrapper", None)
         group = getattr(wrapper, "callback_group", None)
         held = group is not None and not is_custom(group) and not is_busy(group, wrapper)
@@ -247,33 +248,29 @@ class Pump:
                 self.stacks.groups.end(group, wrapper)
 
 
-class _Awaited:
-    """Says which future a spin waits for, when somebody asks."""
+class _AwaitedFuture:
+    """Describes the future that a spin waits for."""
 
     def __init__(self, graph: Graph, condition: Callable[[], bool]) -> None:
         self._graph = graph
         self._future = getattr(condition, "__self__", None)
 
     def __str__(self) -> str:
-        return f"a future to be completed: {awaited(self._graph, self._future)}"
+        return f"a future to be completed: {describe_awaited(self._graph, self._future)}"
 
 
 def _is_stale(item: Any) -> bool:
-    """Say whether there is nothing to do any more: destroyed, or dropped from a full queue."""
+    """Return whether an item was destroyed, or its message dropped from a full queue."""
     return getattr(item, "destroyed", False) or not getattr(item, "queue", True)
 
 
 def _is_always(condition: Callable[[], bool]) -> bool:
-    """Say whether a condition is none: rclpy's default for ``spin_once``."""
+    """Return whether a condition is rclpy's default, which is never met."""
     return getattr(condition, "__name__", "") == "<lambda>"
 
 
-def pump_of(stacks: Stacks, executor: Any) -> Pump:
-    """Return the simulated part of an executor."""
-    pump: Pump | None = executor.__dict__.get("_rsltrace_pump")
-    if pump is None or pump.stacks is not stacks:
-        pump = executor.__dict__["_rsltrace_pump"] = Pump(stacks, executor)
-    return pump
-
-
-__all__ = ["Pump", "pump_of"]
+def driver_of(stacks: Runtime, executor: Any) -> ExecutorDriver:
+    driver: ExecutorDriver | None = executor.__dict__.get("_rsltrace_driver")
+    if driver is None or driver.stacks is not stacks:
+        driver = executor.__dict__["_rsltrace_driver"] = ExecutorDriver(stacks, executor)
+    return driver

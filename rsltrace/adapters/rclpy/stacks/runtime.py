@@ -1,10 +1,9 @@
-"""Blocked calls, and the stacks that run the loop meanwhile.
+"""The runtime of user code in one run: blocked calls, and the call stacks (greenlets) they wait on.
 
-There is one thread, so whoever blocks gives its call stack up for a while: greenlets do that. The
-loop runs on the stack of whoever runs it; when a callback blocks deep inside it, another stack
-takes the loop over, and when the wait is over the loop's present runner switches back to the
-callback, which finishes and goes on as the loop's runner. Callbacks that do not block (nearly all)
-never meet any of this.
+All simulated threads share one real thread. When a callback blocks, its stack is suspended and
+another stack takes over the loop. When the wait is over, that stack switches back to the callback,
+which finishes and then runs the loop itself. Callbacks that do not block (nearly all) involve none
+of this.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.adapters.rclpy.stacks.callback_groups import CallbackGroups
 from rsltrace.adapters.rclpy.stacks.coroutines import Coroutines
-from rsltrace.adapters.rclpy.stacks.mailbox import called_service
-from rsltrace.adapters.rclpy.stacks.program import Program, Programs
+from rsltrace.adapters.rclpy.stacks.mailbox import describe_service_call
+from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram, SimulatedPrograms
 from rsltrace.errors import EXIT_RUN
 from rsltrace.guard.callers import is_telling
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
@@ -35,21 +34,21 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 _RESUME = int(EventKind.RESUME)
 
 Patience = bool | Callable[[], bool]
-"""Whether it is in order to wait for ever, or what says so when somebody asks."""
+"""Whether a wait may last for ever, or a function that returns it."""
 
 
 class RunEnded(BaseException):
     """Raised in a blocked call when the run ends, so that ``finally`` blocks run."""
 
 
-class Runners:
-    """The stacks of one run. ``waiting`` are those that wait to run the loop again, ``main`` is the
-    one that began. What happens in another ``process`` or real ``thread`` is not simulated."""
+class LoopStacks:
+    """The stacks that run the loop: ``waiting`` are those that wait to run it again, ``main`` is
+    the first. Nothing in another ``process`` or real ``thread`` is simulated."""
 
     def __init__(
         self,
         domain: Domain,
-        programs: Programs,
+        programs: SimulatedPrograms,
         groups: CallbackGroups,
         run: Callable[[], None],
     ) -> None:
@@ -58,21 +57,20 @@ class Runners:
         self.groups = groups
         self.process = os.getpid()
         self.thread = get_ident()
-        self.blocked: dict[Wait, None] = {}
+        self.blocked: dict[BlockedCall, None] = {}
         self.main: greenlet | None = None
         self.waiting: list[greenlet] = []
         self.error: BaseException | None = None
         self.numbers: WeakKeyDictionary[greenlet, int] | None = None
-        """A number for each stack whose callback has been at a line where another could go on, if
-        threads are switched at lines."""
+        """Numbers of stacks that could switch at a line, if threads do."""
         self._next_number = itertools.count(1).__next__
         self._run = run
         self._maker: greenlet | None = None
 
     def next(self) -> greenlet:
-        """Return the stack to switch to when a callback blocks: who runs the loop from then on.
+        """Return the stack that runs the loop when a callback blocks.
 
-        New runners all begin on the stack of one maker, so that however many calls are blocked, the
+        New stacks all begin on the stack of one maker, so that however many calls are blocked, the
         next callback does not run deeper (in Python's recursion limit, and in C).
         """
         if self.waiting:
@@ -82,7 +80,7 @@ class Runners:
         return self._maker
 
     def close(self) -> None:
-        """Let go of the stack that makes runners, or it would keep this world alive for ever."""
+        """Drop the maker, which would keep this world alive."""
         maker, self._maker = self._maker, None
         if maker is not None:
             maker.throw()
@@ -92,7 +90,7 @@ class Runners:
             greenlet(self._run, self.main).switch()
 
     def number_of(self, stack: greenlet) -> int:
-        """Return the number of a stack, where stacks have numbers."""
+        """Return the number of a stack; 0 if stacks have none."""
         if self.numbers is None:
             return 0
         number = self.numbers.get(stack)
@@ -101,15 +99,15 @@ class Runners:
         return number
 
     def step_aside(self) -> None:
-        """Have whoever switched to the present stack go on once it ends."""
+        """Let the stack that switched to the current one go on when this ends."""
         getcurrent().parent = self.waiting.pop()
 
 
-class Wait:
-    """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
+class BlockedCall:
+    """One blocked call. ``wake`` makes it ready; it is dispatched like an event."""
 
     def __init__(
-        self, runners: Runners, what: object, group: object, *, quiet: bool, patient: Patience
+        self, runners: LoopStacks, what: object, group: object, *, quiet: bool, patient: Patience
     ) -> None:
         domain, programs = runners.domain, runners.programs
         event = domain.event
@@ -117,7 +115,7 @@ class Wait:
         self.what = what
         self._patient = patient
         self.error: BaseException | None = None
-        """What to raise in the blocked call when it goes on."""
+        """The exception that the call raises when it goes on."""
         self.program = programs.present
         self.since_ns = domain.loop.now_ns
         self.deadline_ns: int | None = None
@@ -126,9 +124,9 @@ class Wait:
         self.stack = getcurrent()
         self.timed_out = False
         self.woken = False
-        """Whether anything lets the call return."""
+        """Whether the call may return."""
         self.event = (event.handle, event.entity, event.node)
-        """Whose event it is that waits: handle, entity and node."""
+        """The event that waits: handle, entity and node."""
         self.constructing = programs.constructing
         """The entry under construction where it waits."""
         self._end_group = event.on_end
@@ -148,23 +146,22 @@ class Wait:
 
     @property
     def waiting(self) -> bool:
-        """Whether nothing has let the call return yet."""
         return not self.woken
 
     def stop_waiting(self) -> None:
-        """Take no more notice of what the call waited for."""
+        """Ignore later wake-ups."""
         self.woken = True
 
     def is_patient(self) -> bool:
-        """Return whether it is in order to wait for ever: for more work, say."""
-        patient, self._patient = self._patient, False  # False, should somebody ask in a circle
+        """Return whether the call may wait for ever (for more work, say)."""
+        patient, self._patient = self._patient, False  # False, if asked in a circle
         try:
             return patient if isinstance(patient, bool) else patient()
         finally:
             self._patient = patient
 
     def wake(self) -> None:
-        """Let the call return: because of the event under way."""
+        """Let the call return because of the current event."""
         if not self.woken:
             self.woken = True
             domain = self._runners.domain
@@ -174,32 +171,31 @@ class Wait:
             domain.loop.tasks.append(self)
 
     def release(self) -> None:
-        """Let the call return, because of nothing that has an event."""
+        """Let the call return without a causing event."""
         if not self.woken:
             self.woken = True
             self._runners.domain.loop.tasks.append(self)
 
     def time_out(self) -> None:
-        """Let the call return: because its time is up."""
+        """Let the call return because of its timeout."""
         if not self.woken:
             self.woken = self.timed_out = True
             self._runners.domain.loop.ready.append(self)
 
     def give_way(self, output: int) -> None:
-        """Let the call return when it is its turn among those that are ready: it waits for nothing.
-        ``output`` of the event under way says so."""
+        """Let the call return when it is its turn; ``output`` of the current event is the cause."""
         self.woken = True
         self._cause = (self._runners.domain.loop.events, output)
         self._runners.domain.loop.ready.append(self)
 
     @property
     def held(self) -> list[Any] | None:
-        """Where it is kept if its process hangs or has crashed, else None."""
+        """The list that keeps it while its process hangs or after a crash, else None."""
         held = self.program.held
         return held if held is not None or self.event[2] is None else self.event[2].held
 
     def dispatch(self) -> None:
-        """Give the loop's runner up to the blocked call (called on the runner's stack)."""
+        """Switch from the stack that runs the loop to the blocked call."""
         if (held := self.held) is not None:
             held.append(self)
             return
@@ -207,7 +203,7 @@ class Wait:
         self.stack.switch()
 
     def resumed(self) -> None:
-        """Begin the RESUME event (called on the blocked call's own stack)."""
+        """Begin the RESUME event, on the stack of the blocked call."""
         dispatcher, programs = self._runners.domain.dispatcher, self._runners.programs
         event = dispatcher.event
         event.handle, event.entity, event.node = self.event
@@ -226,45 +222,41 @@ class Wait:
             observer.resumed()
 
     def follow(self, event: int) -> None:
-        """Go on after ``event``, which has run on the stack meanwhile."""
+        """Make ``event``, which has run on the stack meanwhile, the cause."""
         self._cause = (event, 0)
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: a callback under way goes on, and has its worker."""
+        """Describe it to a policy: it already has its worker."""
         thread = self._runners.number_of(self.stack)
         return Runnable("resume", "", self.entity_id, thread=thread)
 
     def describe(self) -> str:
-        """Name the callback that waits."""
         return self.event[0].describe() if self.event[0] is not None else "the run"
 
     def waits_for(self) -> str:
-        """Say who waits for what, with the lines of user code that led there."""
+        """Describe who waits for what, with the lines of user code."""
         frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
         own = [frame for frame in frames if is_telling(frame.filename)]
         where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
         hint = ""
         if self._group is not None and self._runners.groups.waiting_for(self._group):
             hint = (
-                ", which may be among the events that wait for its callback group: a blocked "
+                ", which may be one of the events that wait for its callback group: a blocked "
                 "callback keeps a mutually exclusive group busy, so give the client, timer or "
                 "subscription it waits for a callback group of its own"
             )
         graph = self._runners.domain.graph
-        what = called_service(graph, self.stack.gr_frame) or self.what
+        what = describe_service_call(graph, self.stack.gr_frame) or self.what
         return f"{self.describe()} waits for {what}{hint}{where}"
 
 
-# The call stacks of user code in one run: who blocks, who is suspended, whose process it is.
-
-
-class Thread(Protocol):
+class UserThread(Protocol):
     """A thread that user code has started."""
 
     ident: int
     daemon: bool
     ended: bool
-    program: Program
+    program: SimulatedProgram
     node: Any
     thread: Any
 
@@ -272,33 +264,32 @@ class Thread(Protocol):
         """Wait until it has ended."""
 
     def dismiss(self) -> None:
-        """Let it end when it has done its work."""
+        """Let the worker of a pool end after its work."""
 
     def end(self) -> None:
-        """Take note that it has ended."""
+        """Mark it as ended."""
 
 
-class Threads:
-    """The threads of user code that have not ended, and the stacks they run on."""
+class UserThreads:
+    """The running threads of user code, and their stacks."""
 
     def __init__(self) -> None:
-        self.alive: dict[Thread, None] = {}
-        self.by_stack: dict[greenlet, Thread] = {}
+        self.alive: dict[UserThread, None] = {}
+        self.by_stack: dict[greenlet, UserThread] = {}
         self.count = 0
 
     def runs_on(self, stack: greenlet) -> bool:
-        """Return whether a stack is that of a thread which user code has started."""
+        """Return whether a stack is that of a thread."""
         return stack in self.by_stack
 
 
 @dataclass(slots=True)
-class Ending:
-    """How far the end of a run is. ``closing``: mains are told to end, and do. ``unwinding``:
-    nothing waits any more, blocked calls raise ``RunEnded``. ``stuck`` says who still waited when
-    nothing could happen any more.
+class RunEnding:
+    """The stages of the end of a run. ``closing``: mains are interrupted. ``unwinding``: blocked
+    calls raise ``RunEnded``. ``stuck`` describes the waiting calls of a deadlock.
 
-    ``grace_ns`` and ``shutdown_ns`` are how long mains and ``destroy_node`` have slept since, while
-    time stands still; ``refused`` counts the waits of those who go on regardless.
+    ``grace_ns`` and ``shutdown_ns``: how long mains and ``destroy_node`` have slept since, while
+    time stands still. ``refused`` counts waits after the end.
     """
 
     closing: bool = False
@@ -309,8 +300,8 @@ class Ending:
     refused: int = 0
 
 
-class Stacks:
-    """What the stacks of user code have to do with: each value has one job, see its class.
+class Runtime:
+    """The state of user code in one run; each attribute is explained at its class.
 
     ``executor`` is the rclpy Executor of the nodes that the job constructs.
     """
@@ -320,20 +311,20 @@ class Stacks:
         self.loop = domain.loop
         self.dispatcher = domain.dispatcher
         self.event = domain.event
-        self.ending = Ending()
+        self.ending = RunEnding()
         self.groups = CallbackGroups(domain)
-        self.programs = Programs()
-        self.threads = Threads()
+        self.programs = SimulatedPrograms()
+        self.threads = UserThreads()
         self.coroutines = Coroutines(domain)
-        self.runners = Runners(domain, self.programs, self.groups, self._take_over)
+        self.runners = LoopStacks(domain, self.programs, self.groups, self._take_over)
         self.executor: Any = None
         self.runs_callbacks: Any = None
-        """What user code has put in place of rclpy's ``await_or_execute``, if it has."""
+        """The function that user code put in place of rclpy's ``await_or_execute``, if any."""
 
     def _take_over(self) -> None:
-        """Run the loop on a stack of its own, because its runner's callback has blocked.
+        """Run the loop on another stack, because a callback blocked.
 
-        When the loop ends, whatever stack it ran on, the stack that began the run goes on.
+        When the loop ends, the stack that began the run goes on.
         """
         runners = self.runners
         try:
@@ -350,13 +341,13 @@ class Stacks:
         getcurrent().parent = runners.main
 
     def _note_stuck(self) -> None:
-        """Remember who still waits if the run has ended because nothing can happen any more."""
+        """Note the waiting calls if the run ended for lack of events."""
         stopped = self.loop.stopped
         if stopped is not None and stopped.reason == NOTHING_LEFT and not self.ending.stuck:
             self.ending.stuck = self.who_waits()
 
     def who_waits(self) -> list[str]:
-        """Say of every suspended coroutine and blocked call what it waits for."""
+        """Describe what every suspended coroutine and blocked call waits for."""
         suspended = [run for run in self.coroutines.suspended if not run.task.cancelled()]
         blocked = [one for one in self.runners.blocked if one.held is None]  # does not hang
         waits = [run.waits_for() for run in suspended if run.node is None or run.node.held is None]

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 
 from rsltrace.cli.main import cli
 from rsltrace.trace.model.finding import waits_of
-from tests.doors.test_mains import main_spec
+from tests.adapters.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 
@@ -151,7 +151,7 @@ def test_an_executor_that_a_callback_keeps_busy(simulate: Any) -> None:
         names = {trace.entities[one].name for one in wait.held}
     assert wait.since_ns == 1_000_000_000
     line = Robot.begin.__code__.co_firstlineno + 2
-    assert wait.text.endswith(f"of /ask (1 server) at test_held_back.py:{line} in begin")
+    assert wait.text.endswith(f"of /ask (1 server) at test_endless_waits.py:{line} in begin")
     assert names >= {"/ask", "Other.tick"}
     told = CliRunner().invoke(cli, ["info", str(recorded.path)]).output
     assert f"waiting    since 1.000000000 s: {wait.text}" in told

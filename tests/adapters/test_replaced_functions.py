@@ -15,7 +15,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace.adapters.rclpy.executors import user_executors
-from tests.doors.test_mains import main_spec
+from tests.adapters.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 
@@ -142,7 +142,9 @@ def test_others_that_are_replaced_are_told(simulate: Any, monkeypatch: pytest.Mo
     monkeypatch.setattr(Executor, "_take_timer", take)
     (note,) = told(simulate(lambda: Busy([]), duration=1.5))
     line = take.__code__.co_firstlineno
-    assert note.startswith(f"tests/doors/test_exchanged_functions.py:{line}: Executor._take_timer")
+    assert note.startswith(
+        f"tests/adapters/test_replaced_functions.py:{line}: Executor._take_timer"
+    )
     assert "is never called" in note
     assert "await_or_execute" in note
 
@@ -207,7 +209,7 @@ def test_who_spins_a_node_again_and_again_looks_once(
 ) -> None:
     """``spin_once`` adds its node each time; to look takes longer than all the rest of it."""
     looks: list[Any] = []
-    monkeypatch.setattr(user_executors, "note_exchanged", lambda *args: looks.append(args))
+    monkeypatch.setattr(user_executors, "note_replaced_functions", lambda *args: looks.append(args))
 
     def program() -> None:
         rclpy.init()

@@ -20,7 +20,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
-from rsltrace.adapters.rclpy.executors import pump
+from rsltrace.adapters.rclpy.executors import executor_driver as driver
 from rsltrace.adapters.rclpy.executors.standby import Standby
 from rsltrace.errors import LivelockError
 
@@ -207,7 +207,7 @@ def compare(simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int, *, tame: 
     """Run the same with and without standing by; return how much was logged."""
     at_once = run(simulate, seed, tame=tame)
     with monkeypatch.context() as patch:
-        patch.setattr(pump, "standby_of", lambda *_, **__: None)
+        patch.setattr(driver, "standby_of", lambda *_, **__: None)
         usual = run(simulate, seed, tame=tame)
     assert at_once == usual
     return len(at_once[-1])

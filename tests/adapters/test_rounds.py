@@ -16,7 +16,7 @@ from rsltrace import NodeSpec
 from rsltrace.adapters.rclpy.stacks.coroutines import _run_oldest_first
 from rsltrace.simulation.loop.policy import Candidate, Moment
 from rsltrace.simulation.loop.wait_set import RclpyWaitSet
-from tests.doors.rounds_program import Busy, Shared, nodes_of
+from tests.adapters.rounds_program import Busy, Shared, nodes_of
 
 pytestmark = pytest.mark.ros
 

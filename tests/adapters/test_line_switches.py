@@ -117,7 +117,7 @@ def test_one_departure_is_one_switch_and_cat_and_diff_name_its_line(
         job = {**LINES, "policy": {"departures": departures}}
         simulate(Tally, duration=0.2, job=job).path.rename(tmp_path / f"{count}.mcap")
     line = Path(__file__).read_text().splitlines().index("        for step in (1, 0, 0):") + 1
-    place = f"tests/doors/test_line_switches.py:{line}"
+    place = f"tests/adapters/test_line_switches.py:{line}"
     assert "goes on before" not in told("cat", "0.mcap")[1]
     assert told("cat", "1.mcap")[1].count(f"another thread goes on before {place}") == 1
     rows = map(json.loads, told("cat", "1.mcap", "--json")[1].splitlines())
@@ -234,7 +234,7 @@ class Uneasy(Tally):
                 self.count += 0
                 self.count += 0
 
-        import tests.doors.imported_by_a_thread  # noqa: F401
+        import tests.adapters.imported_by_a_thread  # noqa: F401
 
         Left()
         json.dumps([Left()], default=str)

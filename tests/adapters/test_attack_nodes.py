@@ -303,7 +303,7 @@ def test_a_module_that_keeps_sleep_sleeps_in_every_run(
 
 
 def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
-    from rsltrace.adapters.rclpy.stacks.runners import Stacks
+    from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 
     class Waits(Ticker):
         def act(self) -> None:
@@ -312,7 +312,7 @@ def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
     def worlds() -> int:
         gc.unfreeze()
         gc.collect()
-        return sum(isinstance(thing, Stacks) for thing in gc.get_objects())
+        return sum(isinstance(thing, Runtime) for thing in gc.get_objects())
 
     before = worlds()  # of other tests, held by what they keep
     simulate(Waits, duration=2)

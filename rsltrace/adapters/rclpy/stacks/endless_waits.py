@@ -1,8 +1,7 @@
-"""Callbacks that waited until the end, and those that never ran because of it.
+"""Reports callbacks that waited until the end of the run, and those that never ran because of it.
 
-A callback that waits for something only a callback of its own mutually exclusive group can bring
-waits for ever. Where nothing else runs either, that is a deadlock, and reported as one; where other
-timers go on, the run ends as it should, and half of a node was dead all the time.
+A callback waits for ever if only a callback of its own mutually exclusive group could wake it. If
+nothing else runs, that is reported as a deadlock; if other timers go on, it is reported here.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
-from rsltrace.adapters.rclpy.stacks.runners import Stacks, Wait
+from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.simulation.loop.ordered import OrderedLoop, Workers
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity
@@ -19,21 +18,20 @@ from rsltrace.trace.model.finding import EndlessWait
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
 _LONG_NS = 1_000_000_000
-"""A shorter wait may well be over soon after the end, and is not told."""
+"""Shorter waits are not reported: they may be over soon after the end."""
 
 _NAMED_MAX = 4
 
 
-def note_waits(stacks: Stacks, outcome: Outcome) -> None:
-    """Say who still waits, at the end of a run, in a call that no passing of time ends, and what
-    that keeps from running."""
+def note_waits(stacks: Runtime, outcome: Outcome) -> None:
+    """Note the calls that wait without a timeout at the end, and the callbacks they hold back."""
     starved = _starved(stacks)
     blocked = [
         one
         for one in stacks.runners.blocked
         if one.waiting and one.deadline_ns is None and one.held is None and not one.is_patient()
     ]
-    told = _held_in_groups(stacks, outcome)
+    noted = _note_busy_groups(stacks, outcome)
     for one in blocked:
         text, waited_ns = one.waits_for(), stacks.loop.now_ns - one.since_ns
         candidates = starved.get(_workers(stacks, one.event[0]), [])
@@ -43,7 +41,7 @@ def note_waits(stacks: Stacks, outcome: Outcome) -> None:
         held += [getattr(handle, "entity_id", 0) for handle, _, _ in parked]
         numbers = tuple(sorted({number for number in held if number}))
         outcome.waits.append(EndlessWait(one.since_ns, text, numbers))
-        if waited_ns < _LONG_NS or one in told:
+        if waited_ns < _LONG_NS or one in noted:
             continue
         lasted = f"{format_duration(waited_ns)} until the end"
         if names:
@@ -55,8 +53,8 @@ def note_waits(stacks: Stacks, outcome: Outcome) -> None:
             outcome.notes.append(f"waited for {lasted}: {text}")
 
 
-def _starved(stacks: Stacks) -> dict[Workers | None, list[Candidate]]:
-    """Return what is ready and has no worker, by simulated executor."""
+def _starved(stacks: Runtime) -> dict[Workers | None, list[Candidate]]:
+    """Return the ready callbacks without a worker, by simulated executor."""
     found: dict[Workers | None, list[Candidate]] = {}
     if isinstance(stacks.loop, OrderedLoop):
         for place in stacks.loop.starved():
@@ -64,15 +62,15 @@ def _starved(stacks: Stacks) -> dict[Workers | None, list[Candidate]]:
     return found
 
 
-def _workers(stacks: Stacks, handle: Any) -> Workers | None:
-    """Return the simulated executor that the callbacks of a handle run on, None if on none."""
+def _workers(stacks: Runtime, handle: Any) -> Workers | None:
+    """Return the simulated executor of a handle's callbacks, if any."""
     loop, is_entity = stacks.loop, isinstance(handle, DomainEntity)
     return loop.place(handle).workers if is_entity and isinstance(loop, OrderedLoop) else None
 
 
-def _held_in_groups(stacks: Stacks, outcome: Outcome) -> list[Wait | TaskRun]:
-    """Say of every callback group that has been busy for long who waits for it, and why; return
-    who keeps them busy."""
+def _note_busy_groups(stacks: Runtime, outcome: Outcome) -> list[BlockedCall | TaskRun]:
+    """Note the callbacks that wait for a group which has long been busy; return those that keep the
+    groups busy."""
     holders = []
     for group, waiting in stacks.groups.parked.items():
         since_ns = min(since for _, since, _ in waiting)
@@ -97,8 +95,8 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
-def _holder(stacks: Stacks, group: object) -> Wait | TaskRun | None:
-    """Return the callback that keeps a group busy, unless it only waits for time to pass."""
+def _holder(stacks: Runtime, group: object) -> BlockedCall | TaskRun | None:
+    """Return the callback that keeps a group busy, unless it waits with a timeout."""
     for blocked in stacks.runners.blocked:
         if blocked.group is group:
             return blocked if blocked.deadline_ns is None else None

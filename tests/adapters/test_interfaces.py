@@ -101,9 +101,9 @@ def test_the_services_of_an_action_are_services() -> None:
         (
             "no_such_msgs/msg/Thing",
             "no_such_msgs/msg/Thing needs the package no_such_msgs, which this Python cannot "
-            "import. There is no wheel of it that we know of: put its sources (package.xml, .msg, "
-            ".srv and .action files) into a folder of search_path, and its classes are made from "
-            "them; or source the ROS 2 workspace that holds it (one of ROS's own: apt install "
+            "import. There is no wheel of it: put its sources (package.xml, .msg, .srv and "
+            ".action files) into a folder of search_path, and its classes are made from them; or "
+            "source the ROS 2 workspace that holds it (for one of ROS's own: apt install "
             "ros-jazzy-no-such-msgs, then source /opt/ros/jazzy/setup.bash), and run rsltrace with "
             "the Python that it is built for",
         ),

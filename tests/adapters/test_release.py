@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 import rsltrace.adapters.rclpy.boundary.installation as installing
-from rsltrace.adapters.rclpy.boundary.boundary import Boundary
+from rsltrace.adapters.rclpy.boundary.boundary import RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.installation import boundary, missing_parts
 from rsltrace.adapters.rclpy.handles.timers import TimerHandle
 from rsltrace.errors import SetupError
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.ros
 def test_a_missing_part_of_the_boundary_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     boundary()  # this release is complete
     monkeypatch.setattr(installing, "_installed", None)
-    monkeypatch.delattr(Boundary, "rclpy_get_topic_names_and_types")
+    monkeypatch.delattr(RclpyBoundary, "rclpy_get_topic_names_and_types")
     monkeypatch.delattr(TimerHandle, "time_since_last_call")
     with pytest.raises(SetupError) as caught:
         boundary()

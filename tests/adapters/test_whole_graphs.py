@@ -15,7 +15,7 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from rsltrace.errors import DeadlockError
-from tests.doors.test_mains import main_spec, seconds
+from tests.adapters.test_mains import main_spec, seconds
 
 pytestmark = pytest.mark.ros
 

@@ -19,7 +19,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace.errors import DeadlockError, NodeError
-from tests.doors.test_mains import Counter, listener, main_spec, seconds
+from tests.adapters.test_mains import Counter, listener, main_spec, seconds
 
 pytestmark = pytest.mark.ros
 

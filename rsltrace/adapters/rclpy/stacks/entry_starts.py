@@ -1,5 +1,5 @@
-"""Entries that start while the run goes on: after a time, a topic, a service, a node, or another
-entry's start or end."""
+"""Entries that start during the run: after a time, a message, a service, a node, or the start or
+end of another entry."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Entry, StartRule
-from rsltrace.adapters.rclpy.stacks.runners import Stacks
+from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.loop.loop import Release
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.events.event import Event, OutsideEvent
@@ -16,11 +16,9 @@ from rsltrace.simulation.middleware.services import Service
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.model.finding import Policy
 
-# Events in which the code of a job's entry runs: its constructor, its main, its threads.
 
-
-class Construction(OutsideEvent):
-    """An event that is no entity's callback; ``entry`` is what is being constructed, or None."""
+class ConstructionEvent(OutsideEvent):
+    """Runs an entry's constructor, main or thread."""
 
     def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
         super().__init__(describe)
@@ -28,7 +26,7 @@ class Construction(OutsideEvent):
 
 
 def policy_of(event: Event) -> Policy | None:
-    """Return the guard's policy for whoever runs, or None for the job's."""
+    """Return the guard's policy of the running node or entry; None for the job's policy."""
     if event.node is not None:
         return getattr(event.node, "policy", None)
     entry = entry_of(event)
@@ -36,33 +34,32 @@ def policy_of(event: Event) -> Policy | None:
 
 
 def entry_of(event: Event) -> Entry | None:
-    """Return the entry of the job whose constructor runs, as long as it has made no node."""
+    """Return the entry whose constructor runs and has made no node yet."""
     return getattr(event.handle, "entry", None)
 
 
 STARTS = 4
-"""The operation of a TASK output: what comes of it is that an entry starts."""
+"""The operation of a TASK output that starts an entry."""
 
-Construct = Callable[[Entry, tuple[int, int]], bool]
-"""Constructs an entry, given the event and output that made it start; False: that ended the run."""
+ConstructEntry = Callable[[Entry, tuple[int, int]], bool]
+"""Constructs an entry, given its causing event and output; returns False if that ended the run."""
 
 
-class Starts:
-    """The entries that wait for their start. ``failed`` is the one whose construction has ended
-    the run."""
+class EntryStarts:
+    """The entries that wait for their start; ``failed`` is one whose construction ended the run."""
 
-    def __init__(self, stacks: Stacks, construct: Construct) -> None:
+    def __init__(self, stacks: Runtime, construct: ConstructEntry) -> None:
         self.stacks = stacks
         self.construct = construct
         self.failed: Entry | None = None
         self.start_ns: int | None = None
-        self._waiting: list[LaterStart] = []
+        self._waiting: list[DelayedStart] = []
 
     def add(self, entry: Entry) -> None:
-        """Let an entry wait for what its rule says. Before the first one is constructed."""
+        """Register an entry with a start rule. Call it before the first construction."""
         rule = entry.start_after
         assert rule is not None
-        later = LaterStart(self, entry, rule)
+        later = DelayedStart(self, entry, rule)
         self._waiting.append(later)
         domain, programs = self.stacks.domain, self.stacks.programs
         programs.to_come.append(entry.key)
@@ -70,36 +67,36 @@ class Starts:
             domain.watch(rule.topic, lambda publisher, data: later.met("topic"))
         if rule.service is not None or rule.node is not None:
             domain.graph.joined.append(later.joined)
-        programs.listeners.append(later.told)
+        programs.listeners.append(later.entry_changed)
 
     def add_at(self, entry: Entry, time_ns: int) -> None:
-        """Let an entry start at a time, whatever its rule says."""
-        later = LaterStart(self, entry, StartRule())
+        """Start an entry at a time, whatever its rule says."""
+        later = DelayedStart(self, entry, StartRule())
         self._waiting.append(later)
         self.stacks.programs.to_come.append(entry.key)
         self.stacks.loop.schedule_release(time_ns, _release, later)
 
     def begin(self, start_ns: int) -> None:
-        """Take note that the run begins: times count from here."""
+        """Begin the run: delays count from here."""
         self.start_ns = start_ns
         for later in self._waiting:
-            later.look()
+            later.schedule_if_met()
 
-    def gone(self, later: LaterStart) -> None:
-        """Take note that one has started."""
+    def remove_started(self, later: DelayedStart) -> None:
+        """Remove an entry that has started."""
         self._waiting.remove(later)
         self.stacks.programs.to_come.remove(later.entry.key)
 
     def missed(self) -> Iterator[tuple[str, list[str]]]:
-        """Yield the key of each entry that has not started, and what it still waits for."""
+        """Yield the key of each entry that has not started, and its unmet conditions."""
         for later in self._waiting:
             yield later.entry.key, list(later.unmet)
 
 
-class LaterStart:
-    """One entry that waits for its start. The loop dispatches it once, to begin."""
+class DelayedStart:
+    """An entry that waits for its start; the loop dispatches it once."""
 
-    def __init__(self, starts: Starts, entry: Entry, rule: StartRule) -> None:
+    def __init__(self, starts: EntryStarts, entry: Entry, rule: StartRule) -> None:
         self.entry = entry
         self._starts = starts
         self._rule = rule
@@ -109,30 +106,30 @@ class LaterStart:
         self._scheduled = False
 
     def joined(self, member: Any) -> None:
-        """Look at what has joined the graph."""
+        """Check a service or node that joined the graph."""
         rule = self._rule
         if isinstance(member, Service) and member.service == rule.service:
             self.met("service")
         elif isinstance(member, Participant) and member.fully_qualified_name == rule.node:
             self.met("node")
 
-    def told(self, condition: str, key: str) -> None:
-        """Look at which entry has "started" or "ended"."""
+    def entry_changed(self, condition: str, key: str) -> None:
+        """Check the start or end of another entry."""
         if key == getattr(self._rule, condition):
             self.met(condition)
 
     def met(self, condition: str) -> None:
-        """Take note that a condition has come true, in the event under way."""
+        """Note that a condition was met in the current event."""
         if condition in self.unmet and self._starts.stacks.loop.stopped is None:
             self.unmet.remove(condition)
             if not self.unmet:
                 dispatcher = self._starts.stacks.dispatcher
                 position = dispatcher.note(OutputKind.TASK, 0, STARTS, self._rule.delay_ns)
                 self._cause = (self._starts.stacks.loop.events, position)
-                self.look()
+                self.schedule_if_met()
 
-    def look(self) -> None:
-        """Let the entry start when its time has come, if nothing else keeps it waiting."""
+    def schedule_if_met(self) -> None:
+        """Schedule the start if all conditions are met."""
         loop, start_ns = self._starts.stacks.loop, self._starts.start_ns
         if not self.unmet and not self._scheduled and start_ns is not None:
             self._scheduled = True
@@ -140,20 +137,17 @@ class LaterStart:
             loop.schedule_release(time_ns, _release, self)
 
     def dispatch(self) -> None:
-        """Construct the entry, as one event."""
-        self._starts.gone(self)
+        self._starts.remove_started(self)
         if not self._starts.construct(self.entry, self._cause):
             self._starts.failed = self.entry
 
     def runnable(self) -> Runnable:
-        """Describe it to a policy: it is on no executor."""
         return on_no_executor(None, self.describe())
 
     def describe(self) -> str:
-        """Name it for people."""
         return f"the start of {self.entry.name}"
 
 
-def _release(release: Release) -> LaterStart:
-    later: LaterStart = release[4]
+def _release(release: Release) -> DelayedStart:
+    later: DelayedStart = release[4]
     return later
