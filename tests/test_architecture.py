@@ -279,9 +279,9 @@ RUNS_CODE = {
     "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
-    "rsltrace/adapters/launch/api/names.py": "import_module",  # stand-ins for modules of launch
+    "rsltrace/adapters/launch/api/ros_modules.py": "import_module",  # modules of launch
     "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
-    "rsltrace/adapters/launch/api/sources.py": "exec_module",  # a Python launch file
+    "rsltrace/adapters/launch/api/description_sources.py": "exec_module",  # a Python launch file
     "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
     "rsltrace/native/apart/wire.py": "pickle",  # of user code: plain values only

@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.adapters.launch.expression import evaluate
-from rsltrace.adapters.launch.model import Scope
-from rsltrace.adapters.launch.substitution import Call, Substitutions, parse_template
+from rsltrace.adapters.launch.model import LaunchScope
+from rsltrace.adapters.launch.substitution import SubstitutionCall, Substitutions, parse_template
 
 
 def text(written: str) -> str:
-    values = Scope(
+    values = LaunchScope(
         configurations={"a": "1", "b": "two words", "yes": "True", "name": "a"},
         environment={"HOME": "/home/me"},
     )
@@ -79,7 +79,7 @@ def test_any_text_is_taken_apart_or_refused(written: str) -> None:
         parts = parse_template(written)
     except ValueError:
         return
-    assert all(isinstance(part, (str, Call)) for part in parts)
+    assert all(isinstance(part, (str, SubstitutionCall)) for part in parts)
 
 
 @pytest.mark.parametrize(

@@ -412,7 +412,7 @@ def test_a_bad_name_is_told_at_its_node(read: Any, prefix: Path) -> None:
 
 
 def test_the_document_names_all_that_is_read() -> None:
-    from rsltrace.adapters.launch.model import Scope
+    from rsltrace.adapters.launch.model import LaunchScope
     from rsltrace.adapters.launch.reader import ActionReader
     from rsltrace.adapters.launch.substitution import Substitutions
 
@@ -421,5 +421,5 @@ def test_the_document_names_all_that_is_read() -> None:
               "log_info", "executable", "shutdown"}  # fmt: skip
     for action in set(ActionReader({})._actions) - silent:
         assert f"`{action}`" in text, action
-    for name in set(Substitutions(Scope(), Path())._known) - {"optenv"}:
+    for name in set(Substitutions(LaunchScope(), Path())._known) - {"optenv"}:
         assert f"`$({name})`" in text or f"`$({name} …)`" in text, name

@@ -10,7 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.launch.model import Attribute, Element, Launched, Scope, Unsupported, typed
+from rsltrace.adapters.launch.model import (
+    Attribute,
+    Element,
+    Launched,
+    LaunchScope,
+    UnsupportedItem,
+    typed,
+)
 from rsltrace.adapters.launch.substitution import Substitutions, truth
 from rsltrace.job.reading.yaml_source import Place
 
@@ -25,7 +32,7 @@ class Evaluation:
 
     def __init__(self, arguments: dict[str, str]) -> None:
         self.launched = Launched()
-        self.scope = Scope(configurations=arguments)
+        self.scope = LaunchScope(configurations=arguments)
         self.delay_ns = 0
         self.after: tuple[str, int] | None = None
         self.kept: list[object] = []
@@ -38,7 +45,9 @@ class Evaluation:
         return self._substitutions.file
 
     @contextmanager
-    def within(self, *, scope: Scope | None = None, file: Path | None = None) -> Iterator[None]:
+    def within(
+        self, *, scope: LaunchScope | None = None, file: Path | None = None
+    ) -> Iterator[None]:
         """Evaluate what is read meanwhile in another scope, or for another file."""
         substitutions = self._substitutions
         outer = self.scope, substitutions.file
@@ -130,7 +139,7 @@ class Evaluation:
     def refuse(self, element: Element, what: str, why: str) -> None:
         """Note that something cannot be simulated."""
         where = element.place.source.where(element.place.mark)
-        self.launched.unsupported.append(Unsupported(where, what, why))
+        self.launched.unsupported.append(UnsupportedItem(where, what, why))
 
     def existing_file(self, attribute: Attribute) -> str:
         """Return the path of a file that must be there; relative to the launch file's folder."""

@@ -10,9 +10,9 @@ from rsltrace.adapters.launch.evaluation import Evaluation
 from rsltrace.adapters.launch.model import (
     Element,
     LaunchedNode,
-    ParameterFile,
+    ParameterFilePath,
     Parameters,
-    Surroundings,
+    ProcessSettings,
     absolute_namespace,
     full_name,
     respawning,
@@ -115,7 +115,7 @@ class Nodes:
     def _check_process(self, element: Element, children: list[str]) -> None:
         element.check([*_NODE, *_WITHOUT_MEANING, *_OF_PROCESSES, *_ENDS], [*children, "env"])
 
-    def _surroundings(self, element: Element) -> Surroundings:
+    def _surroundings(self, element: Element) -> ProcessSettings:
         """Return what is said of the process of a node."""
         evaluation = self._evaluation
         own = {
@@ -127,7 +127,7 @@ class Nodes:
             times = int(self._number(element, "respawn_max_retries", -1))
             delay_s = self._number(element, "respawn_delay", 0.0)
             respawn = respawning(delay_s, times)
-        return Surroundings(
+        return ProcessSettings(
             tuple({**evaluation.changed_environment(), **own}.items()),
             folder=evaluation.optional(element, "cwd") or "",
             respawn=respawn,
@@ -189,7 +189,7 @@ class Nodes:
     # -- parameters --------------------------------------------------------------------------------
 
     def _parameters(self, element: Element, full_name: str | None) -> Parameters:
-        found: list[ParameterFile | dict[str, Any]] = []
+        found: list[ParameterFilePath | dict[str, Any]] = []
         for param in element.named("param"):
             if param.get("from") is None:
                 found.append(self._mapping([param]))
@@ -201,7 +201,7 @@ class Nodes:
                 replaced = partial(self._evaluation.replaced, place=place)
                 found.append(substituted_parameters(path, replaced, full_name))
             else:
-                found.append(ParameterFile(path))
+                found.append(ParameterFilePath(path))
         return tuple(found)
 
     def _mapping(self, params: list[Element]) -> dict[str, Any]:

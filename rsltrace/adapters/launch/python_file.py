@@ -17,9 +17,11 @@ from rsltrace.adapters.launch.api.basics import (
     as_job_error,
     shown,
 )
-from rsltrace.adapters.launch.api.names import own_launch
+from rsltrace.adapters.launch.api.description_sources import (
+    get_launch_description_from_python_launch_file,
+)
 from rsltrace.adapters.launch.api.packages import missing_packages_allowed
-from rsltrace.adapters.launch.api.sources import get_launch_description_from_python_launch_file
+from rsltrace.adapters.launch.api.ros_modules import own_launch
 from rsltrace.adapters.launch.model import Launched, argument_words
 from rsltrace.adapters.launch.reader import ActionReader
 from rsltrace.errors import JobError

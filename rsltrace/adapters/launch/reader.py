@@ -17,8 +17,8 @@ from rsltrace.adapters.launch.model import (
     Attribute,
     Element,
     Launched,
-    ParameterFile,
-    Scope,
+    LaunchScope,
+    ParameterFilePath,
     joined_namespace,
     not_a_launch_file,
 )
@@ -200,7 +200,7 @@ class ActionReader(Evaluation):
             return
         scope = self.scope.copy()
         if not self.flag(element.get("forwarding"), True):
-            scope = Scope(environment=dict(self._environment))
+            scope = LaunchScope(environment=dict(self._environment))
         scope.configurations.update(keeps)
         with self.within(scope=scope):
             self._children(element, ("keep",))
@@ -313,7 +313,7 @@ class ActionReader(Evaluation):
     def _set_parameters_from_file(self, element: Element) -> None:
         element.check(["filename"])
         path = self.existing_file(element.need("filename"))
-        self.scope.parameters += (ParameterFile(path),)
+        self.scope.parameters += (ParameterFilePath(path),)
 
     def _set_remap(self, element: Element) -> None:
         element.check(["from", "to"])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.adapters.launch.expression import evaluate
-from rsltrace.adapters.launch.model import Scope
+from rsltrace.adapters.launch.model import LaunchScope
 from rsltrace.adapters.workspace.imports import unbuilt_prefix
 from rsltrace.errors import did_you_mean, nearest
 from rsltrace.job.reading.substitute import package_prefix
@@ -24,7 +24,7 @@ _DEPTH_MAX = 50
 
 
 @dataclass(frozen=True, slots=True)
-class Call:
+class SubstitutionCall:
     """One substitution: ``$(env HOME)`` has the name ``env`` and one argument."""
 
     name: str
@@ -32,7 +32,7 @@ class Call:
     written: str
 
 
-Template = tuple["str | Call", ...]
+Template = tuple["str | SubstitutionCall", ...]
 """The pieces of a text, in order."""
 
 
@@ -41,10 +41,10 @@ def parse_template(text: str) -> Template:
 
     :raises ValueError: if a substitution is not written properly.
     """
-    return _Parser(text).template()
+    return _TemplateParser(text).template()
 
 
-class _Parser:
+class _TemplateParser:
     def __init__(self, text: str) -> None:
         self._text = text
         self._at = 0
@@ -52,7 +52,7 @@ class _Parser:
 
     def template(self, end: str = "") -> Template:
         """Read up to the character ``end`` (a quote, which is skipped), or all there is."""
-        parts: list[str | Call] = []
+        parts: list[str | SubstitutionCall] = []
         plain = ""
         text = self._text
         while self._at < len(text):
@@ -78,7 +78,7 @@ class _Parser:
             parts.append(plain)
         return tuple(parts)
 
-    def _call(self) -> Call:
+    def _call(self) -> SubstitutionCall:
         start = self._at
         self._depth += 1
         if self._depth > _DEPTH_MAX:
@@ -101,14 +101,14 @@ class _Parser:
             arguments.append(self._argument())
         self._at += 1
         self._depth -= 1
-        return Call(name.group(), tuple(arguments), self._text[start : self._at])
+        return SubstitutionCall(name.group(), tuple(arguments), self._text[start : self._at])
 
     def _argument(self) -> Template:
         text = self._text
         if text[self._at] in "'\"":
             self._at += 1
             return self.template(text[self._at - 1])
-        parts: list[str | Call] = []
+        parts: list[str | SubstitutionCall] = []
         while self._at < len(text) and text[self._at] not in " \t\r\n)":
             if text.startswith("$(", self._at):
                 parts.append(self._call())
@@ -124,8 +124,8 @@ class _Parser:
             self._at += 1
 
 
-def _joined(parts: list[str | Call]) -> list[str | Call]:
-    joined: list[str | Call] = []
+def _joined(parts: list[str | SubstitutionCall]) -> list[str | SubstitutionCall]:
+    joined: list[str | SubstitutionCall] = []
     for part in parts:
         if isinstance(part, str) and joined and isinstance(joined[-1], str):
             joined[-1] += part
@@ -160,7 +160,7 @@ def truth(text: str) -> bool:
 class Substitutions:
     """Replaces ``$(…)`` by what ``scope`` holds; ``file`` is the launch file being read."""
 
-    def __init__(self, scope: Scope, file: Path) -> None:
+    def __init__(self, scope: LaunchScope, file: Path) -> None:
         self.scope = scope
         self.file = file
         self._anonymous: dict[str, str] = {}
@@ -197,7 +197,7 @@ class Substitutions:
     def _evaluate(self, template: Template) -> str:
         return "".join(part if isinstance(part, str) else self._call(part) for part in template)
 
-    def _call(self, call: Call) -> str:
+    def _call(self, call: SubstitutionCall) -> str:
         if call.name in _REFUSED:
             raise ValueError(f"{call.written}: {_REFUSED[call.name]}; give the value itself")
         if call.name not in self._known:

@@ -14,8 +14,8 @@ from rsltrace.adapters.launch.api.basics import (
     as_substitutions,
     visit_all,
 )
+from rsltrace.adapters.launch.api.description_sources import LaunchDescriptionSource
 from rsltrace.adapters.launch.api.packages import missing_package
-from rsltrace.adapters.launch.api.sources import LaunchDescriptionSource
 from rsltrace.adapters.launch.substitution import truth
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time

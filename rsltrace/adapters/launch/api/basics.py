@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.launch.evaluation import Evaluation
-from rsltrace.adapters.launch.model import Argument, Unsupported
+from rsltrace.adapters.launch.model import Argument, UnsupportedItem
 from rsltrace.errors import JobError
 
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
@@ -123,7 +123,7 @@ class LaunchContext:
 
     def refuse(self, where: str, what: str, why: str) -> None:
         """Note that something cannot be simulated."""
-        self.evaluation.launched.unsupported.append(Unsupported(where, what, why))
+        self.evaluation.launched.unsupported.append(UnsupportedItem(where, what, why))
 
 
 class Condition:

@@ -27,38 +27,38 @@ class Shutdown(Event):
         self.reason, self.due_to_sigint = reason, due_to_sigint
 
 
-class _Named(Event):
+class _UnusedEvent(Event):
     """An event of processes or lifecycle nodes, which does not happen here."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
 
-class ProcessExited(_Named):
+class ProcessExited(_UnusedEvent):
     """A process has ended."""
 
 
-class ProcessStarted(_Named):
+class ProcessStarted(_UnusedEvent):
     """A process has started."""
 
 
-class ProcessIO(_Named):
+class ProcessIO(_UnusedEvent):
     """A process has written something."""
 
 
-class SignalProcess(_Named):
+class SignalProcess(_UnusedEvent):
     """A process gets a signal."""
 
 
-class ShutdownProcess(_Named):
+class ShutdownProcess(_UnusedEvent):
     """A process is to end."""
 
 
-class ChangeState(_Named):
+class ChangeState(_UnusedEvent):
     """A lifecycle node is to change its state."""
 
 
-class StateTransition(_Named):
+class StateTransition(_UnusedEvent):
     """A lifecycle node has changed its state."""
 
 

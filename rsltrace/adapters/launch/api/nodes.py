@@ -18,7 +18,7 @@ from rsltrace.adapters.launch.api.packages import names_missing_package
 from rsltrace.adapters.launch.api.parameters import evaluated_parameters
 from rsltrace.adapters.launch.model import (
     LaunchedNode,
-    Surroundings,
+    ProcessSettings,
     absolute_namespace,
     full_name,
     respawning,
@@ -52,7 +52,7 @@ class ExecuteLocal(Action):
         self._on_exit = on_exit
         self._options = {name: value for name, value in options.items() if value}
 
-    def _surroundings(self, context: LaunchContext) -> Surroundings:
+    def _surroundings(self, context: LaunchContext) -> ProcessSettings:
         """Return what is said of the process."""
         options = self._options
         own = {
@@ -64,7 +64,7 @@ class ExecuteLocal(Action):
         if _flag(context, options.get("respawn", False)):
             times = int(_number(context, options.get("respawn_max_retries", -1)))
             respawn = respawning(_number(context, options.get("respawn_delay", 0.0)), times)
-        return Surroundings(
+        return ProcessSettings(
             tuple({**context.evaluation.changed_environment(), **own}.items()),
             folder=context.optional(options.get("cwd")) or "",
             respawn=respawn,
@@ -116,7 +116,7 @@ class Node(ExecuteLocal):
         super().__init__(**options)
         self._executable = as_substitutions(executable)
         self._package = None if package is None else as_substitutions(package)
-        self._description = _Description(name, namespace, parameters, remappings)
+        self._description = _NodeDescription(name, namespace, parameters, remappings)
         self._ros_arguments = list(ros_arguments or ())
         self._arguments = list(arguments or ())
         self._values: dict[str, Any] = {}
@@ -172,7 +172,7 @@ class LifecycleNode(Node):
             )
 
 
-class _Description:
+class _NodeDescription:
     """What nodes and components have in common."""
 
     def __init__(
@@ -246,7 +246,7 @@ class ComposableNode:
         self.where = calling_line()
         self._package, self._plugin = as_substitutions(package), as_substitutions(plugin)
         self._condition = condition
-        self._description = _Description(name, namespace, parameters, remappings)
+        self._description = _NodeDescription(name, namespace, parameters, remappings)
         self._extra_arguments = list(extra_arguments or ())
 
     def note(self, context: LaunchContext, container: str) -> None:

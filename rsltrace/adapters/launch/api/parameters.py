@@ -59,7 +59,7 @@ class ParameterFile:
 
     def found(
         self, context: LaunchContext, full_name: str | None
-    ) -> scope.ParameterFile | dict[str, Any]:
+    ) -> scope.ParameterFilePath | dict[str, Any]:
         """Return the file, or its content for a node if it stays only as long as it is read.
 
         :raises ValueError: if it is not there.
@@ -74,7 +74,7 @@ class ParameterFile:
             return substituted_parameters(path, context.evaluation.replaced_text, full_name)
         if Path(path).parent == Path(tempfile.gettempdir()):
             return parameters_for(path, full_name)
-        return scope.ParameterFile(path)
+        return scope.ParameterFilePath(path)
 
 
 def parameter_value(context: LaunchContext, value: Any, kind: Any) -> Any:
@@ -173,7 +173,7 @@ def named_values(
 
 def evaluated_parameters(
     context: LaunchContext, parameters: Iterable[Any], full_name: str | None
-) -> Iterator[scope.ParameterFile | dict[str, Any]]:
+) -> Iterator[scope.ParameterFilePath | dict[str, Any]]:
     """Yield the files and values of a node's ``parameters=[…]``.
 
     :raises ValueError, TypeError: if one of them is none, or a file is not there.

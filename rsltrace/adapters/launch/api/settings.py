@@ -8,7 +8,7 @@ from typing import Any
 
 from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions
 from rsltrace.adapters.launch.api.parameters import ParameterFile, parameter_value, plain_value
-from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, Scope, joined_namespace
+from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, LaunchScope, joined_namespace
 from rsltrace.errors import JobError
 
 
@@ -92,7 +92,7 @@ class ResetLaunchConfigurations(Action):
         context.launch_configurations.update(kept)
 
 
-class _Environment(Action):
+class _EnvironmentAction(Action):
     """Changes the environment that the launch file sees."""
 
     def __init__(self, name: Any, **options: Any) -> None:
@@ -105,7 +105,7 @@ class _Environment(Action):
         return name
 
 
-class SetEnvironmentVariable(_Environment):
+class SetEnvironmentVariable(_EnvironmentAction):
     """Sets an environment variable."""
 
     def __init__(self, name: Any, value: Any, **options: Any) -> None:
@@ -117,7 +117,7 @@ class SetEnvironmentVariable(_Environment):
         context.environment[self._note(context)] = context.text(self.value)
 
 
-class AppendEnvironmentVariable(_Environment):
+class AppendEnvironmentVariable(_EnvironmentAction):
     """Makes an environment variable longer."""
 
     def __init__(
@@ -143,7 +143,7 @@ class AppendEnvironmentVariable(_Environment):
         context.environment[name] = context.text(self.separator).join(parts)
 
 
-class UnsetEnvironmentVariable(_Environment):
+class UnsetEnvironmentVariable(_EnvironmentAction):
     """Takes away an environment variable."""
 
     def execute(self, context: LaunchContext) -> None:
@@ -183,7 +183,7 @@ class GroupAction(Action):
         evaluation = context.evaluation
         scope = evaluation.scope.copy()
         if not self._forwarding:
-            scope = Scope(environment=evaluation.first_environment())
+            scope = LaunchScope(environment=evaluation.first_environment())
         scope.configurations.update(kept)
         with evaluation.within(scope=scope):
             visit_all(context, self._actions)
