@@ -224,7 +224,6 @@ _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
     ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
     ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
-    ("rsltrace/adapters/launch/python_file.py", "include"): "a slot of LaunchContext",
 }
 """What has the name of a method, and why it is none of the product's objects'."""
 

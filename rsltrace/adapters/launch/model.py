@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -147,6 +148,31 @@ def _one(value: Any, kind: str) -> Any:
             f"unknown type {kind!r}: there are bool, int, float, str, yaml and list_of_ these"
         )
     raise ValueError(f"expected {kind}, got {value!r}")
+
+
+_TRUE, _FALSE = ("true", "1"), ("false", "0")
+
+
+def truth(text: str) -> bool:
+    """Return a condition's value, as launch reads it.
+
+    :raises ValueError: if it is none of true, 1, false, 0.
+    """
+    word = text.strip().lower()
+    if word not in (*_TRUE, *_FALSE):
+        raise ValueError(f"expected true, 1, false or 0, got {text!r}")
+    return word in _TRUE
+
+
+def equal_texts(a: str, b: str) -> bool:
+    """Return whether two texts are equal as launch compares them: truth values, numbers, text."""
+    words = a.lower(), b.lower()
+    if all(word in (*_TRUE, *_FALSE) for word in words):
+        return (words[0] in _TRUE) == (words[1] in _TRUE)
+    try:
+        return math.isclose(float(a), float(b))
+    except ValueError:
+        return a == b
 
 
 # What becomes of a job with launch files.

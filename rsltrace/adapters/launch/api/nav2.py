@@ -17,8 +17,7 @@ from rsltrace.adapters.launch.api.basics import (
     SubstitutionFailure,
     as_substitutions,
 )
-from rsltrace.adapters.launch.model import yaml_value
-from rsltrace.adapters.launch.substitution import truth
+from rsltrace.adapters.launch.model import truth, yaml_value
 
 
 class _FileSubstitution(Substitution):
