@@ -224,7 +224,6 @@ _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
     ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
     ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
-    ("rsltrace/adapters/launch/python_file.py", "include"): "a slot of LaunchContext",
 }
 """What has the name of a method, and why it is none of the product's objects'."""
 
@@ -278,9 +277,9 @@ RUNS_CODE = {
     "rsltrace/search/perturb.py": "runpy",  # this command once more, in another environment
     "rsltrace/child_processes.py": "runpy",  # a command of ours, in a process
     # Python launch files are programs; they are read in a process of their own.
-    "rsltrace/adapters/launch/api/names.py": "import_module",  # stand-ins for modules of launch
+    "rsltrace/adapters/launch/api/ros_modules.py": "import_module",  # modules of launch
     "rsltrace/adapters/launch/api/substitutions.py": "eval import_module",  # PythonExpression
-    "rsltrace/adapters/launch/api/sources.py": "exec_module",  # a Python launch file
+    "rsltrace/adapters/launch/api/description_sources.py": "exec_module",  # a Python launch file
     "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
     "rsltrace/native/apart/wire.py": "pickle",  # of user code: plain values only

@@ -1,6 +1,5 @@
-"""Recording nodes natively: rclpy's own executors over DDS, in real time, observed and not steered.
+"""Records runs on rclpy's own executors over DDS, in real time: observed, not steered.
 
-``session.run_natively`` runs a job; ``boundary`` and ``executors`` say to the ``ledger`` what they
-see of it, and ``pen`` writes that down as a trace. ``apart`` has a process for each entry.
-``docs/native.md`` has what a user should know.
+``session.run_natively`` runs a job. The observers report to the ``span_recorder``, and
+``span_writer`` writes the trace. ``apart`` runs each entry in its own process. See docs/native.md.
 """

@@ -16,8 +16,8 @@ from contextlib import ExitStack, contextmanager
 from functools import wraps
 from typing import Any
 
+from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.support import patched
-from rsltrace.native.things import Thing, Things
 from rsltrace.simulation.loop.policy import Candidate, PriorityRule
 from rsltrace.trace.model.entity import EntityKind
 
@@ -83,8 +83,8 @@ class Priorities:
     the real-time class, if that is so.
     """
 
-    def __init__(self, things: Things, rules: tuple[PriorityRule, ...] | None) -> None:
-        self._things = things
+    def __init__(self, entities: ObservedEntities, rules: tuple[PriorityRule, ...] | None) -> None:
+        self._entities = entities
         self._rules = rules
         self._periods: dict[str, int] = {}
         self._local = threading.local()
@@ -108,10 +108,10 @@ class Priorities:
         @wraps(original)
         def send(handle: Any, *words: Any) -> Any:
             period_ns = getattr(self._local, "period_ns", None)
-            thing = self._things.find(handle)
-            if period_ns is not None and thing is not None:
-                known = self._periods.get(thing.name, period_ns)
-                self._periods[thing.name] = min(known, period_ns)
+            observed = self._entities.find(handle)
+            if period_ns is not None and observed is not None:
+                known = self._periods.get(observed.name, period_ns)
+                self._periods[observed.name] = min(known, period_ns)
             return original(handle, *words)
 
         return send
@@ -120,22 +120,22 @@ class Priorities:
         """Return how urgent something ready is: the lower the more."""
         if self._rules is None:
             return self._period(entity, node)
-        thing = self._thing(entity)
+        observed = self._observed_entity(entity)
         group = [
-            self._name(self._thing(one))
+            self._name(self._observed_entity(one))
             for one in (*node.timers, *node.subscriptions, *node.services, *node.clients)
             if one.callback_group is getattr(entity, "callback_group", None)
         ]
-        kind = "" if thing is None else thing.kind.label
+        kind = "" if observed is None else observed.kind.label
         name = node.get_fully_qualified_name()
-        candidate = Candidate(name, self._name(thing), kind, 0, None, tuple(group), entity)
+        candidate = Candidate(name, self._name(observed), kind, 0, None, tuple(group), entity)
         return -next((rule.priority for rule in self._rules if rule.fits(candidate)), 0)
 
     def _period(self, entity: Any, node: Any) -> float:
-        thing = self._thing(entity)
-        if thing is not None and thing.kind is EntityKind.TIMER:
+        observed = self._observed_entity(entity)
+        if observed is not None and observed.kind is EntityKind.TIMER:
             return float(entity.timer_period_ns)
-        known = None if thing is None else self._periods.get(thing.name)
+        known = None if observed is None else self._periods.get(observed.name)
         if known is not None:
             return known
         return min((float(timer.timer_period_ns) for timer in node.timers), default=math.inf)
@@ -157,11 +157,11 @@ class Priorities:
         self.levels[name] = level
         _set_level(level)
 
-    def _thing(self, entity: Any) -> Thing | None:
-        return self._things.find(entity)
+    def _observed_entity(self, entity: Any) -> ObservedEntity | None:
+        return self._entities.find(entity)
 
-    def _name(self, thing: Thing | None) -> str:
-        return "" if thing is None else thing.name
+    def _name(self, observed: ObservedEntity | None) -> str:
+        return "" if observed is None else observed.name
 
 
 def _set_level(level: int) -> None:

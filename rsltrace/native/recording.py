@@ -15,8 +15,8 @@ from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 from rsltrace.errors import RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
-from rsltrace.native.pen import Clocks, Pen, Spans
 from rsltrace.native.priorities import order, real_time_class
+from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
 from rsltrace.run.plans.scheduling import end_ns_of, stop_conditions
 from rsltrace.run.process import Observer
@@ -58,7 +58,7 @@ class NativeResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Spent:
+class ProcessorTime:
     """Processor time in nanoseconds: ``callbacks_ns`` of the nodes with rclpy and the middleware
     (and what observes them in their threads), ``beside_ns`` of telling of it, the pen's aside."""
 
@@ -67,7 +67,7 @@ class Spent:
 
 
 @dataclass
-class Recording:
+class NativeRun:
     """A native run. Only its own thread calls it, but for ``stop`` and ``fail``.
 
     ``rules`` are those of ``policy``, None if it goes by rate; ``levels`` are the real-time
@@ -113,7 +113,7 @@ class Recording:
         self,
         stack: ExitStack,
         output: Path,
-        spans: Spans,
+        spans: SpanSource,
         described: Mapping[str, str],
         sources: Mapping[str, Path] | None = None,
         *,
@@ -129,7 +129,7 @@ class Recording:
         if self.observer.interrupt is not None:
             self.observer.interrupt(self.stop)
         recorder = Recorder(self.writer, keep_payload=payload_filter(job))
-        self.clocks = Clocks.now()
+        self.clocks = ClockPair.now()
         write_job(self.writer, job)
         self.writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
         write_sources(self.writer, job, sources)
@@ -145,7 +145,7 @@ class Recording:
                 **({} if self.policy is None else {"policy": self.policy, "priorities": order()}),
             },
         )
-        self.pen = Pen(spans, recorder, self.clocks, job.base_dir)
+        self.span_writer = SpanWriter(spans, recorder, self.clocks, job.base_dir)
 
     def watch_topic(self, on_message: dict[str, Any]) -> None:
         """Let the topic of ``stop:`` end the run; ``on_message`` is told of bytes and class."""
@@ -166,7 +166,7 @@ class Recording:
 
     def wait(self) -> Iterator[None]:
         """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
-        while not self.stopped.wait(LOOK_EVERY_S) and self.pen.error is None:
+        while not self.stopped.wait(LOOK_EVERY_S) and self.span_writer.error is None:
             yield
         self.ended_ns = time.monotonic_ns()
 
@@ -201,18 +201,18 @@ class Recording:
         self.stop(Stop(reason or str(error).splitlines()[0], error.exit_code))
 
     def close(
-        self, ended_after: int, stuck: tuple[str, ...], unreadable: int, spent: Spent
+        self, ended_after: int, stuck: tuple[str, ...], unreadable: int, spent: ProcessorTime
     ) -> NativeResult:
         """Write what is left, close the trace, and say how it went.
 
         :raises OutputError: if the trace cannot be written.
         """
-        self.pen.finish()
-        events = self.pen.count
+        self.span_writer.finish()
+        events = self.span_writer.count
         stop = self.ending or Stop("nothing is left")
         exit_code = self.error.exit_code if self.error is not None else stop.exit_code
-        observer_ns = self.pen.observer_ns
-        pen_ns = (self.pen.cpu_ns + spent.beside_ns) // max(events, 1)
+        observer_ns = self.span_writer.observer_ns
+        pen_ns = (self.span_writer.cpu_ns + spent.beside_ns) // max(events, 1)
         callback_ns = spent.callbacks_ns // max(events, 1)
         self.writer.close(
             result={
@@ -224,7 +224,7 @@ class Recording:
                 "observer_ns": str(observer_ns),
                 "pen_ns": str(pen_ns),
                 "callback_ns": str(callback_ns),
-                "unknown_causes": str(self.pen.causes.unknown),
+                "unknown_causes": str(self.span_writer.causes.unknown),
                 **self._levels(),
             },
             replace=self.begun_ns > 0 or exit_code == 0,

@@ -12,23 +12,23 @@ from rsltrace.adapters.rclpy.boundary.installation import boundary, check_free
 from rsltrace.errors import JobError, NodeError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support
-from rsltrace.native.apart.run import InProcesses
-from rsltrace.native.boundary import Boundary
-from rsltrace.native.entries import RunningEntry, destroy
-from rsltrace.native.executors import EXECUTORS, Executors
-from rsltrace.native.ledger import Ledger
-from rsltrace.native.nodes import Nodes
+from rsltrace.native.apart.run import MultiProcessRun
+from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver
+from rsltrace.native.message_observer import MessageObserver
+from rsltrace.native.node_observer import NodeObserver
+from rsltrace.native.observed_entities import ObservedEntities
 from rsltrace.native.priorities import Priorities
 from rsltrace.native.recording import (
     ENDS_WITHIN_S,
     LOOK_EVERY_S,
     NativeResult,
-    Recording,
-    Spent,
+    NativeRun,
+    ProcessorTime,
     rclpy_running,
 )
+from rsltrace.native.running_entry import RunningEntry, destroy
+from rsltrace.native.span_recorder import SpanRecorder
 from rsltrace.native.support import domain
-from rsltrace.native.things import Things
 from rsltrace.run.inputs import without_launch_files
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import Observer, kept_process, search_path
@@ -64,9 +64,9 @@ def run_natively(
     check_free()
     expanded = without_launch_files(job)
     support.check(expanded.job)
-    kind: type[InThreads | InProcesses] = InThreads
+    kind: type[SingleProcessRun | MultiProcessRun] = SingleProcessRun
     if processes or support.needs_processes(expanded.job):
-        kind = InProcesses
+        kind = MultiProcessRun
     rules = support.priority_rules(expanded.job, policy)
     run = kind(expanded.job, observer or Observer(), executor, domain_id, policy, rules)
     run.notes += expanded.notes
@@ -77,18 +77,18 @@ def run_natively(
         return run.finish()
 
 
-class InThreads(Recording):
+class SingleProcessRun(NativeRun):
     """All entries in this process, a thread and an executor each."""
 
     def open(self, stack: ExitStack, output: Path, *, force: bool, echo: bool) -> None:
         """Find what can be known to be wrong, then start rclpy and create the trace."""
-        self.ledger = Ledger()
-        self.things = Things(self.ledger.add)
-        self.boundary = Boundary(self.ledger, self.things)
-        self.nodes = Nodes(self.things)
+        self.recorder = SpanRecorder()
+        self.entities = ObservedEntities(self.recorder.add)
+        self.message_observer = MessageObserver(self.recorder, self.entities)
+        self.nodes = NodeObserver(self.entities)
         self.priorities: Priorities | None = None
         if self.policy is not None:
-            self.priorities = Priorities(self.things, self.rules)
+            self.priorities = Priorities(self.entities, self.rules)
         self._cpu_ns = time.process_time_ns()
         self._start = threading.Event()
         self._running: list[RunningEntry] = []
@@ -102,23 +102,25 @@ class InThreads(Recording):
             "processes": "1",
             "domain": str(number),
         }
-        self.create(stack, output, self.ledger, described, force=force)
-        executors = Executors(self.ledger, self.things, self.boundary, self.nodes.meet)
-        stack.enter_context(self.boundary.watched(boundary().real))
+        self.create(stack, output, self.recorder, described, force=force)
+        executors = CallbackObserver(
+            self.recorder, self.entities, self.message_observer, self.nodes.meet
+        )
+        stack.enter_context(self.message_observer.watched(boundary().real))
         if self.priorities is not None:
             stack.enter_context(self.priorities.watched(boundary().real))
         stack.enter_context(self.nodes.watched())
         stack.enter_context(executors.watched())
-        self.watch_topic(self.boundary.on_message)
+        self.watch_topic(self.message_observer.on_message)
 
     def go_on(self) -> None:
         """Construct the nodes, one entry after the other, then spin all until the run ends."""
-        self.pen.start()
+        self.span_writer.start()
         for entry in self.entries:
             if self.stopped.is_set():
                 break
             one = RunningEntry(
-                entry, self.ledger, self.nodes, self._make_executor, self._start, self._ended
+                entry, self.recorder, self.nodes, self._make_executor, self._start, self._ended
             )
             self._running.append(one)
             one.start()
@@ -126,7 +128,7 @@ class InThreads(Recording):
         self.begun_ns, self._cpu_ns = time.monotonic_ns(), time.process_time_ns()
         self._start.set()
         for _ in self.wait():
-            self.look(self.ledger.count, self.ledger.activity_ns)
+            self.look(self.recorder.count, self.recorder.activity_ns)
 
     def _wait_for(self, one: RunningEntry) -> None:
         deadline = time.monotonic() + _CONSTRUCTED_WITHIN_S
@@ -136,7 +138,7 @@ class InThreads(Recording):
 
     def _make_executor(self) -> Any:
         if self.priorities is not None:
-            from rsltrace.native.executors import PriorityExecutor
+            from rsltrace.native.callback_observer import PriorityExecutor
 
             return PriorityExecutor(self.priorities)
         import rclpy.executors
@@ -176,11 +178,11 @@ class InThreads(Recording):
         for one in self._running:
             one.join(max(deadline - time.monotonic(), 0.1))
         stuck = tuple(one.entry.name for one in self._running if one.is_alive())
-        ended_after = self.ledger.count
+        ended_after = self.recorder.count
         for one in self._running:
             if not one.is_alive() and self.error is None:
-                destroy(one.nodes, self.ledger, self.things)
+                destroy(one.nodes, self.recorder, self.entities)
         if self.priorities is not None:
             self.levels.update(self.priorities.levels)
-        spent = Spent(time.process_time_ns() - self._cpu_ns - self.pen.cpu_ns)
-        return self.close(ended_after, stuck, self.boundary.unreadable, spent)
+        spent = ProcessorTime(time.process_time_ns() - self._cpu_ns - self.span_writer.cpu_ns)
+        return self.close(ended_after, stuck, self.message_observer.unreadable, spent)

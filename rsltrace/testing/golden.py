@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 UPDATE_HINT = "pytest --rsltrace-update accepts what it does now"
 
 
-class Session:
+class GoldenSession:
     """What pytest was asked for, and what was done; the plugin sets and reads it."""
 
     update: bool = False
@@ -71,9 +71,9 @@ def assert_matches_golden(
         with TemporaryDirectory(prefix="rsltrace-golden-") as folder:
             result = run_job(job_or_result, folder)  # type: ignore[arg-type]
             return assert_matches_golden(result, golden, update=update, options=options)
-    if Session.update if update is None else update:
+    if GoldenSession.update if update is None else update:
         written = _write(path, target)
-        Session.written += [target] if written and update is None else []
+        GoldenSession.written += [target] if written and update is None else []
         return written
     if not target.exists():
         raise TraceError(f"there is no golden trace {target}: pytest --rsltrace-update writes it")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from rsltrace.testing.golden import Session
+from rsltrace.testing.golden import GoldenSession
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
@@ -36,21 +36,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Let tests without the fixture know of ``--rsltrace-update``, too."""
-    Session.update = bool(config.getoption("--rsltrace-update"))
+    GoldenSession.update = bool(config.getoption("--rsltrace-update"))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Begin to note which golden traces a test writes."""
     del item
-    Session.written.clear()
+    GoldenSession.written.clear()
 
 
 def pytest_runtest_teardown(item: pytest.Item) -> None:
     """Put those into its report, which xdist sends on."""
-    item.user_properties += [(_PROPERTY, os.path.abspath(path)) for path in Session.written]
+    item.user_properties += [(_PROPERTY, os.path.abspath(path)) for path in GoldenSession.written]
 
 
-class Golden:
+class GoldenFixture:
     """What the fixture ``rsltrace_golden`` gives: call it with a job or a result.
 
     ``path`` defaults to ``golden/<name of the test>.mcap``; relative paths are relative to the
@@ -117,9 +117,9 @@ class Golden:
 
 
 @pytest.fixture
-def rsltrace_golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
-    """Compare runs with golden traces: ``rsltrace_golden("job.yaml")``; see ``Golden``."""
-    return Golden(request, tmp_path)
+def rsltrace_golden(request: pytest.FixtureRequest, tmp_path: Path) -> GoldenFixture:
+    """Compare runs with golden traces: ``rsltrace_golden("job.yaml")``; see ``GoldenFixture``."""
+    return GoldenFixture(request, tmp_path)
 
 
 @pytest.fixture

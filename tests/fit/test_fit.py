@@ -17,7 +17,7 @@ from rsltrace import Trace, record
 from rsltrace.checks.latency.measure import measure_latencies
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
-from rsltrace.native.fit.measured import Measured, measured
+from rsltrace.native.fit.measured import NativeTimes, measured
 from rsltrace.native.fit.models import ks_distance
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.simulation.chance.stream import Stream
@@ -145,7 +145,7 @@ def nodes_of(trace: Trace, entity: int) -> str:
     return trace.node_of(trace.entity(entity)).name
 
 
-def look(path: Path) -> Measured:
+def look(path: Path) -> NativeTimes:
     with Trace.open(path) as trace:
         return measured(trace)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.native.fit.comparison import compared
+from rsltrace.native.fit.comparison import compare_samples
 from rsltrace.native.fit.measured import clock_steps
 from rsltrace.native.fit.models import ks_distance, model_of, table_of
 from rsltrace.simulation.chance.distribution import Empirical, Gamma, Lognormal, Normal, Uniform
@@ -69,7 +69,7 @@ def test_two_samples_of_one_distribution_and_of_two() -> None:
     pytest.importorskip("scipy")
     chance = np.random.default_rng(1)
     a, b = chance.gamma(4, MS, 2000).astype(int), chance.gamma(4, MS, 2000).astype(int)
-    same, scaled = compared(a, b), compared(a, b * 3 // 2)
+    same, scaled = compare_samples(a, b), compare_samples(a, b * 3 // 2)
     assert same.p_value > 0.001
     assert same.distance < 1.95 * np.sqrt(2 / 2000)
     for one in same.quantiles:
@@ -96,7 +96,7 @@ def test_the_interval_of_a_quantile_holds_what_it_says() -> None:
             for place in range(1, 600):
                 walk[place] = 0.6 * walk[place - 1] + noise[place]
             samples.append((10 + walk) * MS)
-        median = compared(*(one.astype(int) for one in samples)).quantiles[0]
+        median = compare_samples(*(one.astype(int) for one in samples)).quantiles[0]
         held += median.low <= 1 <= median.high
     assert held >= 50
 

@@ -9,17 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.adapters.launch.api.basics import LaunchContext
 from rsltrace.adapters.launch.expression import evaluate
-from rsltrace.adapters.launch.model import Scope
-from rsltrace.adapters.launch.substitution import Call, Substitutions, parse_template
+from rsltrace.adapters.launch.model import LaunchScope
+from rsltrace.adapters.launch.substitution import SubstitutionCall, parse_template
 
 
 def text(written: str) -> str:
-    values = Scope(
+    context = LaunchContext()
+    context.file = Path("/launch/robot.launch.xml")
+    context.scope = LaunchScope(
         configurations={"a": "1", "b": "two words", "yes": "True", "name": "a"},
         environment={"HOME": "/home/me"},
     )
-    return Substitutions(values, Path("/launch/robot.launch.xml")).text(written)
+    return context.text(parse_template(written))
 
 
 @pytest.mark.parametrize(
@@ -62,7 +65,7 @@ def test_what_substitutions_mean(written: str, meant: str) -> None:
         ("$(var 'a)", "a quote ' is not closed"),
         ("$(1)", "begins a substitution"),
         ("$(find-pkg-share none)", "there is no ROS package 'none'"),
-        ("$(find-exec no-such-program)", "no executable 'no-such-program'"),
+        ("$(find-exec no-such-program)", "executable 'no-such-program' not found"),
         ("$(file-content /no/such)", "No such file"),
         ("$(" + "var $(" * 60, "nested more than"),
     ],
@@ -79,7 +82,7 @@ def test_any_text_is_taken_apart_or_refused(written: str) -> None:
         parts = parse_template(written)
     except ValueError:
         return
-    assert all(isinstance(part, (str, Call)) for part in parts)
+    assert all(isinstance(part, (str, SubstitutionCall)) for part in parts)
 
 
 @pytest.mark.parametrize(

@@ -260,7 +260,7 @@ return LaunchDescription([
         ),
         (
             "return LaunchDescription([Node(package='a', executable=LaunchConfiguration('x'))])",
-            "launch configuration 'x' does not exist",
+            "there is no launch argument 'x'",
         ),
         (
             "return LaunchDescription([Node(package='a', node_executable='x', executable='y')])",

@@ -12,10 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.native.apart import run as merging
-from rsltrace.native.apart.run import Merge
-from rsltrace.native.apart.wire import Link, LinkError, SpanReader, SpanWriter
-from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span, Taken, now_ns
-from rsltrace.native.things import Things
+from rsltrace.native.apart.run import SpanMerger
+from rsltrace.native.apart.wire import Link, LinkError, SpanDecoder, SpanEncoder
+from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.span_recorder import (
+    CallbackError,
+    CallbackSpan,
+    EmittedLog,
+    ReceivedInput,
+    SentMessage,
+    SpanRecorder,
+    TaskCreation,
+    now_ns,
+)
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
@@ -24,8 +33,8 @@ from tests.tiers import cases
 TIMER, TASK = int(EventKind.TIMER), int(EventKind.TASK)
 
 
-def span(start_ns: int) -> Span:
-    return Span(TIMER, None, start_ns, 0, 1, None, end_ns=start_ns + 1)
+def span(start_ns: int) -> CallbackSpan:
+    return CallbackSpan(TIMER, None, start_ns, 0, 1, None, end_ns=start_ns + 1)
 
 
 @settings(max_examples=cases(10, 40))
@@ -34,7 +43,7 @@ def test_all_is_in_order_and_nothing_is_lost(
     starts: list[list[int]], chance: random.Random
 ) -> None:
     begun_ns = now_ns() + 10**12
-    merge = Merge()
+    merge = SpanMerger()
     left = [(merge.source(), sorted(begun_ns + one for one in own)) for own in starts]
     found: list[int] = []
     while left:
@@ -51,7 +60,7 @@ def test_all_is_in_order_and_nothing_is_lost(
 
 
 def test_who_has_told_nothing_keeps_the_others_back() -> None:
-    merge = Merge()
+    merge = SpanMerger()
     silent, other = merge.source(), merge.source()
     later_ns = now_ns() + 10**10
     merge.add(other, [span(later_ns)], later_ns + 1)
@@ -61,7 +70,7 @@ def test_who_has_told_nothing_keeps_the_others_back() -> None:
 
 
 def test_who_stands_still_does_not_keep_them_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    merge = Merge()
+    merge = SpanMerger()
     silent, other = merge.source(), merge.source()
     begun_ns = now_ns()
     merge.add(other, [span(begun_ns)], begun_ns + 1)
@@ -75,38 +84,43 @@ def test_who_stands_still_does_not_keep_them_for_ever(monkeypatch: pytest.Monkey
 
 def test_spans_are_the_same_on_the_other_side() -> None:
     log = pytest.importorskip("rcl_interfaces.msg").Log
-    ledger = Ledger()
-    things = Things(ledger.add)
-    writer = SpanWriter(things)
-    node = things.add((), None, EntityKind.NODE, "/node")
-    topic = things.add((), node, EntityKind.PUBLISHER, "/topic", "std_msgs/msg/String")
-    rosout = things.add((), node, EntityKind.PUBLISHER, "/rosout")
+    recorder = SpanRecorder()
+    entities = ObservedEntities(recorder.add)
+    writer = SpanEncoder(entities)
+    node = entities.add((), None, EntityKind.NODE, "/node")
+    topic = entities.add((), node, EntityKind.PUBLISHER, "/topic", "std_msgs/msg/String")
+    rosout = entities.add((), node, EntityKind.PUBLISHER, "/rosout")
     topic.sends, topic.gid = MessageType("std_msgs/msg/String", lambda: ("string data", "")), b"me"
-    ledger.finished(None)
-    taken = Taken(topic, 1, 2, "1 /topic", 3, 4, 5, 6, b"gid")
-    ledger.begin(TIMER, topic, taken)
-    sent = Sent(1, topic, 7, b"data", 8, 9, 10)
-    ledger.sent(ledger.sending(), sent)
-    ledger.add(Logged(rosout, 20, "name", "text", "function", "file", 3))
-    cause = ledger.add(Scheduled())
-    ledger.end(Failed("ValueError", "no", "trace"))
-    ledger.begin(TASK, topic, None, cause)
-    ledger.end()
-    spans = ledger.finished(None)
+    recorder.finished(None)
+    taken = ReceivedInput(topic, 1, 2, "1 /topic", 3, 4, 5, 6, b"gid")
+    recorder.begin(TIMER, topic, taken)
+    sent = SentMessage(1, topic, 7, b"data", 8, 9, 10)
+    recorder.sent(recorder.sending(), sent)
+    recorder.add(EmittedLog(rosout, 20, "name", "text", "function", "file", 3))
+    cause = recorder.add(TaskCreation())
+    recorder.end(CallbackError("ValueError", "no", "trace"))
+    recorder.begin(TASK, topic, None, cause)
+    recorder.end()
+    spans = recorder.finished(None)
     told = pickle.loads(pickle.dumps((writer.definitions(), [writer.plain(one) for one in spans])))
 
-    reader = SpanReader(count(100), count(7), log)
+    reader = SpanDecoder(count(100), count(7), log)
     reader.define(told[0])
     first, second = (reader.span(one) for one in told[1])
-    assert (first.thing, second.thing) == (first.thing, first.thing)
-    assert first.thing is not None
-    assert (first.thing.id, first.thing.node, first.thing.gid) == (101, 100, b"me")
-    assert first.thing.sends is not None
-    assert first.thing.sends.describe() == ("string data", "")
+    assert (first.entity, second.entity) == (first.entity, first.entity)
+    assert first.entity is not None
+    assert (first.entity.id, first.entity.node, first.entity.gid) == (101, 100, b"me")
+    assert first.entity.sends is not None
+    assert first.entity.sends.describe() == ("string data", "")
     assert first.thread == 7
     assert second.cause == (first, 2)
-    assert first.taken == Taken(first.thing, 1, 2, "1 /topic", 3, 4, 5, 6, b"gid")
-    assert [type(one) for one in first.outputs] == [Sent, Logged, Scheduled, Failed]
+    assert first.taken == ReceivedInput(first.entity, 1, 2, "1 /topic", 3, 4, 5, 6, b"gid")
+    assert [type(one) for one in first.outputs] == [
+        SentMessage,
+        EmittedLog,
+        TaskCreation,
+        CallbackError,
+    ]
 
 
 class Evil:

@@ -9,7 +9,13 @@ import pytest
 
 from rsltrace.native.timing.bounds import bounds
 from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
-from rsltrace.native.timing.system import Callback, Executor, Order, System, Task
+from rsltrace.native.timing.system import (
+    CallbackKey,
+    ChainTask,
+    ExecutorModel,
+    ExecutorOrder,
+    TaskSystem,
+)
 
 
 def task(
@@ -23,22 +29,23 @@ def task(
     urgency: float = 0,
     place: int = 0,
     count: int = 1,
-) -> Task:
-    callback = Callback("/n", kind, name)
-    return Task(
+) -> ChainTask:
+    callback = CallbackKey("/n", kind, name)
+    return ChainTask(
         callback, executor, wcet, arrivals, parent, 0, count, urgency=urgency, place=(place,)
     )
 
 
-def found(tasks: list[Task], **executors: Executor) -> list[int | None]:
-    return [one.ns for one in bounds(System(tuple(tasks), executors))]
+def found(tasks: list[ChainTask], **executors: ExecutorModel) -> list[int | None]:
+    return [one.ns for one in bounds(TaskSystem(tuple(tasks), executors))]
 
 
 def preemptive(times: list[tuple[int, int]]) -> list[int | None]:
     """Bounds of tasks (execution time, period) on one processor, the first most urgent."""
     tasks = [task(f"t{n}", c, Arrivals(t), executor=f"e{n}") for n, (c, t) in enumerate(times)]
     above = {
-        f"e{n}": Executor(above=frozenset(f"e{m}" for m in range(n))) for n in range(len(tasks))
+        f"e{n}": ExecutorModel(above=frozenset(f"e{m}" for m in range(n)))
+        for n in range(len(tasks))
     }
     return found(tasks, **above)
 
@@ -59,7 +66,7 @@ def test_non_preemptive_priorities() -> None:
     instance of the third message that takes longest, 3.5 ms, as the revised analysis has it."""
     times = [(10, 25), (10, 35), (10, 35)]
     tasks = [task(f"m{n}", c, Arrivals(t), urgency=n) for n, (c, t) in enumerate(times)]
-    assert found(tasks, e=Executor(Order.PRIORITY)) == [20, 30, 35]
+    assert found(tasks, e=ExecutorModel(ExecutorOrder.PRIORITY)) == [20, 30, 35]
 
 
 POSE, COSTMAP, PLANNER, SENSOR = 2, 20, 180, 2
@@ -81,7 +88,7 @@ def move_base(percent: int, jitter: int = 2) -> int | None:
         task("sensor2mem", SENSOR, others),
         task("sensor2mem", SENSOR, others),
     ]
-    return found(tasks, e=Executor(supply=supply))[2]
+    return found(tasks, e=ExecutorModel(supply=supply))[2]
 
 
 def test_the_case_study_of_casini_and_others() -> None:
@@ -107,10 +114,10 @@ def test_the_examples_of_response_time_analysis_rs() -> None:
     fast = task("fast", 1, Arrivals(10), kind="timer", place=0)
     slow = task("slow", 3, Arrivals(20), kind="timer", place=1)
     late = task("slow", 3, Arrivals(20, 10), kind="timer", place=1)
-    first = Executor(Order.WAIT_SET, RESERVED)
+    first = ExecutorModel(ExecutorOrder.WAIT_SET, RESERVED)
     assert found([*timer, fast, slow], e=first)[0] == 12
     assert found([*timer, fast, late], e=first)[0] == 17
-    anyhow = Executor(supply=RESERVED)
+    anyhow = ExecutorModel(supply=RESERVED)
     polled = [task("own", 1, Arrivals(10)), task("b", 1, Arrivals(10)), task("c", 3, Arrivals(20))]
     assert found(polled, e=anyhow)[0] == 12
     chain = [
@@ -130,8 +137,8 @@ def test_priorities_of_chains_save_them_from_what_is_less_urgent() -> None:
         task("slow", 9, Arrivals(100), urgency=2),
         task("slower", 8, Arrivals(100), urgency=3),
     ]
-    assert found(chain, e=Executor())[1] == 22
-    assert found(chain, e=Executor(Order.PRIORITY))[1] == 14
+    assert found(chain, e=ExecutorModel())[1] == 22
+    assert found(chain, e=ExecutorModel(ExecutorOrder.PRIORITY))[1] == 14
 
 
 def test_polling_points_bound_a_chain_beside_one_that_comes_in_bursts() -> None:
@@ -142,19 +149,19 @@ def test_polling_points_bound_a_chain_beside_one_that_comes_in_bursts() -> None:
         task("a2", 1, parent=0, place=1),
         task("burst", 5, Arrivals(1000), place=2, count=40),
     ]
-    anyhow = found(tasks, e=Executor())
-    polled = found(tasks, e=Executor(Order.WAIT_SET))
+    anyhow = found(tasks, e=ExecutorModel())
+    polled = found(tasks, e=ExecutorModel(ExecutorOrder.WAIT_SET))
     assert (anyhow[1], polled[1]) == (202, 12)
 
 
-@pytest.mark.parametrize("order", list(Order))
-def test_no_bound_where_there_is_more_to_do_than_time(order: Order) -> None:
+@pytest.mark.parametrize("order", list(ExecutorOrder))
+def test_no_bound_where_there_is_more_to_do_than_time(order: ExecutorOrder) -> None:
     tasks = [
         task("a", 6, Arrivals(10), urgency=1, kind="timer", place=0),
         task("b", 5, Arrivals(10), urgency=2, place=1),
         task("c", 1, parent=1, urgency=2, executor="other"),
     ]
-    assert found(tasks, e=Executor(order))[1:] == [None, None]
+    assert found(tasks, e=ExecutorModel(order))[1:] == [None, None]
 
 
 def test_a_reservation_gives_no_less_than_its_supply_bound_says() -> None:

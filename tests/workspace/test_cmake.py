@@ -160,7 +160,7 @@ def test_any_text_is_read(text: str) -> None:
     assert commands(package) == []
     from rsltrace.adapters.workspace import cmake
 
-    evaluation = cmake._Evaluation(package)
+    evaluation = cmake._CMakeInterpreter(package)
     words, end = cmake._arguments(text, 0)
     assert end <= len(text)
     evaluation._expanded(words)

@@ -82,13 +82,13 @@ def evaluate(text: str) -> Any:
         raise ValueError(f"{text!r} is not a Python expression: {error.msg}") from None
     except (RecursionError, MemoryError):
         raise ValueError(f"{text[:40]!r}… is nested too deeply") from None
-    except _Refused as error:
+    except _ForbiddenExpression as error:
         raise ValueError(f"{text!r}: {error}") from None
     except Exception as error:
         raise ValueError(f"{text!r} raises {type(error).__name__}: {error}") from None
 
 
-class _Refused(Exception):
+class _ForbiddenExpression(Exception):
     """The expression reaches for more than plain values."""
 
 
@@ -100,10 +100,12 @@ def _value(node: ast.expr) -> Any:
         return values if isinstance(node, ast.List) else tuple(values)
     if isinstance(node, ast.Name):
         if node.id in ("true", "false"):
-            raise _Refused(f"{node.id} is {node.id.capitalize()} in Python; or quote it")
+            raise _ForbiddenExpression(
+                f"{node.id} is {node.id.capitalize()} in Python; or quote it"
+            )
         if node.id in _MATH:
             return _MATH[node.id]
-        raise _Refused(f"there is no {node.id!r} here: quote it if it is text")
+        raise _ForbiddenExpression(f"there is no {node.id!r} here: quote it if it is text")
     if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
         return _UNARY[type(node.op)](_value(node.operand))
     if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
@@ -119,21 +121,21 @@ def _value(node: ast.expr) -> Any:
     if isinstance(node, ast.Attribute):
         if isinstance(node.value, ast.Name) and node.value.id == "math" and node.attr in _MATH:
             return _MATH[node.attr]
-        raise _Refused(f".{node.attr} cannot be used here")
+        raise _ForbiddenExpression(f".{node.attr} cannot be used here")
     if isinstance(node, ast.Call) and not node.keywords:
         return _call(node)
-    raise _Refused(f"{type(node).__name__} cannot be used here, only plain computing")
+    raise _ForbiddenExpression(f"{type(node).__name__} cannot be used here, only plain computing")
 
 
 def _binary(operation: ast.operator, left: Any, right: Any) -> Any:
     if isinstance(operation, ast.Pow) and (abs(right) > 1000 or abs(left) > 10**6):
-        raise _Refused("the power is too large")
+        raise _ForbiddenExpression("the power is too large")
     if isinstance(operation, ast.Mult):
         for one, other in ((left, right), (right, left)):
             if isinstance(one, (str, list, tuple)) and len(one) * other > _SIZE_MAX:
-                raise _Refused("the result is too long")
+                raise _ForbiddenExpression("the result is too long")
     if isinstance(operation, ast.Mod) and isinstance(left, str):
-        raise _Refused("text cannot be formatted with %; use + and str()")
+        raise _ForbiddenExpression("text cannot be formatted with %; use + and str()")
     return _BINARY[type(operation)](left, right)
 
 
@@ -170,7 +172,7 @@ def _call(node: ast.Call) -> Any:
     if isinstance(node.func, ast.Name):
         function = _FUNCTIONS.get(node.func.id) or _MATH.get(node.func.id)
         if not callable(function):
-            raise _Refused(f"{node.func.id}() cannot be called here")
+            raise _ForbiddenExpression(f"{node.func.id}() cannot be called here")
     elif isinstance(node.func, ast.Attribute):
         owner = node.func.value
         if isinstance(owner, ast.Name) and owner.id == "math":
@@ -178,13 +180,13 @@ def _call(node: ast.Call) -> Any:
         else:
             text = _value(owner)
             if not isinstance(text, str) or node.func.attr not in _METHODS:
-                raise _Refused(f".{node.func.attr}() cannot be called here")
+                raise _ForbiddenExpression(f".{node.func.attr}() cannot be called here")
             function = getattr(text, node.func.attr)
         if not callable(function):
-            raise _Refused(f".{node.func.attr}() cannot be called here")
+            raise _ForbiddenExpression(f".{node.func.attr}() cannot be called here")
     else:
-        raise _Refused("only functions and methods of text can be called here")
+        raise _ForbiddenExpression("only functions and methods of text can be called here")
     result = function(*arguments)
     if isinstance(result, (str, list)) and len(result) > _SIZE_MAX:
-        raise _Refused("the result is too long")
+        raise _ForbiddenExpression("the result is too long")
     return result

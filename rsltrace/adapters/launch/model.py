@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -21,18 +22,18 @@ from rsltrace.trace.model.texts import printable
 
 
 @dataclass(frozen=True, slots=True)
-class ParameterFile:
+class ParameterFilePath:
     """A file of parameters (absolute), at its place among a node's parameters."""
 
     path: str
 
 
-Parameters = tuple["ParameterFile | dict[str, Any]", ...]
+Parameters = tuple["ParameterFilePath | dict[str, Any]", ...]
 """Files and mappings in order; what comes later has the last word."""
 
 
 @dataclass(slots=True)
-class Scope:
+class LaunchScope:
     """What one group can see; ``copy`` gives an inner group its own."""
 
     configurations: dict[str, str] = field(default_factory=dict)
@@ -41,7 +42,7 @@ class Scope:
     parameters: Parameters = ()
     remappings: tuple[tuple[str, str], ...] = ()
 
-    def copy(self) -> Scope:
+    def copy(self) -> LaunchScope:
         """Return a copy that can be changed without changing this."""
         return replace(
             self, configurations=dict(self.configurations), environment=dict(self.environment)
@@ -74,7 +75,7 @@ def joined_namespace(base: str, own: str | None) -> str:
 # Values of parameters in launch files: what a text or a typed YAML value becomes.
 
 
-class _Constructor(SafeConstructor):
+class _LaunchYamlConstructor(SafeConstructor):
     """Reads what ROS's launch writes, too: it has tuples where a file has lists.
 
     Names are text, even if they are ``n`` or ``on``.
@@ -88,7 +89,7 @@ class _Constructor(SafeConstructor):
         return super().construct_mapping(node, deep)
 
 
-_Constructor.add_constructor(
+_LaunchYamlConstructor.add_constructor(
     "tag:yaml.org,2002:python/tuple",
     lambda constructor, node: constructor.construct_sequence(node, deep=True),
 )
@@ -99,7 +100,7 @@ def yaml_value(text: str) -> Any:
     if nested_too_deep(text) >= 0:
         return text
     yaml = YAML(typ="safe", pure=True)
-    yaml.Constructor = _Constructor
+    yaml.Constructor = _LaunchYamlConstructor
     yaml.version = (1, 1)
     try:
         return yaml.load(text)
@@ -147,6 +148,31 @@ def _one(value: Any, kind: str) -> Any:
             f"unknown type {kind!r}: there are bool, int, float, str, yaml and list_of_ these"
         )
     raise ValueError(f"expected {kind}, got {value!r}")
+
+
+_TRUE, _FALSE = ("true", "1"), ("false", "0")
+
+
+def truth(text: str) -> bool:
+    """Return a condition's value, as launch reads it.
+
+    :raises ValueError: if it is none of true, 1, false, 0.
+    """
+    word = text.strip().lower()
+    if word not in (*_TRUE, *_FALSE):
+        raise ValueError(f"expected true, 1, false or 0, got {text!r}")
+    return word in _TRUE
+
+
+def equal_texts(a: str, b: str) -> bool:
+    """Return whether two texts are equal as launch compares them: truth values, numbers, text."""
+    words = a.lower(), b.lower()
+    if all(word in (*_TRUE, *_FALSE) for word in words):
+        return (words[0] in _TRUE) == (words[1] in _TRUE)
+    try:
+        return math.isclose(float(a), float(b))
+    except ValueError:
+        return a == b
 
 
 # What becomes of a job with launch files.
@@ -227,7 +253,7 @@ ENVIRONMENT = (
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class ProcessSettings:
     """What a launch file says of the process of a node: where it runs, and when again.
 
     ``environment`` is what differs from that of the launch file; ``own`` names what of these is
@@ -243,7 +269,7 @@ class Surroundings:
 
 
 def respawning(delay_s: float, times: int) -> tuple[int, int | None] | None:
-    """Return ``Surroundings.respawn`` as launch files say it; negative ``times``: no limit."""
+    """Return ``ProcessSettings.respawn`` as launch files say it; negative ``times``: no limit."""
     return None if times == 0 else (round(max(delay_s, 0) * 1e9), None if times < 0 else times)
 
 
@@ -273,7 +299,7 @@ class LaunchedNode:
     after: tuple[str, int] | None = None
     number: int = 0
     fault: str = ""
-    surroundings: Surroundings = Surroundings()
+    surroundings: ProcessSettings = ProcessSettings()
     is_container: bool = False
     container: str = ""
     extra_arguments: Parameters = ()
@@ -291,7 +317,7 @@ class LaunchedNode:
 
 
 @dataclass(frozen=True, slots=True)
-class Unsupported:
+class UnsupportedItem:
     """Something in a launch file that cannot be simulated, and why."""
 
     where: str
@@ -326,7 +352,7 @@ class Launched:
     Where a node of which ``required`` has the number ends, everything does."""
 
     nodes: list[LaunchedNode] = field(default_factory=list)
-    unsupported: list[Unsupported] = field(default_factory=list)
+    unsupported: list[UnsupportedItem] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
     arguments: dict[str, Argument] = field(default_factory=dict)
     required: set[int] = field(default_factory=set)

@@ -1,6 +1,6 @@
 """Reads Python launch files with rsltrace's own part of ``launch``: for a process of its own.
 
-A Python launch file is a program, and may do to its process whatever it likes (see ``apart``).
+A Python launch file is a program, and may do to its process whatever it likes (see ``expand``).
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ from rsltrace.adapters.launch.api.basics import (
     as_job_error,
     shown,
 )
-from rsltrace.adapters.launch.api.names import own_launch
+from rsltrace.adapters.launch.api.description_sources import (
+    get_launch_description_from_python_launch_file,
+)
 from rsltrace.adapters.launch.api.packages import missing_packages_allowed
-from rsltrace.adapters.launch.api.sources import get_launch_description_from_python_launch_file
-from rsltrace.adapters.launch.model import Launched, argument_words
-from rsltrace.adapters.launch.reader import ActionReader
+from rsltrace.adapters.launch.api.ros_modules import own_launch
+from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.reader import LaunchFileReader
 from rsltrace.errors import JobError
 
 
@@ -30,25 +32,12 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
 
     :raises JobError: with file and line, if something in it is wrong, missing or not known here.
     """
-    context = LaunchContext(argv=argument_words(arguments))
-
-    def run(file: Path) -> None:
-        _run(context, file)
-
-    reader = ActionReader(dict(arguments), run)
-    context.evaluation = reader
-    context.include = lambda file: reader.include(file, None)
-    with own_launch(), missing_packages_allowed(context):
-        reader.include(path, None)
-        while context.later:
-            try:
-                context.later.pop(0)()
-            except Exception as error:
-                raise as_job_error(error, shown(str(path))) from error
-    return reader.launched
+    reader = LaunchFileReader(arguments, _load)
+    with own_launch(), missing_packages_allowed(reader.context):
+        return reader.read(path)
 
 
-def _run(context: LaunchContext, file: Path) -> None:
+def _load(context: LaunchContext, file: Path) -> LaunchDescription:
     os.environ.update(context.environment)
     here = str(file)
     try:
@@ -72,10 +61,7 @@ def _run(context: LaunchContext, file: Path) -> None:
             "LaunchDescription",
             where=shown(here),
         )
-    try:
-        description.visit(context)
-    except Exception as error:
-        raise as_job_error(error, shown(here)) from error
+    return description
 
 
 __all__ = ["read_launch_file"]

@@ -22,10 +22,10 @@ from rsltrace.adapters.launch.model import (
     Argument,
     Launched,
     LaunchedNode,
-    ParameterFile,
+    ParameterFilePath,
     Parameters,
-    Surroundings,
-    Unsupported,
+    ProcessSettings,
+    UnsupportedItem,
     argument_words,
     full_name,
     respawning,
@@ -59,7 +59,7 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
     with _own_environment(["ros2", "launch", str(path), *words]):
         context = LaunchContext(argv=words)
         context.launch_configurations.update(arguments)
-        visitor = _Visitor(context, path)
+        visitor = _LaunchVisitor(context, path)
         try:
             source = AnyLaunchDescriptionSource(str(path))
             given = list(arguments.items())
@@ -87,7 +87,7 @@ def _own_environment(argv: list[str]) -> Iterator[None]:
         os.environ.update(saved)
 
 
-class _Visitor:
+class _LaunchVisitor:
     def __init__(self, context: Any, path: Path) -> None:
         self.launched = Launched()
         self._context = context
@@ -215,7 +215,7 @@ class _Visitor:
         self._refuse(name, "it is not for one process, or calls a function with the event")
 
     def _refuse(self, what: str, why: str) -> None:
-        self.launched.unsupported.append(Unsupported(self.where(), what, why))
+        self.launched.unsupported.append(UnsupportedItem(self.where(), what, why))
 
     def _declare(self, action: Any) -> None:
         default = action.default_value
@@ -270,7 +270,7 @@ class _Visitor:
             )
         )
 
-    def _surroundings(self, node: Any) -> Surroundings:
+    def _surroundings(self, node: Any) -> ProcessSettings:
         process = node.process_description
         own: dict[str, str] = {}
         for pairs in (process.env, process.additional_env):
@@ -283,7 +283,7 @@ class _Visitor:
             times = getattr(node, "_ExecuteLocal__respawn_max_retries", -1)
             respawn = respawning(delay_s, int(times))
         prefix = self._text(process.prefix) if process.prefix is not None else ""
-        return Surroundings(
+        return ProcessSettings(
             tuple({**changed, **own}.items()),
             folder=self._optional(process.cwd) or "",
             respawn=respawn,
@@ -301,7 +301,7 @@ class _Visitor:
 
     def _parameters(self, node: Any, name: str | None, namespace: str | None) -> Parameters:
         whole = None if name is None else full_name(namespace, name)
-        found: list[ParameterFile | dict[str, Any]] = []
+        found: list[ParameterFilePath | dict[str, Any]] = []
         shared = self._context.launch_configurations.get("global_params") or ()
         found += [{item[0]: item[1]} for item in shared if isinstance(item, tuple)]
         for text, is_file in node._Node__expanded_parameter_arguments or ():
@@ -313,7 +313,7 @@ class _Visitor:
                 found.append(parameters_for(text, whole))
                 self._scratch.add(text)
             else:
-                found.append(ParameterFile(text))
+                found.append(ParameterFilePath(text))
         return tuple(found)
 
     def _components(self, descriptions: Any, container: str) -> None:
@@ -350,23 +350,23 @@ class _Visitor:
         )
 
     def _component_parameters(self, description: Any) -> Parameters:
-        found: list[ParameterFile | dict[str, Any]] = []
+        found: list[ParameterFilePath | dict[str, Any]] = []
         for item in self._context.launch_configurations.get("global_params") or ():
             if isinstance(item, tuple):
                 found.append({item[0]: item[1]})
             else:
-                found.append(ParameterFile(os.path.abspath(item)))
+                found.append(ParameterFilePath(os.path.abspath(item)))
         return (*found, *self._evaluated(description.parameters))
 
     def _evaluated(self, parameters: Any) -> Parameters:
         from launch_ros.utilities import evaluate_parameters
 
-        found: list[ParameterFile | dict[str, Any]] = []
+        found: list[ParameterFilePath | dict[str, Any]] = []
         for given in evaluate_parameters(self._context, parameters or ()):
             if isinstance(given, dict):
                 found.append({str(name): _plain(value) for name, value in given.items()})
             elif isinstance(given, Path):
-                found.append(ParameterFile(str(given)))
+                found.append(ParameterFilePath(str(given)))
             else:
                 name, value = given.evaluate(self._context)
                 found.append({name: _plain(value)})

@@ -9,9 +9,9 @@ from typing import Any
 from rsltrace.adapters.launch.model import (
     Launched,
     LaunchedNode,
-    ParameterFile,
-    Surroundings,
-    Unsupported,
+    ParameterFilePath,
+    ProcessSettings,
+    UnsupportedItem,
     full_name,
     inferred,
 )
@@ -47,7 +47,7 @@ def node_specs(
     for node in _without_idle_containers(launched.nodes, why_not):
         why = _why_not(node, why_not, containers)
         if why is not None:
-            launched.unsupported.append(Unsupported(node.where, node.title, why))
+            launched.unsupported.append(UnsupportedItem(node.where, node.title, why))
         else:
             runs.append(node)
             containers |= {node.full_name} if node.is_container else set()
@@ -73,7 +73,7 @@ def node_specs(
     return specs
 
 
-def _position(item: Unsupported) -> tuple[str, list[int]]:
+def _position(item: UnsupportedItem) -> tuple[str, list[int]]:
     file, *numbers = item.where.split(":")
     return file, [int(number) for number in numbers if number.isdigit()]
 
@@ -88,7 +88,7 @@ def _without_orphans(nodes: list[LaunchedNode], launched: Launched) -> list[Laun
         for node in nodes:
             if node not in kept and node.after is not None:
                 why = f"it starts when something has {node.after[0]} that is left out itself"
-                launched.unsupported.append(Unsupported(node.where, node.title, why))
+                launched.unsupported.append(UnsupportedItem(node.where, node.title, why))
         nodes = kept
 
 
@@ -144,7 +144,7 @@ def _spec(
     if node.fault:
         raise JobError(node.fault)
     words, ros_words = split_ros_arguments(node.arguments)
-    given = _RosWords([*node.ros_arguments, *ros_words], node.where)
+    given = _RosArguments([*node.ros_arguments, *ros_words], node.where)
     name = given.name or node.name
     namespace = given.namespace or node.namespace
     whole = None if name is None else full_name(namespace, name)
@@ -185,7 +185,7 @@ def _spec(
         raise JobError(str(error).removeprefix("NodeSpec: "), where=node.where) from None
 
 
-def _surroundings(said: Surroundings) -> dict[str, Any]:
+def _surroundings(said: ProcessSettings) -> dict[str, Any]:
     values: dict[str, Any] = {"environment": dict(said.environment)}
     if said.folder:
         values["working_directory"] = said.folder
@@ -196,7 +196,7 @@ def _surroundings(said: Surroundings) -> dict[str, Any]:
 
 
 def _in_order(
-    parameters: Sequence[ParameterFile | dict[str, Any]], full_name: str | None
+    parameters: Sequence[ParameterFilePath | dict[str, Any]], full_name: str | None
 ) -> tuple[list[str], dict[str, Any]]:
     """Return files and values such that each parameter has the value given last.
 
@@ -205,7 +205,7 @@ def _in_order(
     files: list[str] = []
     values: dict[str, Any] = {}
     for item in parameters:
-        if isinstance(item, ParameterFile):
+        if isinstance(item, ParameterFilePath):
             files.append(lasting(item.path))
             for name in parameters_for(item.path, full_name):
                 values.pop(name, None)
@@ -214,13 +214,13 @@ def _in_order(
     return files, values
 
 
-class _RosWords:
+class _RosArguments:
     """What ``--ros-args`` words say about one node."""
 
     def __init__(self, words: Sequence[str], where: str) -> None:
         self.name: str | None = None
         self.namespace: str | None = None
-        self.parameters: list[ParameterFile | dict[str, Any]] = []
+        self.parameters: list[ParameterFilePath | dict[str, Any]] = []
         self.remappings: list[tuple[str, str]] = []
         self._where = where
         rest = list(words)
@@ -243,7 +243,7 @@ class _RosWords:
             path = os.path.abspath(value)
             if not os.path.isfile(path):
                 raise JobError(f"there is no parameter file {value}", where=self._where)
-            self.parameters.append(ParameterFile(path))
+            self.parameters.append(ParameterFilePath(path))
             return
         name, assigned, to = value.partition(":=")
         if option not in ("-r", "--remap", "-p", "--param") or not assigned:

@@ -1,38 +1,23 @@
-"""What the substitutions of launch files stand for, without ROS's launch."""
+"""``$(…)`` in XML and YAML launch files: the grammar, and what each stands for."""
 
 from __future__ import annotations
 
-import math
-import os
 import re
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
+from rsltrace.adapters.launch.api import substitutions as api
+from rsltrace.adapters.launch.api.basics import LaunchContext, Substitution, SubstitutionFailure
 from rsltrace.adapters.launch.expression import evaluate
-from rsltrace.adapters.launch.model import Scope
 from rsltrace.adapters.workspace.imports import unbuilt_prefix
-from rsltrace.errors import did_you_mean, nearest
+from rsltrace.errors import nearest
 from rsltrace.job.reading.substitute import package_prefix
-from rsltrace.trace.model.regular_file import read_regular
-
-# Text with ``$(…)`` in it, taken apart: the grammar of substitutions in ROS's launch files.
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 _DEPTH_MAX = 50
 
 
-@dataclass(frozen=True, slots=True)
-class Call:
-    """One substitution: ``$(env HOME)`` has the name ``env`` and one argument."""
-
-    name: str
-    arguments: tuple[Template, ...]
-    written: str
-
-
-Template = tuple["str | Call", ...]
+Template = tuple[str | Substitution, ...]
 """The pieces of a text, in order."""
 
 
@@ -41,10 +26,10 @@ def parse_template(text: str) -> Template:
 
     :raises ValueError: if a substitution is not written properly.
     """
-    return _Parser(text).template()
+    return _TemplateParser(text).template()
 
 
-class _Parser:
+class _TemplateParser:
     def __init__(self, text: str) -> None:
         self._text = text
         self._at = 0
@@ -52,7 +37,7 @@ class _Parser:
 
     def template(self, end: str = "") -> Template:
         """Read up to the character ``end`` (a quote, which is skipped), or all there is."""
-        parts: list[str | Call] = []
+        parts: list[str | Substitution] = []
         plain = ""
         text = self._text
         while self._at < len(text):
@@ -78,7 +63,7 @@ class _Parser:
             parts.append(plain)
         return tuple(parts)
 
-    def _call(self) -> Call:
+    def _call(self) -> SubstitutionCall:
         start = self._at
         self._depth += 1
         if self._depth > _DEPTH_MAX:
@@ -101,14 +86,14 @@ class _Parser:
             arguments.append(self._argument())
         self._at += 1
         self._depth -= 1
-        return Call(name.group(), tuple(arguments), self._text[start : self._at])
+        return SubstitutionCall(name.group(), tuple(arguments), self._text[start : self._at])
 
     def _argument(self) -> Template:
         text = self._text
         if text[self._at] in "'\"":
             self._at += 1
             return self.template(text[self._at - 1])
-        parts: list[str | Call] = []
+        parts: list[str | Substitution] = []
         while self._at < len(text) and text[self._at] not in " \t\r\n)":
             if text.startswith("$(", self._at):
                 parts.append(self._call())
@@ -124,8 +109,8 @@ class _Parser:
             self._at += 1
 
 
-def _joined(parts: list[str | Call]) -> list[str | Call]:
-    joined: list[str | Call] = []
+def _joined(parts: list[str | Substitution]) -> list[str | Substitution]:
+    joined: list[str | Substitution] = []
     for part in parts:
         if isinstance(part, str) and joined and isinstance(joined[-1], str):
             joined[-1] += part
@@ -134,128 +119,48 @@ def _joined(parts: list[str | Call]) -> list[str | Call]:
     return joined
 
 
-_TRUE, _FALSE = ("true", "1"), ("false", "0")
+class SubstitutionCall(Substitution):
+    """One substitution: ``$(env HOME)`` has the name ``env`` and one argument."""
 
-_REFUSED = {
-    "command": "reading a launch file runs no commands",
-    "param": "a parameter's value is not known before the nodes run",
-    "launch_log_dir": "a simulation writes no log files",
-    "log_dir": "a simulation writes no log files",
-}
+    def __init__(self, name: str, arguments: tuple[Template, ...], written: str) -> None:
+        self.name, self.arguments, self.written = name, arguments, written
 
+    def describe(self) -> str:
+        """Return it as it is written."""
+        return self.written
 
-def truth(text: str) -> bool:
-    """Return a condition's value, as launch reads it.
-
-    :raises ValueError: if it is none of true, 1, false, 0.
-    """
-    word = text.strip().lower()
-    if word in _TRUE:
-        return True
-    if word in _FALSE:
-        return False
-    raise ValueError(f"expected true, 1, false or 0, got {text!r}")
-
-
-class Substitutions:
-    """Replaces ``$(…)`` by what ``scope`` holds; ``file`` is the launch file being read."""
-
-    def __init__(self, scope: Scope, file: Path) -> None:
-        self.scope = scope
-        self.file = file
-        self._anonymous: dict[str, str] = {}
-        self._known: dict[str, tuple[int, int, Callable[..., str]]] = {
-            "var": (1, 2, self._var),
-            "env": (1, 2, self._env),
-            "optenv": (1, 2, lambda name, default="": self._env(name, default)),
-            "dirname": (0, 0, lambda: str(self.file.parent)),
-            "filename": (0, 0, lambda: str(self.file)),
-            "find-pkg-share": (1, 1, lambda package: str(_prefix(package) / "share" / package)),
-            "find-pkg-prefix": (1, 1, lambda package: str(_prefix(package))),
-            "exec-in-pkg": (2, 2, _executable_in_package),
-            "find-exec": (1, 1, _find_executable),
-            "file-content": (1, 1, _file_content),
-            "anon": (1, 1, self.anonymous),
-            "eval": (1, 99, lambda *words: str(evaluate(" ".join(words)))),
-            "not": (1, 1, lambda a: _word(not truth(a))),
-            "and": (2, 2, lambda a, b: _word(truth(a) and truth(b))),
-            "or": (2, 2, lambda a, b: _word(truth(a) or truth(b))),
-            "any": (0, 99, lambda *words: _word(any(map(truth, words)))),
-            "all": (0, 99, lambda *words: _word(all(map(truth, words)))),
-            "equals": (2, 2, lambda a, b: _word(equal_texts(a, b))),
-            "not-equals": (2, 2, lambda a, b: _word(not equal_texts(a, b))),
-            "if": (2, 3, lambda a, yes, no="": yes if truth(a) else no),
-        }
-
-    def text(self, written: str) -> str:
-        """Return a text with every substitution in it replaced.
-
-        :raises ValueError: if one is wrong; the message begins with it as it is written.
-        """
-        return self._evaluate(parse_template(written)) if written else ""
-
-    def _evaluate(self, template: Template) -> str:
-        return "".join(part if isinstance(part, str) else self._call(part) for part in template)
-
-    def _call(self, call: Call) -> str:
-        if call.name in _REFUSED:
-            raise ValueError(f"{call.written}: {_REFUSED[call.name]}; give the value itself")
-        if call.name not in self._known:
-            near = nearest(call.name, self._known)
-            there = f"there are {', '.join(self._known)}"
+    def perform(self, context: LaunchContext) -> str:
+        """Return the text. Raises ``ValueError``, whose message begins with what is written."""
+        if self.name in _REFUSED:
+            raise ValueError(f"{self.written}: {_REFUSED[self.name]}; give the value itself")
+        if self.name not in SUBSTITUTIONS:
+            near = nearest(self.name, SUBSTITUTIONS)
+            there = f"there are {', '.join(SUBSTITUTIONS)}"
             hint = f"did you mean $({near} …)?" if near else there
-            raise ValueError(f"{call.written} is no substitution; {hint}")
-        least, most, function = self._known[call.name]
-        if not least <= len(call.arguments) <= most:
+            raise ValueError(f"{self.written} is no substitution; {hint}")
+        least, most, make = SUBSTITUTIONS[self.name]
+        if not least <= len(self.arguments) <= most:
             number = f"{least}" if least == most else f"{least} to {most}"
             raise ValueError(
-                f"{call.written}: {call.name} takes {number} values, here are "
-                f"{len(call.arguments)} (quote a value with blanks in it)"
+                f"{self.written}: {self.name} takes {number} values, here are "
+                f"{len(self.arguments)} (quote a value with blanks in it)"
             )
-        arguments = [self._evaluate(argument) for argument in call.arguments]
         try:
-            return function(*arguments)
-        except (ValueError, OSError) as error:
+            return make(*self.arguments).perform(context)
+        except (ValueError, OSError, SubstitutionFailure) as error:
             said = str(error)
-            raise ValueError(said if said.startswith("$(") else f"{call.written}: {said}") from None
-
-    def _var(self, name: str, default: str | None = None) -> str:
-        value = self.scope.configurations.get(name, default)
-        if value is None:
-            names = sorted(self.scope.configurations)
-            there = f"there are {', '.join(names)}" if names else "none is declared"
-            hint = did_you_mean(name, names, there)
-            raise ValueError(f"there is no launch argument {name!r}; {hint}")
-        return value
-
-    def _env(self, name: str, default: str | None = None) -> str:
-        value = self.scope.environment.get(name, default)
-        if value is None:
-            raise ValueError(
-                f"the environment variable {name} is not set: set it, or give a default, "
-                f"$(env {name} default)"
-            )
-        return value
-
-    def anonymous(self, name: str) -> str:
-        """Return a name that nobody else has."""
-        # ROS appends host, process and a random number; here runs must not differ.
-        return self._anonymous.setdefault(name, f"{name}_{len(self._anonymous) + 1}")
+            raise ValueError(said if said.startswith("$(") else f"{self.written}: {said}") from None
 
 
-def _word(value: bool) -> str:
-    return str(value).lower()
+class _TextFunction(Substitution):
+    """What a function makes of texts."""
 
+    def __init__(self, function: Callable[..., str], *arguments: Template) -> None:
+        self._function, self._arguments = function, arguments
 
-def equal_texts(a: str, b: str) -> bool:
-    """Return whether two texts are equal as launch compares them: truth values, numbers, text."""
-    words = a.lower(), b.lower()
-    if all(word in (*_TRUE, *_FALSE) for word in words):
-        return (words[0] in _TRUE) == (words[1] in _TRUE)
-    try:
-        return math.isclose(float(a), float(b))
-    except ValueError:
-        return a == b
+    def perform(self, context: LaunchContext) -> str:
+        """Return the text."""
+        return self._function(*map(context.text, self._arguments))
 
 
 def _prefix(package: str) -> Path:
@@ -275,12 +180,40 @@ def _executable_in_package(executable: str, package: str) -> str:
     return str(path)
 
 
-def _find_executable(name: str) -> str:
-    path = shutil.which(name)
-    if path is None:
-        raise ValueError(f"there is no executable {name!r} in PATH")
-    return os.path.abspath(path)
+def _function(function: Callable[..., str]) -> Callable[..., Substitution]:
+    return lambda *arguments: _TextFunction(function, *arguments)
 
 
-def _file_content(path: str) -> str:
-    return read_regular(Path(path)).decode()
+def _environment(name: Template, default: Template | None = None) -> Substitution:
+    return api.EnvironmentVariable(name, default_value=default)
+
+
+_REFUSED = {
+    "command": "reading a launch file runs no commands",
+    "param": "a parameter's value is not known before the nodes run",
+    "launch_log_dir": "a simulation writes no log files",
+    "log_dir": "a simulation writes no log files",
+}
+SUBSTITUTIONS: dict[str, tuple[int, int, Callable[..., Substitution]]] = {
+    "var": (1, 2, lambda name, default=None: api.LaunchConfiguration(name, default=default)),
+    "env": (1, 2, _environment),
+    "optenv": (1, 2, lambda name, default=(): _environment(name, default)),
+    "dirname": (0, 0, api.ThisLaunchFileDir),
+    "filename": (0, 0, api.ThisLaunchFile),
+    "find-pkg-share": (1, 1, _function(lambda name: str(_prefix(name) / "share" / name))),
+    "find-pkg-prefix": (1, 1, _function(lambda name: str(_prefix(name)))),
+    "exec-in-pkg": (2, 2, _function(_executable_in_package)),
+    "find-exec": (1, 1, lambda name: api.FindExecutable(name=name)),
+    "file-content": (1, 1, api.FileContent),
+    "anon": (1, 1, api.AnonName),
+    "eval": (1, 99, _function(lambda *words: str(evaluate(" ".join(words))))),
+    "not": (1, 1, api.NotSubstitution),
+    "and": (2, 2, api.AndSubstitution),
+    "or": (2, 2, api.OrSubstitution),
+    "any": (0, 99, api.AnySubstitution),
+    "all": (0, 99, api.AllSubstitution),
+    "equals": (2, 2, api.EqualsSubstitution),
+    "not-equals": (2, 2, api.NotEqualsSubstitution),
+    "if": (2, 3, api.IfElseSubstitution),
+}
+"""How many values each takes, and the substitution that it is. None runs code of the file's."""

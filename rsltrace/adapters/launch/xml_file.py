@@ -14,14 +14,14 @@ _DEPTH_MAX = 100
 
 def parse_xml(text: str, name: str, folder: str) -> Element:
     """Return the ``<launch>`` element. Raises ``JobError`` with the place of a mistake."""
-    reader = _Reader(YamlSource(name, text, folder))
+    reader = _XmlReader(YamlSource(name, text, folder))
     root = reader.read()
     if root.tag != "launch":
         raise root.place.error(f"a launch file begins with <launch>, not with <{root.tag}>")
     return root
 
 
-class _Reader:
+class _XmlReader:
     def __init__(self, source: YamlSource) -> None:
         self._source = source
         self._parser = parser = expat.ParserCreate("utf-8")

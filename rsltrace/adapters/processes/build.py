@@ -37,7 +37,7 @@ _ERROR_LINES = 12
 
 
 @dataclass(frozen=True, slots=True)
-class Ros:
+class RosInstallation:
     """A ROS installation to build against: its headers and libraries, and where else libraries
     are that these need."""
 
@@ -51,7 +51,7 @@ class Ros:
         return (root, *sorted(path for path in root.iterdir() if path.is_dir()))
 
 
-def find_ros() -> Ros:
+def find_ros() -> RosInstallation:
     """Return the ROS that is sourced, or the one that is installed in this environment.
 
     :raises SetupError: if there is none with headers.
@@ -63,7 +63,7 @@ def find_ros() -> Ros:
             (include / name).exists() or (include / "fastcdr" / name).exists() for name in _HEADERS
         ):
             more = sorted(Path(sys.prefix).glob("lib/python*/site-packages/ros_*.libs"))
-            return Ros(prefix, (prefix / "lib", *more))
+            return RosInstallation(prefix, (prefix / "lib", *more))
     raise SetupError(
         f"processes need ROS 2 with its headers ({_HEADERS[0]}), which is neither sourced nor in "
         f"{sys.prefix}: install it (pip install 'rsltrace[ros]', or apt install ros-jazzy-rcl "
@@ -99,7 +99,7 @@ class Library:
 
     path: Path
     python_symbols: Path
-    ros: Ros
+    ros: RosInstallation
 
 
 def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
@@ -154,13 +154,15 @@ def _options() -> list[str]:
     return ["-std=c++17", "-O2", "-g1", "-fPIC", "-fvisibility=hidden", "-pthread"]
 
 
-def _stamps(ros: Ros) -> list[str]:
+def _stamps(ros: RosInstallation) -> list[str]:
     """Return what changes when ROS is installed anew."""
     files = [ros.prefix / "lib" / f"lib{name}.so" for name in (*_LIBRARIES, "rcl")]
     return [f"{path.stat().st_size} {path.stat().st_mtime_ns}" for path in files if path.exists()]
 
 
-def _build(compiler: list[str], ros: Ros, sources: Sequence[Path], folder: Path) -> None:
+def _build(
+    compiler: list[str], ros: RosInstallation, sources: Sequence[Path], folder: Path
+) -> None:
     """Build the library and the stub in a folder, as many sources at a time as there are cores."""
     include = [f"-I{path}" for path in ros.include]
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
@@ -230,7 +232,7 @@ def _check(name: str, status: int, said: str) -> None:
     )
 
 
-__all__ = ["Library", "Ros", "find_compiler", "find_ros", "library"]
+__all__ = ["Library", "RosInstallation", "find_compiler", "find_ros", "library"]
 
 
 # From a file to a command line: what runs it, and the environment it needs.

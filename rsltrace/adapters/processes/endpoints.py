@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from rsltrace.adapters.processes.wire import Ready, gid_of, packed_item
+from rsltrace.adapters.processes.wire import WakeReason, gid_of, packed_item
 from rsltrace.simulation.middleware.entity import DomainEntity
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
@@ -28,7 +28,7 @@ from rsltrace.trace.model.event import NO_EVENT, OutputKind
 _NO_GID = bytes(16)
 
 
-class Thing(Protocol):
+class WaitableEntity(Protocol):
     """What a process has made and may wait for. ``number`` is what the process calls it."""
 
     number: int
@@ -44,19 +44,19 @@ class Thing(Protocol):
         """Name it for people."""
 
 
-class Host(Protocol):
+class HostProcess(Protocol):
     """The process that endpoints and timers are in, as they see it."""
 
     name: str
     dispatcher: Dispatcher
 
-    def wants(self, thing: Thing) -> bool:
+    def wants(self, thing: WaitableEntity) -> bool:
         """Return whether one of its threads waits for a thing now."""
 
-    def hold(self, thing: Thing) -> None:
+    def hold(self, thing: WaitableEntity) -> None:
         """Keep what is ready until the process waits for it."""
 
-    def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
+    def go_on_with(self, number: int, ready: WakeReason, item: bytes) -> None:
         """Let the thread that waits for a thing go on, until the process waits again."""
 
     def was_no_callback(self) -> None:
@@ -75,7 +75,7 @@ class RosoutPublisher(Publisher):
         super().send(data, hash64(log_content(data)))
 
 
-class _Named(DomainEntity):
+class _CallbackEndpoint(DomainEntity):
     """An endpoint whose callback has a name, if the process says it."""
 
     callback_name = ""
@@ -88,12 +88,12 @@ class _Named(DomainEntity):
         return {**super().trace_detail(), "callback": self.callback_name}
 
 
-class ProcessSubscription(_Named, Subscription):
+class ProcessSubscription(_CallbackEndpoint, Subscription):
     """A subscription of a process. ``number`` is what the process calls it."""
 
     def __init__(
         self,
-        process: Host,
+        process: HostProcess,
         number: int,
         node: Participant,
         topic: str,
@@ -118,7 +118,7 @@ class ProcessSubscription(_Named, Subscription):
             self.node,
             SUBSCRIPTION,
             self.process.go_on_with,
-            (self.number, Ready.ENTITY, self._packed(delivery)),
+            (self.number, WakeReason.ENTITY, self._packed(delivery)),
             *delivery[5:8],
         )
 
@@ -134,12 +134,12 @@ class ProcessSubscription(_Named, Subscription):
         )
 
 
-class ProcessService(_Named, Service):
+class ProcessService(_CallbackEndpoint, Service):
     """A server of a process."""
 
     def __init__(
         self,
-        process: Host,
+        process: HostProcess,
         number: int,
         transport: Transport,
         node: Participant,
@@ -165,7 +165,7 @@ class ProcessService(_Named, Service):
             self.node,
             SERVICE,
             self.process.go_on_with,
-            (self.number, Ready.ENTITY, self._packed(exchange)),
+            (self.number, WakeReason.ENTITY, self._packed(exchange)),
             *exchange[1:4],
         )
 
@@ -191,7 +191,7 @@ class ProcessClient(Client):
 
     def __init__(
         self,
-        process: Host,
+        process: HostProcess,
         number: int,
         transport: Transport,
         node: Participant,
@@ -216,7 +216,7 @@ class ProcessClient(Client):
             self.node,
             CLIENT,
             self.process.go_on_with,
-            (self.number, Ready.ENTITY, self._packed(exchange)),
+            (self.number, WakeReason.ENTITY, self._packed(exchange)),
             *exchange[1:4],
         )
 
@@ -243,7 +243,9 @@ class ProcessTimer(Timer):
 
     begins_active = False
 
-    def __init__(self, dispatcher: Dispatcher, process: Host, number: int, period_ns: int) -> None:
+    def __init__(
+        self, dispatcher: Dispatcher, process: HostProcess, number: int, period_ns: int
+    ) -> None:
         super().__init__(dispatcher, None, period_ns)
         self.process = process
         self.number = number
@@ -284,7 +286,7 @@ class ProcessTimer(Timer):
         )
 
     def _run(self) -> None:
-        self.process.go_on_with(self.number, Ready.TIMER, b"")
+        self.process.go_on_with(self.number, WakeReason.TIMER, b"")
         if not self.is_callback:
             self.process.was_no_callback()
         elif self.node is None and not self.destroyed:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from rsltrace.adapters.processes.wire import HEAD, Fields, gid_of, packed_qos, packed_text
+from rsltrace.adapters.processes.wire import HEAD, RecordReader, gid_of, packed_qos, packed_text
 from rsltrace.simulation.middleware.graph import Graph, names_and_types
 from rsltrace.simulation.middleware.participant import Participant, full_name
 from rsltrace.simulation.middleware.publisher import Publisher
@@ -13,7 +13,7 @@ from rsltrace.simulation.middleware.subscription import Subscription
 NamesAndTypes = Sequence[tuple[str, list[str]]]
 
 
-def answer(graph: Graph, question: Fields) -> bytes:
+def answer(graph: Graph, question: RecordReader) -> bytes:
     """Answer a question: its kind, and two texts that say what of."""
     kind, one, other = question.number(), question.text(), question.text()
     if kind == 1:

@@ -13,19 +13,24 @@ from rsltrace.adapters.processes.endpoints import (
     ProcessClient,
     ProcessService,
     ProcessTimer,
-    Thing,
+    WaitableEntity,
 )
-from rsltrace.adapters.processes.things import GraphChange, Interfaces, Things, WakingTimer
+from rsltrace.adapters.processes.process_entities import (
+    EntityFactory,
+    GraphChange,
+    ProcessEntities,
+    WakingTimer,
+)
 from rsltrace.adapters.processes.wire import (
     GO,
     GRAPH_ID,
     HEAD,
     NEVER_NS,
     RECORD,
-    Fields,
-    Ready,
-    Say,
+    RecordKind,
+    RecordReader,
     Told,
+    WakeReason,
     WireError,
     gid_of,
     packed_qos,
@@ -47,15 +52,15 @@ _REQUEST_ID = struct.Struct("<I16sq")
 _HELLO = struct.Struct("<qQI")
 _SHOWN = struct.Struct("<qI")
 _RECORD_SIZE = RECORD.size
-_PUBLISH, _WAIT = int(Say.PUBLISH), int(Say.WAIT)
+_PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
 _number = HEAD.unpack_from
 _NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
 """What reading raises if something else than the library has written to the link."""
 
-Question = Callable[[Fields], bytes]
+Question = Callable[[RecordReader], bytes]
 
 
-class Surroundings(Interfaces, Protocol):
+class ProcessRun(EntityFactory, Protocol):
     """What a process finds in its run."""
 
     log: Callable[[int, str, str], None]
@@ -75,7 +80,7 @@ class Process:
     ``things`` are its nodes, endpoints and timers.
     """
 
-    def __init__(self, door: Surroundings, name: str, key: str, *, log_failure: bool) -> None:
+    def __init__(self, door: ProcessRun, name: str, key: str, *, log_failure: bool) -> None:
         self.door = door
         self.dispatcher = door.domain.dispatcher
         self.name = name
@@ -86,45 +91,45 @@ class Process:
         self.begun_ns = 0
         self.child: Child
         self.ended: Ended | None = None
-        self.things = Things(door, self)
+        self.things = ProcessEntities(door, self)
         self._wanted: dict[int, int] = {}
         """Which thread waits for a thing."""
         self._waits: tuple[tuple[int, int], ...] = ()
         self._sets: dict[int, tuple[int, ...]] = {}
         self._waking: dict[int, WakingTimer] = {}
-        self._held: list[Thing] = []
+        self._held: list[WaitableEntity] = []
         self._running_thread = 0
         self._same_wait = b""
         """What it waited for last, if that has no end."""
         self._waking_soon = False
-        self._last: Thing | None = None
+        self._last: WaitableEntity | None = None
         self._is_stopping = False
         self._graph = GraphChange(self)
         door.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
-            Say.HELLO: self._hello,
-            Say.TAKE: self._take,
-            Say.READY: self._ready,
-            Say.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
-            Say.QOS: self._qos,
-            Say.MATCHED: self._matched,
-            Say.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_name)),
-            Say.CLOCK: self._clock,
-            Say.CLOCK_OWNER: self._owner_of_new_clock,
-            Say.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
+            RecordKind.HELLO: self._hello,
+            RecordKind.TAKE: self._take,
+            RecordKind.READY: self._ready,
+            RecordKind.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
+            RecordKind.QOS: self._qos,
+            RecordKind.MATCHED: self._matched,
+            RecordKind.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_name)),
+            RecordKind.CLOCK: self._clock,
+            RecordKind.CLOCK_OWNER: self._owner_of_new_clock,
+            RecordKind.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
         }
-        self._records: dict[int, Callable[[Fields], None]] = {
+        self._records: dict[int, Callable[[RecordReader], None]] = {
             **self.things.records,
-            Say.GONE: self._gone,
-            Say.REQUEST: self._request,
-            Say.RESPONSE: self._response,
-            Say.LOG: self._log,
-            Say.REPORT: self._report,
-            Say.TIMER_PASSED: self._timer_passed,
-            Say.TIMER_NEXT: self._timer_next,
-            Say.WAIT_SET: self._wait_set,
-            Say.ALIVE: self._alive,
-            Say.DROPPED: lambda fields: self.things[fields.number()].drop(),
+            RecordKind.GONE: self._gone,
+            RecordKind.REQUEST: self._request,
+            RecordKind.RESPONSE: self._response,
+            RecordKind.LOG: self._log,
+            RecordKind.REPORT: self._report,
+            RecordKind.TIMER_PASSED: self._timer_passed,
+            RecordKind.TIMER_NEXT: self._timer_next,
+            RecordKind.WAIT_SET: self._wait_set,
+            RecordKind.ALIVE: self._alive,
+            RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
     # -- as the trace has it ---------------------------------------------------------------------
@@ -158,15 +163,15 @@ class Process:
         """Whether one of its threads waits for a change of the graph now."""
         return GRAPH_ID in self._wanted
 
-    def wants(self, thing: Thing) -> bool:
+    def wants(self, thing: WaitableEntity) -> bool:
         """Return whether one of its threads waits for a thing now."""
         return thing.number in self._wanted
 
-    def hold(self, thing: Thing) -> None:
+    def hold(self, thing: WaitableEntity) -> None:
         """Keep what is ready until the process waits for it."""
         self._held.append(thing)
 
-    def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
+    def go_on_with(self, number: int, ready: WakeReason, item: bytes) -> None:
         """Let the thread that waits for a thing go on, until the process waits again."""
         thing = self.things[number]
         self._last = thing
@@ -174,22 +179,22 @@ class Process:
 
     def wake(self, thread: int) -> None:
         """Let a thread go on whose time has come."""
-        self._go(thread, Ready.TIMEOUT, 0, b"")
+        self._go(thread, WakeReason.TIMEOUT, 0, b"")
 
     def see_graph(self) -> None:
         """Let those threads go on that wait for a change of the graph."""
-        self._go(self._wanted[GRAPH_ID], Ready.GRAPH, GRAPH_ID, b"")
+        self._go(self._wanted[GRAPH_ID], WakeReason.GRAPH, GRAPH_ID, b"")
 
     def own(self, timer: ProcessTimer) -> None:
         """Give a timer whose callback has run to a node."""
         self.things.own(timer)
 
     def was_no_callback(self) -> None:
-        """Say that the event under way is no callback's: an executor's own timer was due."""
+        """Note that the event under way is no callback's: an executor's own timer was due."""
         event = self.dispatcher.event
         event.kind, event.entity, event.node, event.input_hash = _RESUME, self.entity_id, None, 0
 
-    def _go(self, thread: int, ready: Ready, number: int, item: bytes) -> None:
+    def _go(self, thread: int, ready: WakeReason, number: int, item: bytes) -> None:
         waking = self._waking.get(thread)
         if waking is not None:
             waking.off()
@@ -231,10 +236,10 @@ class Process:
                 continue
             if kind == _WAIT:
                 if body != self._same_wait or self._held:
-                    self._wait(Fields(body))
+                    self._wait(RecordReader(body))
                     self._same_wait = b"" if self._waking_soon else body.tobytes()
                 return None
-            fields = Fields(body)
+            fields = RecordReader(body)
             question = self._questions.get(kind)
             if question is not None:
                 answer = question(fields)
@@ -244,13 +249,13 @@ class Process:
 
     # -- waiting ---------------------------------------------------------------------------------
 
-    def _wait_set(self, fields: Fields) -> None:
+    def _wait_set(self, fields: RecordReader) -> None:
         thread, number, count = fields.number(), fields.number(), fields.number()
         ids = fields.unpack(struct.Struct(f"<{count}I"))
         self._sets = {n: s for n, s in self._sets.items() if s[:1] != (thread,)}
         self._sets[number] = (thread, *ids)
 
-    def _wait(self, fields: Fields) -> None:
+    def _wait(self, fields: RecordReader) -> None:
         """Take note of what its threads wait for."""
         event = self.dispatcher.event
         waits = []
@@ -353,12 +358,12 @@ class Process:
 
     # -- what it asks ----------------------------------------------------------------------------
 
-    def _hello(self, fields: Fields) -> bytes:
+    def _hello(self, fields: RecordReader) -> bytes:
         door, now_ns = self.door, self.dispatcher.loop.now_ns
         return _HELLO.pack(now_ns, door.seed_of(self.key), door.clock is not None)
 
-    def _clock(self, fields: Fields) -> bytes:
-        """Say what a clock shows: that of a node, or of who runs."""
+    def _clock(self, fields: RecordReader) -> bytes:
+        """Answer what a clock shows: that of a node, or of the running one."""
         node = self.things.get(fields.number()) or self._running_node()
         assert self.door.clock is not None, "it asks where there are such clocks"
         name = None if node is None else node.fully_qualified_name
@@ -369,15 +374,15 @@ class Process:
         node = self.dispatcher.event.node
         return node if isinstance(node, Participant) else self.things.last_node
 
-    def _owner_of_new_clock(self, fields: Fields) -> bytes:
+    def _owner_of_new_clock(self, fields: RecordReader) -> bytes:
         return HEAD.pack(self.things.number_of(self.things.newest_node or self._running_node()))
 
-    def _take(self, fields: Fields) -> bytes:
+    def _take(self, fields: RecordReader) -> bytes:
         item = self.things[fields.number()].take()
         return HEAD.pack(0) if item is None else HEAD.pack(1) + item
 
-    def _ready(self, fields: Fields) -> bytes:
-        """Say which of some things are ready, in the order in which the loop would run them."""
+    def _ready(self, fields: RecordReader) -> bytes:
+        """Answer which of these entities are ready, in the order the loop would run them."""
         asked = [self.things[fields.number()] for _ in range(fields.number())]
         order = dict.fromkeys((*self._held, *self.dispatcher.loop.ready))
         places = {thing: place for place, thing in enumerate(order)}
@@ -385,40 +390,40 @@ class Process:
         ready.sort(key=lambda number: (places.get(self.things[number], len(places)), number))
         return struct.pack(f"<{1 + len(ready)}I", len(ready), *ready)
 
-    def _qos(self, fields: Fields) -> bytes:
+    def _qos(self, fields: RecordReader) -> bytes:
         end = self.things[fields.number()]
         return packed_qos(
             end.profile if isinstance(end, ProcessService | ProcessClient) else end.qos
         )
 
-    def _matched(self, fields: Fields) -> bytes:
+    def _matched(self, fields: RecordReader) -> bytes:
         end = self.things[fields.number()]
         others = end.subscriptions if isinstance(end, Publisher) else end.publishers
         return HEAD.pack(len(others))
 
-    def _gone(self, fields: Fields) -> None:
+    def _gone(self, fields: RecordReader) -> None:
         self.things.give_up(fields.number())
         self._waits, self._same_wait = (), b""
 
     # -- what it does ----------------------------------------------------------------------------
 
-    def _request(self, fields: Fields) -> None:
+    def _request(self, fields: RecordReader) -> None:
         self.things[fields.number()].request(fields.rest())
 
-    def _response(self, fields: Fields) -> None:
+    def _response(self, fields: RecordReader) -> None:
         number, gid, sequence = fields.unpack(_REQUEST_ID)
         self.things[number].answer(gid, sequence, fields.rest())
 
-    def _log(self, fields: Fields) -> None:
+    def _log(self, fields: RecordReader) -> None:
         self.door.log(fields.number(), fields.text(), fields.text())
 
-    def _report(self, fields: Fields) -> None:
+    def _report(self, fields: RecordReader) -> None:
         self.door.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
 
-    def _timer_passed(self, fields: Fields) -> None:
+    def _timer_passed(self, fields: RecordReader) -> None:
         self.things[fields.number()].is_callback = False
 
-    def _timer_next(self, fields: Fields) -> None:
+    def _timer_next(self, fields: RecordReader) -> None:
         number, deadline_ns = fields.unpack(_DEADLINE)
         timer = self.things[number]
         if deadline_ns == NEVER_NS:
@@ -426,5 +431,5 @@ class Process:
         else:
             timer.due_at(deadline_ns)
 
-    def _alive(self, fields: Fields) -> None:
+    def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()

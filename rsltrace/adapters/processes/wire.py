@@ -28,7 +28,7 @@ _ITEM = struct.Struct("<qqQQ16sI")
 _QOS = struct.Struct("<IQIIqqIqI")
 
 
-class Say(IntEnum):
+class RecordKind(IntEnum):
     """What a process says. The numbers are those of ``native/wire.h``."""
 
     HELLO = 1
@@ -74,7 +74,7 @@ class Told(IntEnum):
     SHARED = 5
 
 
-class Ready(IntEnum):
+class WakeReason(IntEnum):
     """Why a thread goes on."""
 
     TIMEOUT = 0
@@ -87,7 +87,7 @@ class WireError(Exception):
     """What a process has sent is none of the library's records."""
 
 
-class Fields:
+class RecordReader:
     """Reads the fields of a record, one after the other.
 
     :raises WireError: from any of them, if the record is cut off.

@@ -40,7 +40,7 @@ _LIBRARIES = f"lib/python{sys.version_info[0]}.{sys.version_info[1]}/site-packag
 
 
 @dataclass(frozen=True, slots=True)
-class Word:
+class _Word:
     """An argument of a command; a ``quoted`` one is a single word whatever is in it."""
 
     text: str
@@ -48,17 +48,17 @@ class Word:
 
 
 @dataclass(frozen=True, slots=True)
-class _Call:
+class _WrittenCommand:
     """A command as it is written."""
 
     name: str
-    words: tuple[Word, ...]
+    words: tuple[_Word, ...]
     file: Path
     line: int
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class CMakeCommand:
     """A command with its arguments expanded; paths in them are relative to ``folder``."""
 
     name: str
@@ -81,14 +81,14 @@ def is_expanded(word: str) -> bool:
     return _UNKNOWN.search(word) is None
 
 
-def commands(package: SourcePackage) -> list[Command]:
+def commands(package: SourcePackage) -> list[CMakeCommand]:
     """Return what the ``CMakeLists.txt`` of a package and the files that it includes call."""
-    evaluation = _Evaluation(package)
+    evaluation = _CMakeInterpreter(package)
     evaluation.run_file(package.folder / "CMakeLists.txt")
     return evaluation.found
 
 
-def _read(file: Path) -> list[_Call]:
+def _read(file: Path) -> list[_WrittenCommand]:
     """Return the commands of a file; nothing if it cannot be read. Its text may be anything: what
     is not a command is passed over."""
     try:
@@ -100,7 +100,9 @@ def _read(file: Path) -> list[_Call]:
     while match := _next_command(text, position):
         words, position = _arguments(text, match.end())
         found.append(
-            _Call(match[1].lower(), tuple(words), file, text.count("\n", 0, match.start()) + 1)
+            _WrittenCommand(
+                match[1].lower(), tuple(words), file, text.count("\n", 0, match.start()) + 1
+            )
         )
     return found
 
@@ -115,9 +117,9 @@ def _next_command(text: str, position: int) -> re.Match[str] | None:
     return None
 
 
-def _arguments(text: str, position: int) -> tuple[list[Word], int]:
+def _arguments(text: str, position: int) -> tuple[list[_Word], int]:
     """Return the words up to the parenthesis that closes the command, and where it ends."""
-    words: list[Word] = []
+    words: list[_Word] = []
     depth = 1
     while depth and (token := _TOKEN.match(text, position)):
         position = token.end()
@@ -125,26 +127,26 @@ def _arguments(text: str, position: int) -> tuple[list[Word], int]:
         if kind == "parenthesis":
             depth += 1 if token[0] == "(" else -1
             if depth:
-                words.append(Word(token[0]))
+                words.append(_Word(token[0]))
         elif kind == "quoted":
-            words.append(Word(token["quoted"], quoted=True))
+            words.append(_Word(token["quoted"], quoted=True))
         elif token["bracket"] is not None:
-            words.append(Word(token["bracket"].replace("$", "\\$"), quoted=True))
+            words.append(_Word(token["bracket"].replace("$", "\\$"), quoted=True))
         elif kind == "plain":
-            words.append(Word(token[0]))
+            words.append(_Word(token[0]))
     return words, position
 
 
 @dataclass
-class _Scope:
+class _VariableScope:
     """Variables, and what is visible around them."""
 
     values: dict[str, str] = field(default_factory=dict)
-    outer: _Scope | None = None
+    outer: _VariableScope | None = None
 
     def get(self, name: str) -> str | None:
         """Return a value, None if there is none."""
-        scope: _Scope | None = self
+        scope: _VariableScope | None = self
         while scope is not None:
             if name in scope.values:
                 return scope.values[name]
@@ -152,19 +154,19 @@ class _Scope:
         return None
 
 
-class _Evaluation:
+class _CMakeInterpreter:
     """Follows the commands of one package."""
 
     def __init__(self, package: SourcePackage) -> None:
-        self.found: list[Command] = []
+        self.found: list[CMakeCommand] = []
         self._top = package.folder
         self._folder = package.folder
-        self._functions: dict[str, tuple[_Call, list[_Call]]] = {}
+        self._functions: dict[str, tuple[_WrittenCommand, list[_WrittenCommand]]] = {}
         self._depth = 0
         self._left = _COMMANDS_MAX
         here = str(package.folder)
         own = ("CMAKE_CURRENT_SOURCE_DIR", "PROJECT_SOURCE_DIR", "CMAKE_SOURCE_DIR")
-        self._scope = _Scope(
+        self._scope = _VariableScope(
             {
                 **dict.fromkeys((*own, "CMAKE_CURRENT_LIST_DIR"), here),
                 **dict.fromkeys(("PROJECT_NAME", "CMAKE_PROJECT_NAME"), package.name),
@@ -186,7 +188,7 @@ class _Evaluation:
 
     # -- blocks ----------------------------------------------------------------------------------
 
-    def _run(self, calls: Sequence[_Call]) -> None:
+    def _run(self, calls: Sequence[_WrittenCommand]) -> None:
         index = 0
         while index < len(calls) and self._left > 0:
             self._left -= 1
@@ -199,7 +201,7 @@ class _Evaluation:
             else:
                 self._call(call)
 
-    def _block(self, call: _Call, body: list[_Call]) -> None:
+    def _block(self, call: _WrittenCommand, body: list[_WrittenCommand]) -> None:
         if call.name == "if":
             for part in self._branches(call, body):
                 self._run(part)
@@ -210,9 +212,11 @@ class _Evaluation:
         elif call.name == "block":
             self._run(body)
 
-    def _branches(self, call: _Call, body: list[_Call]) -> Iterator[list[_Call]]:
+    def _branches(
+        self, call: _WrittenCommand, body: list[_WrittenCommand]
+    ) -> Iterator[list[_WrittenCommand]]:
         """Give the branches that may be taken: up to the first one that certainly is."""
-        heads: list[tuple[_Call, list[_Call]]] = [(call, [])]
+        heads: list[tuple[_WrittenCommand, list[_WrittenCommand]]] = [(call, [])]
         depth = 0
         for one in body:
             depth += (one.name in _ENDS) - (one.name in _ENDS.values())
@@ -227,7 +231,7 @@ class _Evaluation:
             if holds:
                 return
 
-    def _foreach(self, call: _Call, body: list[_Call]) -> None:
+    def _foreach(self, call: _WrittenCommand, body: list[_WrittenCommand]) -> None:
         words = self._expanded(call.words)
         if not words:
             return
@@ -253,7 +257,7 @@ class _Evaluation:
 
     # -- commands --------------------------------------------------------------------------------
 
-    def _call(self, call: _Call) -> None:
+    def _call(self, call: _WrittenCommand) -> None:
         words = self._expanded(call.words)
         if call.name in self._functions:
             self._call_function(call.name, words)
@@ -264,7 +268,9 @@ class _Evaluation:
                 known(words)
             return
         name = _below(call.file, self._top)
-        self.found.append(Command(call.name, tuple(words), self._folder, f"{name}:{call.line}"))
+        self.found.append(
+            CMakeCommand(call.name, tuple(words), self._folder, f"{name}:{call.line}")
+        )
 
     def _call_function(self, name: str, words: list[str]) -> None:
         """Call what the package defines; a macro's variables are those of its caller, too."""
@@ -279,7 +285,7 @@ class _Evaluation:
         self._depth += 1
         outer = self._scope
         if head.name == "function":
-            self._scope = _Scope(given, outer)
+            self._scope = _VariableScope(given, outer)
             self._run(body)
             self._scope = outer
         else:
@@ -300,7 +306,7 @@ class _Evaluation:
         name, values = words[0], words[1:]
         if name.startswith("ENV{"):
             return
-        scope: _Scope | None = self._scope
+        scope: _VariableScope | None = self._scope
         if values[-1:] == ["PARENT_SCOPE"]:
             values, scope = values[:-1], self._scope.outer
         if "CACHE" in values:
@@ -400,7 +406,7 @@ class _Evaluation:
             return
         outer, before = self._scope, self._folder
         here = dict.fromkeys(("CMAKE_CURRENT_SOURCE_DIR", "CMAKE_CURRENT_LIST_DIR"), str(folder))
-        self._scope, self._folder = _Scope(here, outer), folder
+        self._scope, self._folder = _VariableScope(here, outer), folder
         self.run_file(folder / "CMakeLists.txt")
         self._scope, self._folder = outer, before
 
@@ -432,7 +438,7 @@ class _Evaluation:
             return []
         return [one for one in value.split(";") if one]
 
-    def _expanded(self, words: Sequence[Word]) -> list[str]:
+    def _expanded(self, words: Sequence[_Word]) -> list[str]:
         """Return the words with their variables in them; an unquoted list is several words."""
         found: list[str] = []
         for word in words:
@@ -460,32 +466,32 @@ class _Evaluation:
 
     # -- conditions ------------------------------------------------------------------------------
 
-    def _holds(self, words: list[Word]) -> bool | None:
+    def _holds(self, words: list[_Word]) -> bool | None:
         """Return whether a condition holds, None if nobody knows."""
         if any(word.text in ("(", ")") and not word.quoted for word in words):
             return None
         for joint, decides in (("OR", True), ("AND", False)):
-            places = [i for i, one in enumerate(words) if one == Word(joint)]
+            places = [i for i, one in enumerate(words) if one == _Word(joint)]
             if places:
                 parts = [words[a + 1 : b] for a, b in pairwise([-1, *places, len(words)])]
                 holds = [self._holds(part) for part in parts]
                 if decides in holds:
                     return decides
                 return None if None in holds else not decides
-        if words[:1] == [Word("NOT")]:
+        if words[:1] == [_Word("NOT")]:
             held = self._holds(words[1:])
             return None if held is None else not held
         return self._test([word.text if word.quoted else word for word in words])
 
-    def _test(self, words: list[str | Word]) -> bool | None:
-        def filled(word: str | Word) -> str:
-            return self._filled(word.text if isinstance(word, Word) else word)
+    def _test(self, words: list[str | _Word]) -> bool | None:
+        def filled(word: str | _Word) -> str:
+            return self._filled(word.text if isinstance(word, _Word) else word)
 
         texts = [filled(word) for word in words]
         if not all(map(is_expanded, texts)):
             return None
         if len(texts) == 1:
-            return self._truth(texts[0], is_plain=isinstance(words[0], Word))
+            return self._truth(texts[0], is_plain=isinstance(words[0], _Word))
         if len(texts) == 2 and texts[0] == "EXISTS":
             return (self._folder / texts[1]).exists()
         if len(texts) == 2 and texts[0] == "DEFINED":
@@ -514,7 +520,7 @@ class _Evaluation:
         return value.upper() not in _FALSE and not value.upper().endswith("-NOTFOUND")
 
 
-def _end_of(calls: Sequence[_Call], index: int, name: str) -> int:
+def _end_of(calls: Sequence[_WrittenCommand], index: int, name: str) -> int:
     """Return where a block ends whose inner commands begin at ``index``."""
     depth = 1
     for place in range(index, len(calls)):
@@ -543,4 +549,4 @@ def _below(file: Path, folder: Path) -> str:
         return str(file)
 
 
-__all__ = ["Command", "commands", "is_expanded"]
+__all__ = ["CMakeCommand", "commands", "is_expanded"]

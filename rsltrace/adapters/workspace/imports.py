@@ -31,7 +31,7 @@ _KINDS = ("msg", "srv", "action")
 _SUPPORT = "_s__rosidl_typesupport_c"
 
 
-class Workspace:
+class UnbuiltWorkspace:
     """The packages in and below some folders, as far as they have not been built."""
 
     def __init__(self, folders: Sequence[Path], *, native: bool = False) -> None:
@@ -135,11 +135,11 @@ class Workspace:
             return str(share_prefix(package))
 
 
-class _Kinds:
+class _InterfaceFinder:
     """Finds ``package.msg`` and its like before anybody takes a folder of sources for it; and the
     modules of a package before anybody takes the folder of its sources for them."""
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: UnbuiltWorkspace) -> None:
         self._workspace = workspace
 
     def find_spec(
@@ -171,10 +171,10 @@ class _Kinds:
         return _spec(name, file) if file.is_file() else None
 
 
-class _Packages:
+class _PackageFinder:
     """Finds the modules of packages, and a package that has nothing but interfaces."""
 
-    def __init__(self, workspace: Workspace) -> None:
+    def __init__(self, workspace: UnbuiltWorkspace) -> None:
         self._workspace = workspace
 
     def find_spec(
@@ -201,7 +201,7 @@ class _Packages:
         return distributions(self._workspace.packages, context or DistributionFinder.Context())
 
 
-def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:
+def _source_spec(workspace: UnbuiltWorkspace, name: str) -> ModuleSpec | None:
     """Return the spec of a module that lies among the sources of a package, or None."""
     place = workspace.module(name)
     if place is None:
@@ -218,7 +218,7 @@ def _spec(name: str, file: Path) -> ModuleSpec | None:
     return spec_from_file_location(name, file, submodule_search_locations=folder)
 
 
-_open: list[Workspace] = []
+_open: list[UnbuiltWorkspace] = []
 
 
 def made_when_imported(module: str) -> tuple[Callable[[str], Any], list[str]]:
@@ -295,14 +295,16 @@ def unbuilt_names() -> set[str]:
 
 
 @contextmanager
-def unbuilt_packages(folders: Sequence[Path], *, native: bool = False) -> Iterator[Workspace]:
+def unbuilt_packages(
+    folders: Sequence[Path], *, native: bool = False
+) -> Iterator[UnbuiltWorkspace]:
     """Let the packages in ``folders`` be used as if they were built, and forget them afterwards.
 
     Their interfaces are classes without compiled type support: ``native``, creating what needs that
     raises SetupError.
     """
-    workspace = Workspace(folders, native=native)
-    before, after = _Kinds(workspace), _Packages(workspace)
+    workspace = UnbuiltWorkspace(folders, native=native)
+    before, after = _InterfaceFinder(workspace), _PackageFinder(workspace)
     sys.meta_path.insert(0, before)
     sys.meta_path.append(after)
     _open.append(workspace)
@@ -319,7 +321,7 @@ def unbuilt_packages(folders: Sequence[Path], *, native: bool = False) -> Iterat
             sys.modules.pop(name)
 
 
-def _put_into_index(stack: ExitStack, workspace: Workspace) -> None:
+def _put_into_index(stack: ExitStack, workspace: UnbuiltWorkspace) -> None:
     """Let the ament index know the workspace, and the wheels of this Python."""
     from ament_index_python import resources, search_paths
 
@@ -369,7 +371,7 @@ def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., An
 
 
 __all__ = [
-    "Workspace",
+    "UnbuiltWorkspace",
     "made_when_imported",
     "unbuilt_executables",
     "unbuilt_names",

@@ -16,7 +16,7 @@ from rsltrace.adapters.workspace.build_files import (
     source_root,
 )
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
-from rsltrace.adapters.workspace.cmake import Command, commands, is_expanded
+from rsltrace.adapters.workspace.cmake import CMakeCommand, commands, is_expanded
 from rsltrace.source_packages import SourcePackage, source_packages
 
 _KINDS = ("DIRECTORY", "FILES", "PROGRAMS")
@@ -43,7 +43,7 @@ def installed_files(package: SourcePackage) -> Iterator[tuple[str, Path]]:
         yield from _installed(command)
 
 
-def _installed(command: Command) -> Iterator[tuple[str, Path]]:
+def _installed(command: CMakeCommand) -> Iterator[tuple[str, Path]]:
     """Give what an ``install`` of ``CMakeLists.txt`` puts where."""
     words = command.words
     if command.name != "install" or words[:1] not in [(kind,) for kind in _KINDS]:
@@ -143,7 +143,7 @@ def _modules_of_cmake(package: SourcePackage) -> dict[str, Path]:
     return found
 
 
-def _option(command: Command, keyword: str) -> list[str]:
+def _option(command: CMakeCommand, keyword: str) -> list[str]:
     """Return the word after a keyword, if it is there."""
     words = command.words
     return list(words[words.index(keyword) + 1 :][:1]) if keyword in words else []
@@ -192,7 +192,7 @@ _INDEX = "share/ament_index/resource_index/packages"
 _NOT_INSTALLED = frozenset(("setup.py", "setup.cfg", "CMakeLists.txt", "test", "src", "include"))
 
 
-class _Tree:
+class _LinkTree:
     """Links by where they are to be: a folder that is linked is opened if more is put into it."""
 
     def __init__(self) -> None:
@@ -216,7 +216,7 @@ class _Tree:
 
 def share_prefix(package: SourcePackage) -> Path:
     """Return a prefix in which ``share/<package>`` has what the package would have installed."""
-    tree = _Tree()
+    tree = _LinkTree()
     for path in sorted(package.folder.iterdir()):
         if not path.name.startswith(".") and path.name not in _NOT_INSTALLED:
             tree.put(PurePosixPath(path.name), path)

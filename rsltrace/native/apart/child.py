@@ -24,14 +24,14 @@ from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.errors import JobError, RsltraceError
-from rsltrace.native.apart.observers import Observers, Sender
+from rsltrace.native.apart.observers import ProcessObservers, SpanSender
 from rsltrace.native.apart.wire import Link, LinkError, Order
-from rsltrace.native.entries import RunningEntry, destroy
-from rsltrace.native.executors import failure_of
-from rsltrace.native.ledger import Callback
+from rsltrace.native.callback_observer import failure_of
+from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.native.priorities import Priorities
 from rsltrace.native.recording import ENDS_WITHIN_S, rclpy_running
-from rsltrace.native.things import Thing
+from rsltrace.native.running_entry import RunningEntry, destroy
+from rsltrace.native.span_recorder import RunningCallback
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
 from rsltrace.run.provenance import source_files
@@ -45,13 +45,13 @@ from rsltrace.trace.model.event import EventKind
 class RunningMain:
     """Runs the main of an entry. What it does between its callbacks is its own events."""
 
-    def __init__(self, entry: Entry, observers: Observers, *, echo: bool) -> None:
+    def __init__(self, entry: Entry, observers: ProcessObservers, *, echo: bool) -> None:
         self._entry = entry
         self._observers = observers
         self._words = [word for part in entry.arguments[:1] for word in part.arguments]
         if not echo:
             self._words += ["--ros-args", "--disable-stdout-logs"]
-        self._callback: Callback | None = None
+        self._callback: RunningCallback | None = None
         self._is_over = False
 
     def is_constructed(self) -> bool:
@@ -61,13 +61,13 @@ class RunningMain:
 
     def run(self) -> None:
         """Run it to its end; what it raises comes out. SIGINT interrupts it from now on."""
-        ledger, things, entry = self._observers.ledger, self._observers.things, self._entry
-        self._callback = callback = ledger.begin(int(EventKind.CONSTRUCT), None)
-        thing = things.add((), None, EntityKind.MAIN, entry.name, runs=entry.make)
-        callback.thing = thing
+        recorder, entities, entry = self._observers.recorder, self._observers.entities, self._entry
+        self._callback = callback = recorder.begin(int(EventKind.CONSTRUCT), None)
+        entity = entities.add((), None, EntityKind.MAIN, entry.name, runs=entry.make)
+        callback.entity = entity
         if callback.span is not None:
-            callback.span.thing = thing
-        self._become_main(thing)
+            callback.span.entity = entity
+        self._become_main(entity)
         failure = None
         try:
             signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -80,10 +80,10 @@ class RunningMain:
             failure = failure_of(error)
             raise
         finally:
-            ledger.end(failure)
+            recorder.end(failure)
             self._is_over = True
 
-    def _become_main(self, thing: Thing) -> None:
+    def _become_main(self, entity: ObservedEntity) -> None:
         """Have this process be what ``ros2 run`` would have started."""
         import rclpy.clock
         import rclpy.context
@@ -101,7 +101,7 @@ class RunningMain:
             (rclpy.timer.Rate, "sleep"),
             (rclpy.clock.Clock, "sleep_until"),
         ):
-            setattr(owner, name, self._pausing(getattr(owner, name), thing))
+            setattr(owner, name, self._pausing(getattr(owner, name), entity))
 
     def _with_words(self, original: Callable[..., None]) -> Callable[..., None]:
         """Add the ROS arguments of the entry to those of ``rclpy.init``."""
@@ -113,12 +113,12 @@ class RunningMain:
 
         return init
 
-    def _pausing(self, original: Callable[..., Any], thing: Thing) -> Callable[..., Any]:
+    def _pausing(self, original: Callable[..., Any], entity: ObservedEntity) -> Callable[..., Any]:
         """Let an event of the main end where it sleeps."""
 
         @wraps(original)
         def sleep(*words: Any, **more: Any) -> Any:
-            self._observers.ledger.pause(thing)
+            self._observers.recorder.pause(entity)
             return original(*words, **more)
 
         return sleep
@@ -141,7 +141,7 @@ def main(number: int) -> None:
     if order.command:
         _become(order, link)
     with ExitStack() as stack:
-        status = _Child(order, link).run(stack)
+        status = _EntryProcess(order, link).run(stack)
         stack.pop_all()  # user code may run up to the end of the process
     sys.exit(status)
 
@@ -160,14 +160,14 @@ def _become(order: Order, link: Link) -> None:
         os._exit(1)
 
 
-class _Child:
+class _EntryProcess:
     """One entry. The main thread runs it, another one listens to the run."""
 
     def __init__(self, order: Order, link: Link) -> None:
         self._order = order
         self._link = link
-        self._observers = Observers(boundary().real)
-        self._sender: Sender | None = None
+        self._observers = ProcessObservers(boundary().real)
+        self._sender: SpanSender | None = None
         self._entry: RunningEntry | None = None
         self._priorities: Priorities | None = None
         self._is_over = threading.Event()
@@ -189,7 +189,7 @@ class _Child:
         if self._link.receive() != ("go",):
             return 0
         if order.policy is not None and entry.argv is None:
-            self._priorities = Priorities(self._observers.things, order.rules)
+            self._priorities = Priorities(self._observers.entities, order.rules)
             stack.enter_context(self._priorities.watched(boundary().real))
         self._observers.watch()
         return self._run_node(entry) if entry.argv is None else self._run_main(entry)
@@ -203,7 +203,7 @@ class _Child:
         return entry
 
     def _begin(self, is_constructed: Any) -> None:
-        self._sender = Sender(self._link, self._observers, is_constructed)
+        self._sender = SpanSender(self._link, self._observers, is_constructed)
         self._sender.start()
         threading.Thread(target=self._listen, name="rsltrace listener", daemon=True).start()
 
@@ -211,7 +211,7 @@ class _Child:
         observers, at_once = self._observers, threading.Event()
         at_once.set()
         self._entry = running = RunningEntry(
-            entry, observers.ledger, observers.nodes, self._make_executor, at_once, self._ended
+            entry, observers.recorder, observers.nodes, self._make_executor, at_once, self._ended
         )
         self._begin(running.constructed.is_set)
         running.run()  # in this thread
@@ -219,7 +219,7 @@ class _Child:
 
     def _make_executor(self) -> Any:
         if self._priorities is not None and self._entry is not None:
-            from rsltrace.native.executors import PriorityExecutor
+            from rsltrace.native.callback_observer import PriorityExecutor
 
             threading.current_thread().name = f"rsltrace {self._entry.entry.name}"
             return PriorityExecutor(self._priorities)
@@ -233,7 +233,7 @@ class _Child:
         elif error is not None:
             self._raised(one.failed_in, one.node_name, error)
         elif one.stopping:
-            destroy(one.nodes, self._observers.ledger, self._observers.things)
+            destroy(one.nodes, self._observers.recorder, self._observers.entities)
         else:
             self._link.send("shutdown")
 

@@ -23,12 +23,12 @@ from ctypes import (
 from pathlib import Path
 from typing import Any
 
-from rsltrace.native.apart.wire import Link, SpanWriter
-from rsltrace.native.boundary import Boundary
-from rsltrace.native.executors import Executors
-from rsltrace.native.ledger import Ledger
-from rsltrace.native.nodes import Nodes
-from rsltrace.native.things import Things
+from rsltrace.native.apart.wire import Link, SpanEncoder
+from rsltrace.native.callback_observer import CallbackObserver
+from rsltrace.native.message_observer import MessageObserver
+from rsltrace.native.node_observer import NodeObserver
+from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.span_recorder import SpanRecorder
 from rsltrace.trace.native import CUT_AFTER_NS
 
 # Which publisher a message is from: what rcl knows and rclpy does not tell.
@@ -71,7 +71,7 @@ class _Bytes(Structure):
     )
 
 
-class Gids:
+class PublisherGids:
     """Asks rcl. ``extension`` is rclpy's."""
 
     def __init__(self, extension: Any, rcl: Any) -> None:
@@ -132,12 +132,12 @@ def _number(value: int) -> int | None:
     return None if value == _NO_NUMBER else value
 
 
-def gids(extension: Any) -> Gids | None:
+def gids(extension: Any) -> PublisherGids | None:
     """Return who asks the librcl that this process has loaded; None if that one cannot be asked."""
     lines = Path("/proc/self/maps").read_text(errors="surrogateescape").splitlines()
     paths = {line.split(maxsplit=5)[-1] for line in lines if "/librcl.so" in line}
     try:
-        return Gids(extension, CDLL(paths.pop()))
+        return PublisherGids(extension, CDLL(paths.pop()))
     except (KeyError, OSError, AttributeError):
         return None
 
@@ -147,36 +147,44 @@ _AT_ONCE = 2_000
 """Spans in one frame, at most."""
 
 
-class Observers:
+class ProcessObservers:
     """Observes this process for good, from ``watch`` on."""
 
     def __init__(self, extension: Any) -> None:
         found = gids(extension)
-        self.ledger = Ledger()
-        self.things = Things(self.ledger.add)
-        self.boundary = Boundary(self.ledger, self.things, None if found is None else found.take)
-        self.nodes = Nodes(self.things) if found is None else Nodes(self.things, found.of_publisher)
+        self.recorder = SpanRecorder()
+        self.entities = ObservedEntities(self.recorder.add)
+        self.message_observer = MessageObserver(
+            self.recorder, self.entities, None if found is None else found.take
+        )
+        self.nodes = (
+            NodeObserver(self.entities)
+            if found is None
+            else NodeObserver(self.entities, found.of_publisher)
+        )
         self._extension = extension
         self._stack = ExitStack()
 
     def watch(self) -> None:
         """Begin."""
-        executors = Executors(self.ledger, self.things, self.boundary, self.nodes.meet)
-        self._stack.enter_context(self.boundary.watched(self._extension))
+        executors = CallbackObserver(
+            self.recorder, self.entities, self.message_observer, self.nodes.meet
+        )
+        self._stack.enter_context(self.message_observer.watched(self._extension))
         self._stack.enter_context(self.nodes.watched())
         self._stack.enter_context(executors.watched(threads_are_processes=False))
 
 
-class Sender(threading.Thread):
+class SpanSender(threading.Thread):
     """Tells the run what was observed, again and again, until ``finish``."""
 
     def __init__(
-        self, link: Link, observers: Observers, is_constructed: Callable[[], bool]
+        self, link: Link, observers: ProcessObservers, is_constructed: Callable[[], bool]
     ) -> None:
         super().__init__(name="rsltrace sender", daemon=True)
         self._link = link
         self._observers = observers
-        self._writer = SpanWriter(observers.things)
+        self._writer = SpanEncoder(observers.entities)
         self._is_constructed = is_constructed
         self._has_told = False
         self._over = threading.Event()
@@ -202,13 +210,13 @@ class Sender(threading.Thread):
             if not self._has_told and self._is_constructed():
                 self._has_told = True
                 self._link.send("constructed")
-            ledger, writer = self._observers.ledger, self._writer
-            spans, until_ns = ledger.finished_until(patience_ns)
+            recorder, writer = self._observers.recorder, self._writer
+            spans, until_ns = recorder.finished_until(patience_ns)
             definitions = writer.definitions()
             counts = (
-                ledger.count,
-                ledger.activity_ns,
-                self._observers.boundary.unreadable,
+                recorder.count,
+                recorder.activity_ns,
+                self._observers.message_observer.unreadable,
                 time.process_time_ns() - self._begun_ns,
                 self._own_ns,
             )

@@ -19,11 +19,17 @@ from rsltrace.child_processes import how_ended
 from rsltrace.errors import NodeError, RsltraceError, RunError
 from rsltrace.native.apart.children import Child, Start
 from rsltrace.native.apart.plans import start_rules, starts_of
-from rsltrace.native.apart.starts import Starts
-from rsltrace.native.apart.wire import Frame, Order, SpanReader
-from rsltrace.native.executors import EXECUTORS
-from rsltrace.native.ledger import Sent, Span, now_ns
-from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording, Spent
+from rsltrace.native.apart.start_queue import StartQueue
+from rsltrace.native.apart.wire import Frame, Order, SpanDecoder
+from rsltrace.native.callback_observer import EXECUTORS
+from rsltrace.native.recording import (
+    ENDS_WITHIN_S,
+    LOOK_EVERY_S,
+    NativeResult,
+    NativeRun,
+    ProcessorTime,
+)
+from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.native.support import check_loopback, domain
 from rsltrace.run.plans.entries import missed_starts
 from rsltrace.run.plans.scheduling import has_stop
@@ -40,44 +46,44 @@ STALLED_NS = 20 * NS_PER_S
 not keep all others from the file."""
 
 
-class Source:
+class ProcessSpans:
     """One process: the spans that it has told of, and up to when that is all of them."""
 
     def __init__(self) -> None:
-        self.spans: deque[Span] = deque()
+        self.spans: deque[CallbackSpan] = deque()
         self.until_ns = now_ns()
         self.is_over = False
 
 
-class Merge:
+class SpanMerger:
     """Takes spans from threads, and gives them in the order of their starts."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._sources: list[Source] = []
+        self._sources: list[ProcessSpans] = []
         self._latest_ns = 0
         self.late = 0
         """Spans that came too late for their place, and were put after what was written."""
 
-    def source(self) -> Source:
+    def source(self) -> ProcessSpans:
         """Return a new source: nothing is in order from now on before it has said so."""
         with self._lock:
-            source = Source()
+            source = ProcessSpans()
             self._sources.append(source)
             return source
 
-    def add(self, source: Source, spans: list[Span], until_ns: int) -> None:
+    def add(self, source: ProcessSpans, spans: list[CallbackSpan], until_ns: int) -> None:
         """Add spans in the order of their starts; no other one will begin before ``until_ns``."""
         with self._lock:
             source.spans.extend(spans)
             source.until_ns = max(source.until_ns, until_ns)
 
-    def end(self, source: Source) -> None:
+    def end(self, source: ProcessSpans) -> None:
         """Take note that nothing more comes from a source."""
         with self._lock:
             source.is_over = True
 
-    def finished(self, patience_ns: int | None) -> list[Span]:
+    def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take what is in order, everything if ``patience_ns`` is None."""
         with self._lock:
             taken = self._taken(self._until(patience_ns))
@@ -100,8 +106,8 @@ class Merge:
         ]
         return min(waited, default=None)
 
-    def _taken(self, until_ns: int | None) -> list[Span]:
-        taken: list[Span] = []
+    def _taken(self, until_ns: int | None) -> list[CallbackSpan]:
+        taken: list[CallbackSpan] = []
         for source in self._sources:
             spans = source.spans
             while spans and (until_ns is None or spans[0].start_ns < until_ns):
@@ -119,16 +125,16 @@ its processor time, and that of telling of it."""
 _QUIET_ENDS = ("KeyboardInterrupt", "ExternalShutdownException")
 
 
-class InProcesses(Recording):
+class MultiProcessRun(NativeRun):
     """Each entry of the job in a process of its own; what they tell is merged into one trace."""
 
     def open(self, stack: ExitStack, output: Path, *, force: bool, echo: bool) -> None:
         """Start the processes up to where they could begin, then create the trace."""
-        self.merge = Merge()
-        self.starts = Starts()
+        self.merge = SpanMerger()
+        self.starts = StartQueue()
         self.children: list[Child] = []
         self._ids, self._threads = count(1), count(1)
-        self._told: dict[Child, tuple[SpanReader, Source]] = {}
+        self._told: dict[Child, tuple[SpanDecoder, ProcessSpans]] = {}
         self._counts: dict[Child, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
@@ -227,11 +233,13 @@ class InProcesses(Recording):
             self._look_for_end(found)
         self.merge.add(source, found, until_ns)
 
-    def _look_for_end(self, spans: list[Span]) -> None:
+    def _look_for_end(self, spans: list[CallbackSpan]) -> None:
         for span in spans:
             for output in span.outputs:
-                if isinstance(output, Sent) and (told := self._on_message.get(output.thing.name)):
-                    type_name = "" if output.thing.sends is None else output.thing.sends.name
+                if isinstance(output, SentMessage) and (
+                    told := self._on_message.get(output.entity.name)
+                ):
+                    type_name = "" if output.entity.sends is None else output.entity.sends.name
                     told(output.data, get_message_class(type_name))
 
     def _hear_error(self, child: Child, kind: str, said: str) -> None:
@@ -312,7 +320,7 @@ class InProcesses(Recording):
 
     def go_on(self) -> None:
         """Let the processes begin, as the job says, and wait until the run ends."""
-        self.pen.start()
+        self.span_writer.start()
         self.begun_ns = time.monotonic_ns()
         for child in list(self.children):
             rule = self._rules.get(child.what.key)
@@ -329,7 +337,7 @@ class InProcesses(Recording):
             self._look_for_mains()
 
     def _go(self, child: Child) -> None:
-        reader = SpanReader(self._ids, self._threads, self._log_type)
+        reader = SpanDecoder(self._ids, self._threads, self._log_type)
         self._told[child] = reader, self.merge.source()
         child.go()
 
@@ -374,7 +382,9 @@ class InProcesses(Recording):
         unreadable, cpu_ns, beside_ns = (
             sum(one[place] for one in self._counts.values()) for place in (2, 3, 4)
         )
-        return self.close(ended_after, stuck, unreadable, Spent(cpu_ns - beside_ns, beside_ns))
+        return self.close(
+            ended_after, stuck, unreadable, ProcessorTime(cpu_ns - beside_ns, beside_ns)
+        )
 
     def _kill_all(self) -> None:
         """Leave no process behind, whatever has happened."""

@@ -58,7 +58,7 @@ def need_scipy() -> None:
         raise SetupError("the two-sample test needs SciPy: pip install 'rsltrace[fit]'")
 
 
-def compared(a: Durations, b: Durations) -> Compared:
+def compare_samples(a: Durations, b: Durations) -> Compared:
     """Compare two samples, each in order of time.
 
     :raises SetupError: if SciPy is missing.
@@ -177,4 +177,4 @@ def _against(chain: ChainLatency | None, other: ChainLatency | None) -> Compared
     if chain is None or other is None:
         return None
     a, b = chain.durations("latency"), other.durations("latency")
-    return compared(a, b) if len(a) and len(b) else None
+    return compare_samples(a, b) if len(a) and len(b) else None

@@ -27,7 +27,7 @@ from rsltrace.trace.reader import Trace
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class LinkTimes:
     """A link, or a service where ``is_service``: how long each message was on its way, in ns.
 
     ``since`` has when each was sent, since the beginning. ``sender`` is the publisher's node, None
@@ -56,7 +56,7 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
-class Execution:
+class CallbackDurations:
     """A callback: how long it kept its executor, each time, in ns, shape (runs,).
 
     ``since`` has when its executor began with each, since the beginning. ``runs`` are the times of
@@ -87,7 +87,7 @@ class Execution:
 
 
 @dataclass(frozen=True, slots=True)
-class Executor:
+class ExecutorThreads:
     """Nodes that ran on the same executor, and how many threads of it were seen at work."""
 
     nodes: tuple[str, ...]
@@ -95,7 +95,7 @@ class Executor:
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class NativeTimes:
     """All that a native run says.
 
     ``idle`` are (node, entity) of callbacks that never ran, ``unknown`` counts messages whose
@@ -104,9 +104,9 @@ class Measured:
     executors did, None: none does.
     """
 
-    links: tuple[Link, ...]
-    executions: tuple[Execution, ...]
-    executors: tuple[Executor, ...]
+    links: tuple[LinkTimes, ...]
+    executions: tuple[CallbackDurations, ...]
+    executors: tuple[ExecutorThreads, ...]
     idle: tuple[tuple[str, str], ...] = ()
     unknown: int = 0
     tasks: int = 0
@@ -135,7 +135,7 @@ _TAKES_NONE = (EventKind.CONSTRUCT, EventKind.RESUME, EventKind.TASK)
 _EXCHANGES = (int(EventKind.SERVICE), int(EventKind.CLIENT))
 
 
-def measured(trace: Trace) -> Measured:
+def measured(trace: Trace) -> NativeTimes:
     """Return what a native run says.
 
     :raises TraceError: the trace is damaged, simulated, or has no callbacks.
@@ -149,11 +149,11 @@ def measured(trace: Trace) -> Measured:
     events = event_columns(trace)
     if not len(rows) or not np.isin(events["kind"], _TAKES_TIME).any():
         raise TraceError(f"{trace.name} has no callbacks: there is nothing to measure")
-    return _Run(trace, rows, events).measured()
+    return _TraceColumns(trace, rows, events).measured()
 
 
 @dataclass
-class _Run:
+class _TraceColumns:
     """A native run in columns, each of shape (events,)."""
 
     trace: Trace
@@ -188,11 +188,11 @@ class _Run:
         made = self.ends[kinds == int(EventKind.CONSTRUCT)]
         return int(made.max()) if len(made) else int(self.steady[0])
 
-    def measured(self) -> Measured:
+    def measured(self) -> NativeTimes:
         executor_of, executors = self._executors()
         kinds = self.events["kind"]
         received = np.isin(kinds, (int(EventKind.SUBSCRIPTION), *_EXCHANGES))
-        return Measured(
+        return NativeTimes(
             tuple(self._links()),
             tuple(self._executions(executor_of)),
             executors,
@@ -210,7 +210,7 @@ class _Run:
 
     # -- links -----------------------------------------------------------------------------------
 
-    def _links(self) -> Iterator[Link]:
+    def _links(self) -> Iterator[LinkTimes]:
         kinds, known = self.events["kind"], (self.source != 0) & (self.ready != 0)
         groups: dict[tuple[str, str | None, str, bool], list[int]] = {}
         for place in np.flatnonzero(known).tolist():
@@ -234,7 +234,7 @@ class _Run:
         receiver: str,
         is_service: bool,
         places: npt.NDArray[np.intp],
-    ) -> Link:
+    ) -> LinkTimes:
         source, ready = self.source[places], self.ready[places]
         delays, waits = ready - source, self.wall[places] - ready
         stepped = np.zeros(len(places), dtype=bool)
@@ -246,7 +246,7 @@ class _Run:
         if not is_service and sender is not None:
             numbers, who = self.rows["sequence"][places], self.senders[places]
             missing = missing_numbers(numbers, who)
-        return Link(
+        return LinkTimes(
             topic,
             sender,
             receiver,
@@ -261,7 +261,7 @@ class _Run:
 
     # -- callbacks -------------------------------------------------------------------------------
 
-    def _executions(self, executor_of: npt.NDArray[np.int64]) -> Iterator[Execution]:
+    def _executions(self, executor_of: npt.NDArray[np.int64]) -> Iterator[CallbackDurations]:
         kinds = self.events["kind"]
         overhead, tails = self._overhead(executor_of), self._tails()
         groups: dict[tuple[str, str], list[int]] = {}
@@ -276,7 +276,7 @@ class _Run:
             suspended = (self.events["flags"][places] & int(EventFlag.SUSPENDED)) != 0
             cut = suspended & (runs >= CUT_AFTER_NS)
             known = tails[places][tails[places] >= 0]
-            yield Execution(
+            yield CallbackDurations(
                 node,
                 name,
                 EventKind(int(kinds[places[0]])).name.lower(),
@@ -319,7 +319,7 @@ class _Run:
         tails[sent] = np.clip(lasted[sent] - left[sent], 0, lasted[sent])
         return tails
 
-    def _executors(self) -> tuple[npt.NDArray[np.int64], tuple[Executor, ...]]:
+    def _executors(self) -> tuple[npt.NDArray[np.int64], tuple[ExecutorThreads, ...]]:
         """Return which executor each event ran on, by number, and the executors with their nodes.
 
         What shares a thread with something shares its executor; threads of a multi-threaded one
@@ -348,7 +348,7 @@ class _Run:
             nodes = {node for node, thread in shared if node and by_thread[thread] == number}
             own = {thread for thread in at_work if by_thread[thread] == number}
             if nodes:
-                found.append(Executor(tuple(sorted(nodes)), max(len(own), 1)))
+                found.append(ExecutorThreads(tuple(sorted(nodes)), max(len(own), 1)))
         return np.array([by_thread[thread] for thread in threads.tolist()]), tuple(found)
 
     def _idle(self) -> Iterator[tuple[str, str]]:

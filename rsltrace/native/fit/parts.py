@@ -9,7 +9,7 @@ from typing import Any
 
 from rsltrace.checks.latency.instances import Durations
 from rsltrace.job import Job
-from rsltrace.native.fit.measured import Execution, Link, Measured
+from rsltrace.native.fit.measured import CallbackDurations, LinkTimes, NativeTimes
 from rsltrace.native.fit.models import FEW, Model, as_job_has_it, model_of, series_of
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
@@ -27,12 +27,12 @@ _TIED = 0.3
 class Fit:
     """What was measured, with a model each; links and callbacks without a duration have none."""
 
-    links: tuple[tuple[Link, Model], ...]
-    executions: tuple[tuple[Execution, Model], ...]
-    measured: Measured
+    links: tuple[tuple[LinkTimes, Model], ...]
+    executions: tuple[tuple[CallbackDurations, Model], ...]
+    measured: NativeTimes
 
 
-def fit(measured: Measured, how: str = TABLES) -> Fit:
+def fit(measured: NativeTimes, how: str = TABLES) -> Fit:
     """Return models of all that was measured: ``tables`` or ``families`` (see ``model_of``), or
     ``series`` (see ``series_of``).
 
@@ -197,7 +197,7 @@ def _replaced(fit: Fit) -> tuple[str, ...]:
     return parts if fit.measured.policy == OWN_POLICY else (*parts, "policy")
 
 
-def _of_link(link: Link) -> Iterator[str]:
+def _of_link(link: LinkTimes) -> Iterator[str]:
     if link.negative:
         yield (
             f"{link}: {link.negative} messages were received before they were sent, so clocks "
@@ -214,7 +214,7 @@ def _of_link(link: Link) -> Iterator[str]:
         )
 
 
-def _of_execution(one: Execution) -> Iterator[str]:
+def _of_execution(one: CallbackDurations) -> Iterator[str]:
     name = f"{one.node}: {one.kind} {one.entity}"
     count = len(one.busy)
     if count < FEW:

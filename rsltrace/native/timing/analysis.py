@@ -12,8 +12,8 @@ from rsltrace.job import Job
 from rsltrace.job.parts.scheduling import EntityExecutionSpec, ExecutionSpec
 from rsltrace.native.timing.bounds import bounds, utilization
 from rsltrace.native.timing.model import Wanted, longest_times, system_of
-from rsltrace.native.timing.observed import Key, ObservedChains
-from rsltrace.native.timing.system import ONCE_NS, Callback
+from rsltrace.native.timing.observed import ChainKey, ObservedChains
+from rsltrace.native.timing.system import ONCE_NS, CallbackKey
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class ChainResult:
     """What is known of a chain. Times in ns; ``bound_ns`` None: there is none; ``period_ns``
     None: it came once. ``native`` has one for each native trace, None where it is not in it."""
 
-    chain: Key
+    chain: ChainKey
     period_ns: int | None
     deadline_ns: int | None
     bound_ns: int | None
@@ -70,7 +70,7 @@ class Analysis:
 
     chains: tuple[ChainResult, ...]
     load: Mapping[str, float]
-    times: Mapping[Callback, int]
+    times: Mapping[CallbackKey, int]
     notes: tuple[str, ...]
 
     @property
@@ -79,9 +79,9 @@ class Analysis:
         return all(one.verdict in ("meets", "no deadline") for one in self.chains)
 
 
-def measured_times(observed: Sequence[ObservedChains], times: str) -> dict[Callback, int]:
+def measured_times(observed: Sequence[ObservedChains], times: str) -> dict[CallbackKey, int]:
     """Return how long callbacks took in runs: the longest, or the 99 % quantile (ns)."""
-    found: dict[Callback, list[int]] = {}
+    found: dict[CallbackKey, list[int]] = {}
     for one in observed:
         for callback, took in one.durations.items():
             quantile = int(np.quantile(took, 0.99, method="inverted_cdf"))
@@ -89,7 +89,7 @@ def measured_times(observed: Sequence[ObservedChains], times: str) -> dict[Callb
     return {callback: max(values) for callback, values in found.items()}
 
 
-def with_times(job: Job, times: Mapping[Callback, int]) -> Job:
+def with_times(job: Job, times: Mapping[CallbackKey, int]) -> Job:
     """Return a job whose callbacks take as long as ``times`` says."""
     longest: dict[tuple[str, str], int] = {}
     for callback, time_ns in times.items():
@@ -109,7 +109,7 @@ def analyze(
     simulated: ObservedChains,
     native: Sequence[ObservedChains],
     *,
-    times: Mapping[Callback, int] | None,
+    times: Mapping[CallbackKey, int] | None,
     deadlines: Mapping[str, int],
     wanted: Wanted,
 ) -> Analysis:
@@ -166,12 +166,12 @@ def analyze(
     return Analysis(tuple(results), load, times, (*notes, *more))
 
 
-def _seen(observed: ObservedChains, key: Key) -> Seen | None:
+def _seen(observed: ObservedChains, key: ChainKey) -> Seen | None:
     path = observed.path(key)
     return None if path is None else Seen(path.worst_ns, path.worst_event, path.runs)
 
 
-def _deadline(chain: Key, deadlines: Mapping[str, int], period_ns: int | None) -> int | None:
+def _deadline(chain: ChainKey, deadlines: Mapping[str, int], period_ns: int | None) -> int | None:
     last = chain[-1]
     given_ns = deadlines.get(last.name, deadlines.get(last.node, deadlines.get("")))
     return period_ns if given_ns is None else given_ns

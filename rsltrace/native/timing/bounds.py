@@ -13,7 +13,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 from rsltrace.native.timing.curves import Arrivals
-from rsltrace.native.timing.system import ONCE_NS, Executor, Order, System, Task
+from rsltrace.native.timing.system import (
+    ONCE_NS,
+    ChainTask,
+    ExecutorModel,
+    ExecutorOrder,
+    TaskSystem,
+)
 
 _ROUNDS_MAX = 1000
 _PERIODS_MAX = 100
@@ -33,14 +39,14 @@ class Bound:
     method: str = ""
 
 
-def bounds(system: System) -> list[Bound]:
+def bounds(system: TaskSystem) -> list[Bound]:
     """Return the bound of each task of a system."""
-    return _Solver(system).solve()
+    return _BoundSolver(system).solve()
 
 
 @dataclass
-class _Solver:
-    system: System
+class _BoundSolver:
+    system: TaskSystem
     ends: list[int | None] = field(default_factory=list)
     methods: list[str] = field(default_factory=list)
 
@@ -99,19 +105,21 @@ class _Solver:
         self.methods[index] = best[1]
 
     def _analyses(
-        self, executor: Executor, task: Task
+        self, executor: ExecutorModel, task: ChainTask
     ) -> Iterable[tuple[str, Callable[[int], int]]]:
         yield "any order", self._in_any_order
-        if executor.order is Order.PRIORITY and task.callback not in self.system.varying:
+        if executor.order is ExecutorOrder.PRIORITY and task.callback not in self.system.varying:
             yield "priorities", self._by_priority
-        if executor.order is Order.WAIT_SET and task.is_timer:
+        if executor.order is ExecutorOrder.WAIT_SET and task.is_timer:
             yield "timers first", self._as_timer
-        elif executor.order in (Order.WAIT_SET, Order.POLLED) and not executor.above:
+        elif (
+            executor.order in (ExecutorOrder.WAIT_SET, ExecutorOrder.POLLED) and not executor.above
+        ):
             yield "polling points", self._by_polling_points
 
     # -- what arrives, and when ------------------------------------------------------------------
 
-    def _head(self, index: int, goes_on: Callable[[Task], bool] = lambda task: True) -> int:
+    def _head(self, index: int, goes_on: Callable[[ChainTask], bool] = lambda task: True) -> int:
         """Return the first of the tasks up to this one that follow each other at once on one
         executor, as long as they are such that the analysis ``goes_on``."""
         tasks = self.system.tasks
@@ -170,7 +178,7 @@ class _Solver:
         tasks, varying = self.system.tasks, self.system.varying
         urgency = tasks[index].urgency
 
-        def goes_first(task: Task) -> bool:
+        def goes_first(task: ChainTask) -> bool:
             return task.urgency <= urgency and task.callback not in varying
 
         def head_of(one: int) -> int:
@@ -236,7 +244,7 @@ class _Solver:
         task = tasks[index]
         executor = self.system.executor_of(task)
         assert executor is not None
-        timers_polled = executor.order is Order.POLLED
+        timers_polled = executor.order is ExecutorOrder.POLLED
         head = self._head(index, lambda one: timers_polled or not one.is_timer)
         chain = self._chain(head, index)
         same = self._same(index)
@@ -311,12 +319,12 @@ def _demand(work: _Work, length_ns: int) -> int:
     return sum(arrivals.within(length_ns) * cost_ns for arrivals, cost_ns in work)
 
 
-def _is_overloaded(system: System, executor: str) -> bool:
-    supply = system.executors.get(executor, Executor()).supply
+def _is_overloaded(system: TaskSystem, executor: str) -> bool:
+    supply = system.executors.get(executor, ExecutorModel()).supply
     return utilization(system, executor) > supply.budget_ns / supply.period_ns + 1e-9
 
 
-def utilization(system: System, executor: str) -> float:
+def utilization(system: TaskSystem, executor: str) -> float:
     """Return which part of its time an executor is busy, if all callbacks take their longest."""
     return sum(
         system.count(task) * task.wcet_ns / system.arrivals(task).period_ns

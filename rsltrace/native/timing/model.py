@@ -12,7 +12,14 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
 from rsltrace.native.timing.observed import ObservedChains, Path
-from rsltrace.native.timing.system import ONCE_NS, Callback, Executor, Order, System, Task
+from rsltrace.native.timing.system import (
+    ONCE_NS,
+    CallbackKey,
+    ChainTask,
+    ExecutorModel,
+    ExecutorOrder,
+    TaskSystem,
+)
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.scheduling import policy_of_job, scheduling_plan, switches_at_lines
 from rsltrace.simulation.chance.channel import NetworkPlan
@@ -58,13 +65,13 @@ def check_job(job: Job) -> None:
         )
 
 
-def longest_times(job: Job, observed: ObservedChains) -> tuple[dict[Callback, int], list[str]]:
+def longest_times(job: Job, observed: ObservedChains) -> tuple[dict[CallbackKey, int], list[str]]:
     """Return the longest that the job lets each callback take (ns), and what to know of that.
 
     Of distributions without an end it is the longest that the run has drawn.
     """
     plan = scheduling_plan(job, 0, None)
-    found: dict[Callback, int] = {}
+    found: dict[CallbackKey, int] = {}
     open_ended: list[str] = []
     for callback in observed.callbacks.values():
         rule = next(
@@ -109,16 +116,16 @@ def longest(distribution: Distribution) -> int | None:
 
 
 def system_of(
-    job: Job, observed: ObservedChains, times: Mapping[Callback, int], wanted: Wanted
-) -> tuple[System, list[str]]:
+    job: Job, observed: ObservedChains, times: Mapping[CallbackKey, int], wanted: Wanted
+) -> tuple[TaskSystem, list[str]]:
     """Return the system of a job whose tasks are the paths of ``observed``, in their order, and
     what to know of it."""
-    return _Maker(job, observed, times, wanted).system()
+    return _SystemBuilder(job, observed, times, wanted).system()
 
 
-class _Maker:
+class _SystemBuilder:
     def __init__(
-        self, job: Job, observed: ObservedChains, times: Mapping[Callback, int], wanted: Wanted
+        self, job: Job, observed: ObservedChains, times: Mapping[CallbackKey, int], wanted: Wanted
     ) -> None:
         self.job = job
         self.observed = observed
@@ -130,7 +137,7 @@ class _Maker:
         self.network: NetworkPlan | None = network_plan(job, 0)
         self.rates = self._rates()
 
-    def system(self) -> tuple[System, list[str]]:
+    def system(self) -> tuple[TaskSystem, list[str]]:
         tasks = tuple(self._task(path) for path in self.observed.paths)
         used = {task.executor for task in tasks if task.executor is not None}
         order = self._order()
@@ -145,25 +152,27 @@ class _Maker:
                 above = frozenset(
                     other for other in used if other != name and rates[other] <= rates[name]
                 )
-            executors[name] = Executor(order, self.wanted.supply, above)
+            executors[name] = ExecutorModel(order, self.wanted.supply, above)
         varying = frozenset(one for one, found in self.rates.items() if len(found) > 1)
         if not isinstance(self.policy, RateMonotonic):
             varying = frozenset()
-        return System(tasks, executors, varying), list(dict.fromkeys(self.notes))
+        return TaskSystem(tasks, executors, varying), list(dict.fromkeys(self.notes))
 
-    def _order(self) -> Order:
+    def _order(self) -> ExecutorOrder:
         if isinstance(self.policy, RclpyWaitSet):
-            return Order.POLLED
+            return ExecutorOrder.POLLED
         if isinstance(self.policy, WaitSet):
-            return Order.WAIT_SET
+            return ExecutorOrder.WAIT_SET
         if isinstance(self.policy, Priority) and self.job.policy is not None:
             if any(rule.group_of is not None for rule in self.job.policy.priority or ()):
                 self.notes.append("priorities of callback groups (group_of) are not analyzed")
-                return Order.ANY
-            return Order.PRIORITY
-        return Order.PRIORITY if isinstance(self.policy, RateMonotonic) else Order.ANY
+                return ExecutorOrder.ANY
+            return ExecutorOrder.PRIORITY
+        return (
+            ExecutorOrder.PRIORITY if isinstance(self.policy, RateMonotonic) else ExecutorOrder.ANY
+        )
 
-    def _task(self, path: Path) -> Task:
+    def _task(self, path: Path) -> ChainTask:
         callback = path.key[-1]
         parent = None if path.parent is None else self.observed.paths[path.parent]
         arrivals = self._arrivals(path) if parent is None else None
@@ -177,7 +186,7 @@ class _Maker:
             urgency = -self.policy.priority(candidate)
         elif isinstance(self.policy, RateMonotonic):
             urgency = min(self.rates[callback])
-        return Task(
+        return ChainTask(
             callback,
             None if path.waits else self._executor(callback),
             self.times.get(callback, 0),
@@ -200,12 +209,12 @@ class _Maker:
         self.notes.append(f"{what} of {callback} {shown}")
         return Arrivals(max(gap_ns or 1, 1))
 
-    def _candidate(self, entity: int, callback: Callback) -> Candidate:
+    def _candidate(self, entity: int, callback: CallbackKey) -> Candidate:
         owner = self.observed.trace.entity(entity).node
         item: Any = SimpleNamespace(node=SimpleNamespace(entity_id=owner))
         return Candidate(callback.node, callback.name, callback.kind, entity, None, (), item)
 
-    def _executor(self, callback: Callback) -> str | None:
+    def _executor(self, callback: CallbackKey) -> str | None:
         for index, rule in enumerate(self.plan.executors):
             if any(fnmatchcase(callback.node, glob) for glob in rule.nodes):
                 if rule.workers > 1:
@@ -217,7 +226,7 @@ class _Maker:
                 return f"executors[{index}]"
         return callback.node
 
-    def _link_ns(self, sender: Callback, receiver: Callback) -> int | None:
+    def _link_ns(self, sender: CallbackKey, receiver: CallbackKey) -> int | None:
         """Return how long messages take at most, None if there is no bound."""
         if self.network is None:
             return 0
@@ -241,9 +250,9 @@ class _Maker:
 
     # -- rates -----------------------------------------------------------------------------------
 
-    def _rates(self) -> dict[Callback, set[float]]:
+    def _rates(self) -> dict[CallbackKey, set[float]]:
         """Return the periods (ns) of the chains that callbacks are in."""
-        found: dict[Callback, set[float]] = {}
+        found: dict[CallbackKey, set[float]] = {}
         for index, path in enumerate(self.observed.paths):
             found.setdefault(path.key[-1], set()).add(self._period(index))
         return found

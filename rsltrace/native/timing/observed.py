@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.native.timing.system import Callback
+from rsltrace.native.timing.system import CallbackKey
 from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, duration_of
@@ -24,7 +24,7 @@ _TIMER, _DRAW = int(EventKind.TIMER), int(OutputKind.DRAW)
 _TIMER_CHANGED = int(OutputKind.TIMER)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 
-Key = tuple[Callback, ...]
+ChainKey = tuple[CallbackKey, ...]
 """A chain: its callbacks. What came from outside begins with the callback that received it."""
 
 
@@ -35,7 +35,7 @@ class Path:
     time between two releases of what begins a chain. ``waits`` says that a callback of it waited.
     """
 
-    key: Key
+    key: ChainKey
     parent: int | None
     entity: int
     runs: int = 0
@@ -57,28 +57,28 @@ class ObservedChains:
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
         self.paths: list[Path] = []
-        self.durations: dict[Callback, npt.NDArray[np.int64]] = {}
+        self.durations: dict[CallbackKey, npt.NDArray[np.int64]] = {}
         self.callbacks = _callbacks(trace)
         self.of = {callback: trace.entity(number) for number, callback in self.callbacks.items()}
-        self.reset: set[Callback] = set()
+        self.reset: set[CallbackKey] = set()
         """Timers that were set otherwise in the run: they are taken to be due when they ran."""
         self._numbers: dict[tuple[int | None, int], int] = {}
         self._of_events: dict[int, tuple[int, int]] = {}
         self._released: dict[int, int] = {}
         self._read()
 
-    def path(self, key: Key) -> Path | None:
+    def path(self, key: ChainKey) -> Path | None:
         """Return the chain of these callbacks, None if the trace has none."""
         return next((one for one in self.paths if one.key == key), None)
 
-    def period_ns(self, callback: Callback) -> int | None:
+    def period_ns(self, callback: CallbackKey) -> int | None:
         """Return the period of a timer."""
         period = self.of[callback].detail.get("period_ns")
         return period if isinstance(period, int) and callback.kind == "timer" else None
 
     def _read(self) -> None:
         native = timings(self.trace)
-        took: dict[Callback, list[int]] = {}
+        took: dict[CallbackKey, list[int]] = {}
         for outputs in self.trace.outputs():
             for number in outputs["entity"][outputs["kind"] == _TIMER_CHANGED].tolist():
                 if (callback := self.callbacks.get(number)) is not None:
@@ -126,19 +126,19 @@ class ObservedChains:
                 self._of_events[index] = (number, release_ns)
         self.durations = {one: np.array(found, np.int64) for one, found in took.items()}
 
-    def _due(self, state: TimerState | None, callback: Callback, now_ns: int) -> int:
+    def _due(self, state: TimerState | None, callback: CallbackKey, now_ns: int) -> int:
         if state is None or callback in self.reset:
             return now_ns
         due_ns = min(state.deadline_ns, now_ns)
         state.call(now_ns)
         return due_ns
 
-    def _extend(self, parent: int | None, entity: int, callback: Callback) -> int | None:
+    def _extend(self, parent: int | None, entity: int, callback: CallbackKey) -> int | None:
         """Return the chain that goes on with a callback; None in a loop."""
         number = self._numbers.get((parent, entity))
         if number is not None:
             return number
-        before: Key = () if parent is None else self.paths[parent].key
+        before: ChainKey = () if parent is None else self.paths[parent].key
         if callback in before:
             return None
         number = self._numbers[parent, entity] = len(self.paths)
@@ -166,7 +166,7 @@ class ObservedChains:
             path.worst_ns, path.worst_event = end_ns - release_ns, event
 
 
-def _callbacks(trace: Trace) -> dict[int, Callback]:
+def _callbacks(trace: Trace) -> dict[int, CallbackKey]:
     """Return what runs callbacks, by the ids of entities."""
     seen: Counter[tuple[str, str, str]] = Counter()
     found = {}
@@ -175,7 +175,7 @@ def _callbacks(trace: Trace) -> dict[int, Callback]:
         if entity.kind not in _RECEIVERS:
             continue
         words = (trace.node_of(entity).name, entity.kind.label, entity.name)
-        found[number] = Callback(*words, seen[words])
+        found[number] = CallbackKey(*words, seen[words])
         seen[words] += 1
     return found
 

@@ -12,13 +12,13 @@ ONCE_NS = 1 << 61
 """The period of what came once."""
 
 
-class Order(Enum):
+class ExecutorOrder(Enum):
     """What is known of the order in which an executor runs what is ready."""
 
     ANY = "any order"
     """It is never idle while something is ready, and finishes what it has begun."""
     PRIORITY = "priorities"
-    """The most urgent first (``Callback.urgency``, the lower the more)."""
+    """The most urgent first (``CallbackKey.urgency``, the lower the more)."""
     WAIT_SET = "wait set"
     """Timers first, then what polling points have found."""
     POLLED = "wait set with polled timers"
@@ -26,16 +26,16 @@ class Order(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Executor:
+class ExecutorModel:
     """An executor with one thread. ``above`` are those that interrupt it whenever they have
     something to do: of the same processor, with real-time priorities that are not lower."""
 
-    order: Order = Order.ANY
+    order: ExecutorOrder = ExecutorOrder.ANY
     supply: Supply = PROCESSOR
     above: frozenset[str] = frozenset()
 
 
-class Callback(NamedTuple):
+class CallbackKey(NamedTuple):
     """A callback: its node and entity, which of those of that name it is; its kind."""
 
     node: str
@@ -48,7 +48,7 @@ class Callback(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
+class ChainTask:
     """A callback as a part of a chain (a tree of them: what comes of a task are its children).
 
     ``executor`` is None where it is on one that is not analyzed. ``arrivals`` are those of a task
@@ -57,7 +57,7 @@ class Task:
     of one run. ``place`` says which of those that a polling point has found runs first.
     """
 
-    callback: Callback
+    callback: CallbackKey
     executor: str | None
     wcet_ns: int
     arrivals: Arrivals | None = None
@@ -74,27 +74,27 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class System:
+class TaskSystem:
     """Tasks, parents before children, and executors by name.
 
     ``varying`` are callbacks whose urgency is not always the same.
     """
 
-    tasks: tuple[Task, ...]
-    executors: dict[str, Executor] = field(default_factory=dict)
-    varying: frozenset[Callback] = frozenset()
+    tasks: tuple[ChainTask, ...]
+    executors: dict[str, ExecutorModel] = field(default_factory=dict)
+    varying: frozenset[CallbackKey] = frozenset()
 
-    def executor_of(self, task: Task) -> Executor | None:
+    def executor_of(self, task: ChainTask) -> ExecutorModel | None:
         """Return the executor of a task, None if it is not analyzed."""
-        return None if task.executor is None else self.executors.get(task.executor, Executor())
+        return None if task.executor is None else self.executors.get(task.executor, ExecutorModel())
 
-    def arrivals(self, task: Task) -> Arrivals:
+    def arrivals(self, task: ChainTask) -> Arrivals:
         """Return how often the chain of a task is released."""
         if task.parent is not None:
             return self.arrivals(self.tasks[task.parent])
         assert task.arrivals is not None, "what has no parent has arrivals"
         return task.arrivals
 
-    def count(self, task: Task) -> int:
+    def count(self, task: ChainTask) -> int:
         """Return how many of a task come of one release of its chain, at most."""
         return task.count * (1 if task.parent is None else self.count(self.tasks[task.parent]))

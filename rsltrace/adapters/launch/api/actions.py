@@ -14,9 +14,9 @@ from rsltrace.adapters.launch.api.basics import (
     as_substitutions,
     visit_all,
 )
+from rsltrace.adapters.launch.api.description_sources import LaunchDescriptionSource
 from rsltrace.adapters.launch.api.packages import missing_package
-from rsltrace.adapters.launch.api.sources import LaunchDescriptionSource
-from rsltrace.adapters.launch.substitution import truth
+from rsltrace.adapters.launch.model import truth
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
 
@@ -94,9 +94,9 @@ class IncludeLaunchDescription(Action):
             context.refuse(self.where, f"include of {path.name}", f"{why} here")
             return None
         if not path.is_file():
-            raise JobError(f"there is no launch file {path}", where=self.where)
+            raise JobError(f"there is no launch file {path}")
         if context.include is None:
-            raise JobError("nothing can be included here", where=self.where)
+            raise JobError("nothing can be included here")
         try:
             context.include(path)
         except MissingModuleError as error:
@@ -149,22 +149,27 @@ class TimerAction(Action):
         self._period = str(period) if isinstance(period, (int, float)) else period
         self._actions = list(actions)
 
+    def inside(self) -> Iterable[Any]:
+        """Give its actions."""
+        return self._actions
+
     def execute(self, context: LaunchContext) -> None:
         """Do the actions; their nodes start that much later."""
-        text = context.text(as_substitutions(self._period))
+        delay_ns = period_ns(context.text(as_substitutions(self._period)))
+        context.delay_ns += delay_ns
         try:
-            period_ns = parse_time(float(text))
-        except ValueError:
-            raise ValueError(
-                f"the period of a timer is a number of seconds, not {text!r}"
-            ) from None
-        evaluation = context.evaluation
-        evaluation.delay_ns += period_ns
-        try:
-            with evaluation.within(scope=evaluation.scope.copy()):
+            with context.within(scope=context.scope.copy()):
                 visit_all(context, self._actions)
         finally:
-            evaluation.delay_ns -= period_ns
+            context.delay_ns -= delay_ns
+
+
+def period_ns(text: str) -> int:
+    """Return the period of a timer. Raises ``ValueError`` if it is none."""
+    try:
+        return parse_time(float(text))
+    except ValueError:
+        raise ValueError(f"the period of a timer is a number of seconds, not {text!r}") from None
 
 
 class LogInfo(Action):

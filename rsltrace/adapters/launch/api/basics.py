@@ -4,13 +4,20 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.launch.evaluation import Evaluation
-from rsltrace.adapters.launch.model import Argument, Unsupported
+from rsltrace.adapters.launch.model import (
+    Argument,
+    Launched,
+    LaunchScope,
+    UnsupportedItem,
+    truth,
+)
 from rsltrace.errors import JobError
+from rsltrace.job.reading.yaml_source import Place
 
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
@@ -78,9 +85,11 @@ def perform_substitutions(context: LaunchContext, substitutions: Iterable[Substi
 
 
 class LaunchContext:
-    """What a launch file can see and do while it is read; ``evaluation`` is who keeps it.
+    """What a launch file can see while it is read, and what it has started (``launched``).
 
-    One that a launch file makes for itself sees nothing.
+    ``delay_ns`` is when what is being read happens after the start of the launch file; or, with
+    ``after``, after the action of that number has ``started`` or ``ended``. ``kept`` keeps the
+    actions alive whose ``id`` is a number.
     """
 
     def __init__(
@@ -88,26 +97,59 @@ class LaunchContext:
         *,
         argv: Sequence[str] | None = None,
         noninteractive: bool = True,
-        evaluation: Evaluation | None = None,
+        arguments: Mapping[str, str] | None = None,
     ) -> None:
         self.argv = list(argv or ())
         self.noninteractive = noninteractive
-        self.evaluation = Evaluation({}) if evaluation is None else evaluation
+        self.launched = Launched()
+        self.scope = LaunchScope(configurations=dict(arguments or {}))
+        self.file = Path()
+        """The launch file being read."""
+        self.delay_ns = 0
+        self.after: tuple[str, int] | None = None
+        self.kept: list[object] = []
         self.later: list[Callable[[], None]] = []
         """What happens once the launch file has been read: event handlers."""
         self.include: Callable[[Path], None] | None = None
         self.where = ""
         """Where the action is that is being done."""
+        self.first_environment = dict(self.scope.environment)
+        self._anonymous: dict[str, str] = {}
+
+    @contextmanager
+    def within(
+        self, *, scope: LaunchScope | None = None, file: Path | None = None
+    ) -> Iterator[None]:
+        """Read in another scope, or another file, within the block."""
+        outer = self.scope, self.file
+        self.scope, self.file = scope or self.scope, file or self.file
+        try:
+            yield
+        finally:
+            self.scope, self.file = outer
+
+    def anonymous(self, name: str) -> str:
+        """Return a unique name that begins with ``name``."""
+        # ROS appends host, process and a random number; here runs must not differ.
+        return self._anonymous.setdefault(name, f"{name}_{len(self._anonymous) + 1}")
+
+    def changed_environment(self) -> dict[str, str]:
+        """Return what the launch file has set in the environment that it found."""
+        return {
+            name: value
+            for name, value in self.scope.environment.items()
+            if self.first_environment.get(name) != value
+        }
 
     @property
     def launch_configurations(self) -> dict[str, str]:
         """The launch arguments, as text."""
-        return self.evaluation.scope.configurations
+        return self.scope.configurations
 
     @property
     def environment(self) -> dict[str, str]:
         """The environment that processes would get."""
-        return self.evaluation.scope.environment
+        return self.scope.environment
 
     def perform_substitution(self, substitution: Substitution) -> str:
         """Return what a substitution stands for."""
@@ -121,9 +163,13 @@ class LaunchContext:
         """Return what text or substitutions stand for, None for None."""
         return None if given is None else self.text(given)
 
+    def flag(self, given: Any) -> bool:
+        """Return whether a truth value, or what stands for one, is true."""
+        return given if isinstance(given, bool) else truth(self.text(given))
+
     def refuse(self, where: str, what: str, why: str) -> None:
         """Note that something cannot be simulated."""
-        self.evaluation.launched.unsupported.append(Unsupported(where, what, why))
+        self.launched.unsupported.append(UnsupportedItem(where, what, why))
 
 
 class Condition:
@@ -150,7 +196,8 @@ class LaunchDescriptionEntity:
 
 
 class Action(LaunchDescriptionEntity):
-    """Something to do, if its condition holds. ``where`` is where the launch file makes it."""
+    """Something to do, if its condition holds. ``where`` is where the launch file makes it,
+    ``place`` the same in XML or YAML."""
 
     def __init__(self, *, condition: Condition | None = None) -> None:
         self._condition = condition
@@ -163,6 +210,7 @@ class Action(LaunchDescriptionEntity):
         return action
 
     where: str
+    place: Place | None = None
     _condition: Condition | None
 
     @property
@@ -180,7 +228,10 @@ class Action(LaunchDescriptionEntity):
             if brought is not None:
                 visit_all(context, brought)
         except Exception as error:
-            raise as_job_error(error, self.where) from error
+            if self.place is None:
+                raise as_job_error(error, self.where) from error
+            found = as_job_error(error, "")
+            raise (found if found.where else self.place.error(str(found))) from error
         finally:
             context.where = outer
 
@@ -228,7 +279,7 @@ def note_arguments(context: LaunchContext, entity: LaunchDescriptionEntity) -> N
     """Note what an entity declares, and what is in it does."""
     declared: Argument | None = getattr(entity, "argument", None)
     if declared is not None:
-        context.evaluation.launched.arguments.setdefault(declared.name, declared)
+        context.launched.arguments.setdefault(declared.name, declared)
     for inner in entity.inside():
         if isinstance(inner, LaunchDescriptionEntity):
             note_arguments(context, inner)

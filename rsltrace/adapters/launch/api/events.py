@@ -27,38 +27,38 @@ class Shutdown(Event):
         self.reason, self.due_to_sigint = reason, due_to_sigint
 
 
-class _Named(Event):
+class _UnusedEvent(Event):
     """An event of processes or lifecycle nodes, which does not happen here."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
 
-class ProcessExited(_Named):
+class ProcessExited(_UnusedEvent):
     """A process has ended."""
 
 
-class ProcessStarted(_Named):
+class ProcessStarted(_UnusedEvent):
     """A process has started."""
 
 
-class ProcessIO(_Named):
+class ProcessIO(_UnusedEvent):
     """A process has written something."""
 
 
-class SignalProcess(_Named):
+class SignalProcess(_UnusedEvent):
     """A process gets a signal."""
 
 
-class ShutdownProcess(_Named):
+class ShutdownProcess(_UnusedEvent):
     """A process is to end."""
 
 
-class ChangeState(_Named):
+class ChangeState(_UnusedEvent):
     """A lifecycle node is to change its state."""
 
 
-class StateTransition(_Named):
+class StateTransition(_UnusedEvent):
     """A lifecycle node has changed its state."""
 
 
@@ -83,7 +83,7 @@ class OnShutdown(EventHandler):
 
     def register(self, context: LaunchContext, where: str) -> None:
         """Say so."""
-        context.evaluation.launched.ignored.append(
+        context.launched.ignored.append(
             f"{where}: OnShutdown: a run is over when it ends; nothing starts then"
         )
 
@@ -141,20 +141,19 @@ def later(context: LaunchContext, where: str, moment: str, target: Action, actio
         context.refuse(where, f"what follows when {_title(target)} has {moment}", _CALLED)
         return
     listed = list(actions) if isinstance(actions, Iterable) else [actions]
-    evaluation = context.evaluation
     if not all(isinstance(action, LaunchDescriptionEntity) for action in listed):
         what = f"what follows when {_title(target)} has {moment}"
-        evaluation.launched.ignored.append(f"{where}: {what}: it is no action")
+        context.launched.ignored.append(f"{where}: {what}: it is no action")
         return
-    evaluation.kept.append(target)
+    context.kept.append(target)
 
     def do() -> None:
-        outer = evaluation.after, evaluation.delay_ns
-        evaluation.after, evaluation.delay_ns = (moment, id(target)), 0
+        outer = context.after, context.delay_ns
+        context.after, context.delay_ns = (moment, id(target)), 0
         try:
             visit_all(context, listed)
         finally:
-            evaluation.after, evaluation.delay_ns = outer
+            context.after, context.delay_ns = outer
 
     context.later.append(do)
 
@@ -176,13 +175,12 @@ class EmitEvent(Action):
             what = f"EmitEvent({type(self.event).__name__})"
             context.refuse(self.where, what, "there are no processes and no launch service here")
             return
-        evaluation = context.evaluation
-        if evaluation.after is None:
+        if context.after is None:
             context.refuse(self.where, "shutdown", _NO_END)
-        elif evaluation.after[0] == "ended" and not evaluation.delay_ns:
-            evaluation.launched.required.add(evaluation.after[1])
+        elif context.after[0] == "ended" and not context.delay_ns:
+            context.launched.required.add(context.after[1])
         else:
-            evaluation.launched.ignored.append(f"{self.where}: shutdown: {_NO_END}")
+            context.launched.ignored.append(f"{self.where}: shutdown: {_NO_END}")
 
 
 class ShutdownAction(EmitEvent):

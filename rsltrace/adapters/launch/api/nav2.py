@@ -17,11 +17,10 @@ from rsltrace.adapters.launch.api.basics import (
     SubstitutionFailure,
     as_substitutions,
 )
-from rsltrace.adapters.launch.model import yaml_value
-from rsltrace.adapters.launch.substitution import truth
+from rsltrace.adapters.launch.model import truth, yaml_value
 
 
-class _OfFile(Substitution):
+class _FileSubstitution(Substitution):
     """Something that is made of a file."""
 
     def __init__(self, source_file: Any) -> None:
@@ -47,7 +46,7 @@ def _written(text: str) -> str:
     return file.name
 
 
-class RewrittenYaml(_OfFile):
+class RewrittenYaml(_FileSubstitution):
     """The path of a copy of a YAML file with some values changed."""
 
     def __init__(
@@ -112,7 +111,7 @@ class RewrittenYaml(_OfFile):
         return found if isinstance(found, (bool, int, float)) else text
 
 
-class ReplaceString(_OfFile):
+class ReplaceString(_FileSubstitution):
     """The path of a copy of a file with some texts in it replaced."""
 
     def __init__(
@@ -131,7 +130,7 @@ class ReplaceString(_OfFile):
         return _written(text)
 
 
-class HasNodeParams(_OfFile):
+class HasNodeParams(_FileSubstitution):
     """``True`` if a parameter file has something for a node."""
 
     def __init__(self, source_file: Any, node_name: str) -> None:

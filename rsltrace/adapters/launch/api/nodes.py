@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from rsltrace.adapters.launch.api.basics import (
@@ -18,12 +18,11 @@ from rsltrace.adapters.launch.api.packages import names_missing_package
 from rsltrace.adapters.launch.api.parameters import evaluated_parameters
 from rsltrace.adapters.launch.model import (
     LaunchedNode,
-    Surroundings,
+    ProcessSettings,
     absolute_namespace,
     full_name,
     respawning,
 )
-from rsltrace.adapters.launch.substitution import truth
 
 _WITHOUT_MEANING = frozenset(
     "output output_format emulate_tty exec_name log_cmd sigterm_timeout sigkill_timeout "
@@ -41,6 +40,9 @@ _RENAMED = {"node_executable": "executable", "node_name": "name", "node_namespac
 class ExecuteLocal(Action):
     """Starts another program: nothing that can be simulated."""
 
+    ends_run: Callable[[LaunchContext], bool] | None = None
+    """Says whether the run ends with it (``required`` and ``on_exit`` in XML and YAML)."""
+
     def __init__(
         self, *, condition: Condition | None = None, on_exit: Any = None, **options: Any
     ) -> None:
@@ -52,7 +54,7 @@ class ExecuteLocal(Action):
         self._on_exit = on_exit
         self._options = {name: value for name, value in options.items() if value}
 
-    def _surroundings(self, context: LaunchContext) -> Surroundings:
+    def _surroundings(self, context: LaunchContext) -> ProcessSettings:
         """Return what is said of the process."""
         options = self._options
         own = {
@@ -61,19 +63,21 @@ class ExecuteLocal(Action):
             for name, value in dict(options.get(key, {})).items()
         }
         respawn = None
-        if _flag(context, options.get("respawn", False)):
+        if context.flag(options.get("respawn", False)):
             times = int(_number(context, options.get("respawn_max_retries", -1)))
             respawn = respawning(_number(context, options.get("respawn_delay", 0.0)), times)
-        return Surroundings(
-            tuple({**context.evaluation.changed_environment(), **own}.items()),
+        return ProcessSettings(
+            tuple({**context.changed_environment(), **own}.items()),
             folder=context.optional(options.get("cwd")) or "",
             respawn=respawn,
-            own=tuple(name for name in ("cwd", "env", "additional_env") if name in options),
+            own=(*(f"env {name}" for name in own), *(["cwd"] if "cwd" in options else [])),
             without=tuple(name for name in _WITHOUT if name in options),
         )
 
     def _started(self, context: LaunchContext) -> None:
         """Note what follows when it ends."""
+        if self.ends_run is not None and self.ends_run(context):
+            context.launched.required.add(id(self))
         if self._on_exit is not None:
             later(context, self.where, "ended", self, self._on_exit)
 
@@ -109,16 +113,16 @@ class Node(ExecuteLocal):
         namespace: Any = None,
         parameters: Iterable[Any] | None = None,
         remappings: Iterable[tuple[Any, Any]] | None = None,
-        ros_arguments: Iterable[Any] | None = None,
-        arguments: Iterable[Any] | None = None,
+        ros_arguments: Any = None,
+        arguments: Any = None,
         **options: Any,
     ) -> None:
         super().__init__(**options)
         self._executable = as_substitutions(executable)
         self._package = None if package is None else as_substitutions(package)
-        self._description = _Description(name, namespace, parameters, remappings)
-        self._ros_arguments = list(ros_arguments or ())
-        self._arguments = list(arguments or ())
+        self._description = _NodeDescription(name, namespace, parameters, remappings)
+        self._ros_arguments = ros_arguments
+        self._arguments = arguments
         self._values: dict[str, Any] = {}
 
     def execute(self, context: LaunchContext) -> None:
@@ -134,8 +138,8 @@ class Node(ExecuteLocal):
         values = self._values or self._description.values(context, self.where)
         if not self._values and not values.get("fault"):
             try:
-                values["arguments"] = tuple(context.text(word) for word in self._arguments)
-                values["ros_arguments"] = tuple(context.text(w) for w in self._ros_arguments)
+                values["arguments"] = _words(context, self._arguments)
+                values["ros_arguments"] = _words(context, self._ros_arguments)
                 values["surroundings"] = self._surroundings(context)
                 _check_paths([*values["arguments"], *values["ros_arguments"]])
             except Exception as error:
@@ -164,7 +168,7 @@ class LifecycleNode(Node):
     def execute(self, context: LaunchContext) -> None:
         """Note the node."""
         super().execute(context)
-        if self._autostart and str(self._autostart).lower() != "false":
+        if context.flag(self._autostart):
             context.refuse(
                 self.where,
                 f"autostart of {context.optional(self._package)}/{context.text(self._executable)}",
@@ -172,7 +176,7 @@ class LifecycleNode(Node):
             )
 
 
-class _Description:
+class _NodeDescription:
     """What nodes and components have in common."""
 
     def __init__(
@@ -191,7 +195,7 @@ class _Description:
 
         What cannot be evaluated is a fault of the node only: it may be one that is left out.
         """
-        scope = context.evaluation.scope
+        scope = context.scope
         name = context.optional(self.name) or None
         namespace = absolute_namespace(scope.namespace, context.optional(self.namespace))
         whole = None if name is None else full_name(namespace, name)
@@ -218,14 +222,11 @@ def _check_paths(values: Iterable[object]) -> None:
 
 def note(context: LaunchContext, action: object, **values: Any) -> None:
     """Note a node that ``action`` starts."""
-    evaluation = context.evaluation
     values.setdefault("where", getattr(action, "where", ""))
-    evaluation.launched.nodes.append(
-        LaunchedNode(
-            **values, delay_ns=evaluation.delay_ns, after=evaluation.after, number=id(action)
-        )
+    context.launched.nodes.append(
+        LaunchedNode(**values, delay_ns=context.delay_ns, after=context.after, number=id(action))
     )
-    evaluation.kept.append(action)  # so that no other gets its id
+    context.kept.append(action)  # so that no other gets its id
 
 
 class ComposableNode:
@@ -246,7 +247,7 @@ class ComposableNode:
         self.where = calling_line()
         self._package, self._plugin = as_substitutions(package), as_substitutions(plugin)
         self._condition = condition
-        self._description = _Description(name, namespace, parameters, remappings)
+        self._description = _NodeDescription(name, namespace, parameters, remappings)
         self._extra_arguments = list(extra_arguments or ())
 
     def note(self, context: LaunchContext, container: str) -> None:
@@ -321,8 +322,9 @@ class LoadComposableNodes(Action):
             component.note(context, container)
 
 
-def _flag(context: LaunchContext, value: Any) -> bool:
-    return value if isinstance(value, bool) else truth(context.text(value))
+def _words(context: LaunchContext, given: Any) -> tuple[str, ...]:
+    """Return the words of a command line: of a sequence, or what makes them of the context."""
+    return tuple(given(context) if callable(given) else map(context.text, given or ()))
 
 
 def _number(context: LaunchContext, value: Any) -> float:

@@ -79,7 +79,7 @@ def missing_packages_allowed(context: LaunchContext) -> Iterator[None]:
                 raise
             if package_name not in noted:
                 noted.add(package_name)
-                context.evaluation.launched.ignored.append(
+                context.launched.ignored.append(
                     f"{context.where or calling_line()}: there is no package {package_name!r}: "
                     f"{_WHY}; what wants something of it is left out"
                 )

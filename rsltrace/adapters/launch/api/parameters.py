@@ -18,6 +18,7 @@ from rsltrace.adapters.launch.api.basics import (
 from rsltrace.adapters.launch.api.packages import missing_package
 from rsltrace.adapters.launch.model import typed, yaml_value
 from rsltrace.adapters.launch.parameter_files import parameters_for, substituted_parameters
+from rsltrace.adapters.launch.substitution import parse_template
 
 _SCALARS = (bool, int, float, str)
 _NUMBER = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
@@ -59,7 +60,7 @@ class ParameterFile:
 
     def found(
         self, context: LaunchContext, full_name: str | None
-    ) -> scope.ParameterFile | dict[str, Any]:
+    ) -> scope.ParameterFilePath | dict[str, Any]:
         """Return the file, or its content for a node if it stays only as long as it is read.
 
         :raises ValueError: if it is not there.
@@ -70,11 +71,15 @@ class ParameterFile:
             raise ValueError(f"there is no package {package!r}, and so no parameter file {path}")
         if not os.path.isfile(path):
             raise ValueError(f"there is no parameter file {path}")
-        if parameter_value(context, self.allow_substs, bool):
-            return substituted_parameters(path, context.evaluation.replaced_text, full_name)
+        if context.flag(self.allow_substs):
+
+            def replaced(text: str) -> str:
+                return context.text(parse_template(text))
+
+            return substituted_parameters(path, replaced, full_name)
         if Path(path).parent == Path(tempfile.gettempdir()):
             return parameters_for(path, full_name)
-        return scope.ParameterFile(path)
+        return scope.ParameterFilePath(path)
 
 
 def parameter_value(context: LaunchContext, value: Any, kind: Any) -> Any:
@@ -173,7 +178,7 @@ def named_values(
 
 def evaluated_parameters(
     context: LaunchContext, parameters: Iterable[Any], full_name: str | None
-) -> Iterator[scope.ParameterFile | dict[str, Any]]:
+) -> Iterator[scope.ParameterFilePath | dict[str, Any]]:
     """Yield the files and values of a node's ``parameters=[…]``.
 
     :raises ValueError, TypeError: if one of them is none, or a file is not there.

@@ -6,10 +6,15 @@ import os
 from collections.abc import Iterable
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import Action, LaunchContext, as_substitutions
-from rsltrace.adapters.launch.api.parameters import ParameterFile, parameter_value, plain_value
-from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, Scope, joined_namespace
-from rsltrace.errors import JobError
+from rsltrace.adapters.launch.api.basics import (
+    Action,
+    LaunchContext,
+    as_substitutions,
+    visit_all,
+)
+from rsltrace.adapters.launch.api.parameters import ParameterFile, plain_value
+from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, LaunchScope, joined_namespace
+from rsltrace.errors import JobError, nearest
 
 
 class DeclareLaunchArgument(Action):
@@ -35,23 +40,28 @@ class DeclareLaunchArgument(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Give it its default if it has no value, and check the value."""
-        context.evaluation.launched.arguments.setdefault(self.name, self.argument)
+        context.launched.arguments.setdefault(self.name, self.argument)
         configurations = context.launch_configurations
         if self.name not in configurations:
             if self.default_value is None:
                 about = self.argument.description
                 raise JobError(
                     f"the launch argument {self.name!r}{f' ({about})' if about else ''} is "
-                    f"required: give {self.name}:=…",
-                    where=self.where,
+                    f"required: give {self.name}:=…{_similar(context, self.name)}"
                 )
             configurations[self.name] = context.text(self.default_value)
         if self.choices is not None and configurations[self.name] not in self.choices:
             raise JobError(
                 f"the launch argument {self.name!r} is {configurations[self.name]!r}, which is "
-                f"none of {', '.join(map(repr, self.choices))}",
-                where=self.where,
+                f"none of {', '.join(map(repr, self.choices))}"
             )
+
+
+def _similar(context: LaunchContext, name: str) -> str:
+    """Return the hint that an argument may be misspelt: one like it is given, but not declared."""
+    declared = context.launched.arguments
+    near = nearest(name, [one for one in context.launch_configurations if one not in declared])
+    return f" (there is a {near!r})" if near else ""
 
 
 class SetLaunchConfiguration(Action):
@@ -92,7 +102,7 @@ class ResetLaunchConfigurations(Action):
         context.launch_configurations.update(kept)
 
 
-class _Environment(Action):
+class _EnvironmentAction(Action):
     """Changes the environment that the launch file sees."""
 
     def __init__(self, name: Any, **options: Any) -> None:
@@ -101,11 +111,11 @@ class _Environment(Action):
 
     def _note(self, context: LaunchContext) -> str:
         name = context.text(self.name)
-        context.evaluation.launched.ignored.append(ENVIRONMENT.format(where=self.where, name=name))
+        context.launched.ignored.append(ENVIRONMENT.format(where=self.where, name=name))
         return name
 
 
-class SetEnvironmentVariable(_Environment):
+class SetEnvironmentVariable(_EnvironmentAction):
     """Sets an environment variable."""
 
     def __init__(self, name: Any, value: Any, **options: Any) -> None:
@@ -117,7 +127,7 @@ class SetEnvironmentVariable(_Environment):
         context.environment[self._note(context)] = context.text(self.value)
 
 
-class AppendEnvironmentVariable(_Environment):
+class AppendEnvironmentVariable(_EnvironmentAction):
     """Makes an environment variable longer."""
 
     def __init__(
@@ -138,17 +148,26 @@ class AppendEnvironmentVariable(_Environment):
         parts = [context.text(self.value)]
         if name in context.environment:
             parts.insert(0, context.environment[name])
-        if parameter_value(context, self.prepend, bool):
+        if context.flag(self.prepend):
             parts.reverse()
         context.environment[name] = context.text(self.separator).join(parts)
 
 
-class UnsetEnvironmentVariable(_Environment):
+class UnsetEnvironmentVariable(_EnvironmentAction):
     """Takes away an environment variable."""
 
     def execute(self, context: LaunchContext) -> None:
         """Take it away."""
         context.environment.pop(self._note(context), None)
+
+
+class ResetEnvironment(Action):
+    """Restores the environment that the launch file found."""
+
+    def execute(self, context: LaunchContext) -> None:
+        """Restore it."""
+        context.environment.clear()
+        context.environment.update(context.first_environment)
 
 
 class GroupAction(Action):
@@ -158,8 +177,8 @@ class GroupAction(Action):
         self,
         actions: Iterable[Any],
         *,
-        scoped: bool = True,
-        forwarding: bool = True,
+        scoped: Any = True,
+        forwarding: Any = True,
         launch_configurations: dict[Any, Any] | None = None,
         **options: Any,
     ) -> None:
@@ -174,18 +193,15 @@ class GroupAction(Action):
 
     def execute(self, context: LaunchContext) -> Any:
         """Do the actions; what they set ends with them if it is ``scoped``."""
-        from rsltrace.adapters.launch.api.basics import visit_all
-
         kept = {context.text(name): context.text(value) for name, value in self._kept.items()}
-        if not self._scoped:
+        if not context.flag(self._scoped):
             context.launch_configurations.update(kept)
             return self._actions
-        evaluation = context.evaluation
-        scope = evaluation.scope.copy()
-        if not self._forwarding:
-            scope = Scope(environment=evaluation.first_environment())
+        scope = context.scope.copy()
+        if not context.flag(self._forwarding):
+            scope = LaunchScope(environment=dict(context.first_environment))
         scope.configurations.update(kept)
-        with evaluation.within(scope=scope):
+        with context.within(scope=scope):
             visit_all(context, self._actions)
         return None
 
@@ -199,7 +215,7 @@ class PushRosNamespace(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Go into the namespace."""
-        scope = context.evaluation.scope
+        scope = context.scope
         scope.namespace = joined_namespace(scope.namespace, context.text(self._namespace)) or "/"
 
 
@@ -213,7 +229,7 @@ class SetParameter(Action):
     def execute(self, context: LaunchContext) -> None:
         """Give it."""
         value = plain_value(context, self._value, "SetParameter")
-        context.evaluation.scope.parameters += ({context.text(self._name): value},)
+        context.scope.parameters += ({context.text(self._name): value},)
 
 
 class SetUseSimTime(Action):
@@ -237,7 +253,7 @@ class SetParametersFromFile(Action):
 
     def execute(self, context: LaunchContext) -> None:
         """Give them."""
-        context.evaluation.scope.parameters += (self._file.found(context, None),)
+        context.scope.parameters += (self._file.found(context, None),)
 
 
 class SetRemap(Action):
@@ -250,7 +266,7 @@ class SetRemap(Action):
     def execute(self, context: LaunchContext) -> None:
         """Remap it."""
         pair = (context.text(self._src), context.text(self._dst))
-        context.evaluation.scope.remappings += (pair,)
+        context.scope.remappings += (pair,)
 
 
 class SetROSLogDir(Action):
@@ -268,6 +284,7 @@ __all__ = [
     "DeclareLaunchArgument",
     "GroupAction",
     "PushRosNamespace",
+    "ResetEnvironment",
     "ResetLaunchConfigurations",
     "SetEnvironmentVariable",
     "SetLaunchConfiguration",

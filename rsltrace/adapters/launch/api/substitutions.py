@@ -21,7 +21,8 @@ from rsltrace.adapters.launch.api.basics import (
     as_substitutions,
 )
 from rsltrace.adapters.launch.api.packages import prefix_of, share_of
-from rsltrace.adapters.launch.substitution import equal_texts, truth
+from rsltrace.adapters.launch.model import equal_texts, truth
+from rsltrace.errors import did_you_mean
 
 
 def _word(value: bool) -> str:
@@ -55,7 +56,10 @@ class LaunchConfiguration(Substitution):
         if value is not None:
             return value
         if self._default is None:
-            raise SubstitutionFailure(f"launch configuration '{name}' does not exist")
+            names = sorted(context.launch_configurations)
+            there = f"there are {', '.join(names)}" if names else "none is declared"
+            hint = did_you_mean(name, names, there)
+            raise SubstitutionFailure(f"there is no launch argument {name!r}; {hint}")
         return context.text(self._default)
 
 
@@ -86,7 +90,9 @@ class EnvironmentVariable(Substitution):
         if value is not None:
             return value
         if self._default is None:
-            raise SubstitutionFailure(f"environment variable '{name}' does not exist")
+            raise SubstitutionFailure(
+                f"the environment variable {name} is not set: set it, or give a default"
+            )
         return context.text(self._default)
 
 
@@ -226,7 +232,7 @@ class ThisLaunchFile(Substitution):
 
     def perform(self, context: LaunchContext) -> str:
         """Return the path."""
-        return str(context.evaluation.file)
+        return str(context.file)
 
 
 class ThisLaunchFileDir(Substitution):
@@ -234,7 +240,7 @@ class ThisLaunchFileDir(Substitution):
 
     def perform(self, context: LaunchContext) -> str:
         """Return the folder."""
-        return str(context.evaluation.file.parent)
+        return str(context.file.parent)
 
     def __truediv__(self, other: Any) -> PathJoinSubstitution:
         return PathJoinSubstitution([self, other])
@@ -248,7 +254,7 @@ class AnonName(Substitution):
 
     def perform(self, context: LaunchContext) -> str:
         """Return the name and a number: ROS draws one at random, and runs must not differ."""
-        return context.evaluation.anonymous(context.text(self.name))
+        return context.anonymous(context.text(self.name))
 
 
 class EqualsSubstitution(Substitution):

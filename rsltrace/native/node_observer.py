@@ -14,8 +14,8 @@ from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import message_type, service_type
+from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.support import patched
-from rsltrace.native.things import Thing, Things
 from rsltrace.simulation.middleware.entity import callback_name
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_SERVICES
@@ -23,11 +23,13 @@ from rsltrace.trace.model.operation import NODE_SERVICES
 _ROSOUT = "/rosout"
 
 
-class Nodes:
-    """Tells ``things`` of what nodes create. ``entry`` is whose nodes this thread constructs."""
+class NodeObserver:
+    """Tells ``entities`` of what nodes create. ``entry`` is whose nodes this thread constructs."""
 
-    def __init__(self, things: Things, gid_of: Callable[[Any], bytes] = lambda handle: b"") -> None:
-        self._things = things
+    def __init__(
+        self, entities: ObservedEntities, gid_of: Callable[[Any], bytes] = lambda handle: b""
+    ) -> None:
+        self._entities = entities
         self._gid_of = gid_of
         self._local = threading.local()
         self.main: Entry | None = None
@@ -50,7 +52,7 @@ class Nodes:
         from rclpy.lifecycle.node import LifecycleNodeMixin
         from rclpy.node import Node
 
-        made: dict[str, Callable[[Thing, Any], object]] = {
+        made: dict[str, Callable[[ObservedEntity, Any], object]] = {
             "create_publisher": self._publisher,
             "create_subscription": self._subscription,
             "create_timer": self._timer,
@@ -67,14 +69,14 @@ class Nodes:
             stack.enter_context(patched(ActionClient, "__init__", self._action(False)))
             yield
 
-    def node(self, node: Any) -> Thing:
+    def node(self, node: Any) -> ObservedEntity:
         """Return a node's entity, which is made when the node makes its first."""
-        found = self._things.find(node)
+        found = self._entities.find(node)
         if found is not None:
             return found
         kind = type(node)
         name = node.get_fully_qualified_name()
-        thing = self._things.add(
+        entity = self._entities.add(
             (node,),
             None,
             EntityKind.NODE,
@@ -85,11 +87,11 @@ class Nodes:
         from rcl_interfaces.msg import Log
 
         type_name = message_type(Log).name
-        rosout = self._things.add(
-            (), thing, EntityKind.PUBLISHER, _ROSOUT, type_name, qos=QOS_ROSOUT.summary()
+        rosout = self._entities.add(
+            (), entity, EntityKind.PUBLISHER, _ROSOUT, type_name, qos=QOS_ROSOUT.summary()
         )
-        self._things.rosout.setdefault(node.get_logger().name, _with_types(rosout, Log))
-        return thing
+        self._entities.rosout.setdefault(node.get_logger().name, _with_types(rosout, Log))
+        return entity
 
     def _with_arguments(self, original: Callable[..., None]) -> Callable[..., None]:
         """Wrap ``Node.__init__``: a node of an entry gets what ``ros2 run`` would give it."""
@@ -108,7 +110,7 @@ class Nodes:
 
     def meet(self, node: Any, made: Any) -> None:
         """Tell of what a node has if nobody did: it was made without the node's ``create_…``."""
-        if self._things.find(made) is not None:
+        if self._entities.find(made) is not None:
             return
         from rclpy.client import Client
         from rclpy.service import Service
@@ -132,13 +134,13 @@ class Nodes:
 
         return construct
 
-    def _transitions(self, owner: Thing, node: Any) -> None:
+    def _transitions(self, owner: ObservedEntity, node: Any) -> None:
         from lifecycle_msgs.msg import TransitionEvent
         from rclpy.qos import QoSProfile
 
         topic = node.resolve_topic_name("~/transition_event")
         qos = qos_of(QoSProfile(depth=10).get_c_qos_profile())
-        thing = self._things.add(
+        entity = self._entities.add(
             (node._state_machine,),
             owner,
             EntityKind.PUBLISHER,
@@ -146,10 +148,10 @@ class Nodes:
             message_type(TransitionEvent).name,
             qos=qos.summary(),
         )
-        thing.qos_yaml = qos.to_yaml()
-        _with_types(thing, TransitionEvent)
+        entity.qos_yaml = qos.to_yaml()
+        _with_types(entity, TransitionEvent)
 
-    def _telling(self, tell: Callable[[Thing, Any], object]) -> Callable[..., Any]:
+    def _telling(self, tell: Callable[[ObservedEntity, Any], object]) -> Callable[..., Any]:
         def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
             @wraps(original)
             def create(node: Any, *args: Any, **kwargs: Any) -> Any:
@@ -162,36 +164,44 @@ class Nodes:
 
         return wrapping
 
-    def _publisher(self, node: Thing, publisher: Any) -> None:
+    def _publisher(self, node: ObservedEntity, publisher: Any) -> None:
         qos = qos_of(publisher.qos_profile.get_c_qos_profile())
         with publisher.handle:
             topic = publisher.handle.get_topic_name()
             gid = self._gid_of(publisher.handle)
-        thing = self._add(
+        entity = self._add(
             publisher, node, EntityKind.PUBLISHER, topic, publisher.msg_type, qos=qos.summary()
         )
-        thing.qos_yaml, thing.gid = qos.to_yaml(), gid
-        _with_types(thing, publisher.msg_type)
+        entity.qos_yaml, entity.gid = qos.to_yaml(), gid
+        _with_types(entity, publisher.msg_type)
 
-    def _subscription(self, node: Thing, subscription: Any) -> None:
+    def _subscription(self, node: ObservedEntity, subscription: Any) -> None:
         with subscription.handle:
             topic = subscription.handle.get_topic_name()
         qos = qos_of(subscription.qos_profile.get_c_qos_profile())
         kind = EntityKind.SUBSCRIPTION
-        thing = self._add(subscription, node, kind, topic, subscription.msg_type, qos=qos.summary())
-        _with_types(thing, subscription.msg_type)
+        entity = self._add(
+            subscription, node, kind, topic, subscription.msg_type, qos=qos.summary()
+        )
+        _with_types(entity, subscription.msg_type)
 
     def _add(
-        self, wrapper: Any, node: Thing, kind: EntityKind, name: str, type: Any, **detail: object
-    ) -> Thing:
+        self,
+        wrapper: Any,
+        node: ObservedEntity,
+        kind: EntityKind,
+        name: str,
+        type: Any,
+        **detail: object,
+    ) -> ObservedEntity:
         keys, callback = (wrapper, wrapper.handle), getattr(wrapper, "callback", None)
         if callback is not None:
             detail["callback"] = callback_name(callback)
         named = service_type(type).name if hasattr(type, "Request") else message_type(type).name
-        return self._things.add(keys, node, kind, name, named, runs=callback, **detail)
+        return self._entities.add(keys, node, kind, name, named, runs=callback, **detail)
 
-    def _timer(self, node: Thing, timer: Any) -> None:
-        self._things.add(
+    def _timer(self, node: ObservedEntity, timer: Any) -> None:
+        self._entities.add(
             (timer, timer.handle),
             node,
             EntityKind.TIMER,
@@ -200,21 +210,21 @@ class Nodes:
             period_ns=timer.timer_period_ns,
         )
 
-    def _guard_condition(self, node: Thing, guard: Any) -> None:
+    def _guard_condition(self, node: ObservedEntity, guard: Any) -> None:
         name, callback = callback_name(guard.callback), guard.callback
-        self._things.add((guard,), node, EntityKind.GUARD_CONDITION, name, runs=callback)
+        self._entities.add((guard,), node, EntityKind.GUARD_CONDITION, name, runs=callback)
 
-    def _client(self, node: Thing, client: Any) -> None:
+    def _client(self, node: ObservedEntity, client: Any) -> None:
         with client.handle:
             name = client.handle.service_name
-        thing = self._add(client, node, EntityKind.CLIENT, name, client.srv_type)
-        _with_types(thing, client.srv_type)
+        entity = self._add(client, node, EntityKind.CLIENT, name, client.srv_type)
+        _with_types(entity, client.srv_type)
 
-    def _service(self, node: Thing, service: Any) -> None:
+    def _service(self, node: ObservedEntity, service: Any) -> None:
         with service.handle:
             name = service.handle.name
-        thing = self._add(service, node, EntityKind.SERVICE, name, service.srv_type)
-        _with_types(thing, service.srv_type)
+        entity = self._add(service, node, EntityKind.SERVICE, name, service.srv_type)
+        _with_types(entity, service.srv_type)
 
     # -- actions: three services and two topics, each an entity ---------------------------------
 
@@ -230,13 +240,15 @@ class Nodes:
                 original(action, node, action_type, action_name, *args, **more)
                 name = node.resolve_topic_name(action_name)
                 handle = action._handle if is_server else action._client_handle
-                self._things.parts[handle] = self._parts(owner, name, action_type.Impl, is_server)
+                self._entities.parts[handle] = self._parts(owner, name, action_type.Impl, is_server)
 
             return construct
 
         return wrapping
 
-    def _parts(self, node: Thing, name: str, impl: Any, is_server: bool) -> dict[str, Thing]:
+    def _parts(
+        self, node: ObservedEntity, name: str, impl: Any, is_server: bool
+    ) -> dict[str, ObservedEntity]:
         services = {
             "send_goal": impl.SendGoalService,
             "cancel_goal": impl.CancelGoalService,
@@ -252,38 +264,38 @@ class Nodes:
                 kind = EntityKind.PUBLISHER if is_server else EntityKind.SUBSCRIPTION
                 type_name = message_type(type).name
             path = f"{name}/_action/{part}"
-            thing = self._things.add((), node, kind, path, type_name, action=name)
-            parts[part] = _with_types(thing, type)
+            entity = self._entities.add((), node, kind, path, type_name, action=name)
+            parts[part] = _with_types(entity, type)
         return parts
 
 
-def _with_types(thing: Thing, type: Any) -> Thing:
+def _with_types(entity: ObservedEntity, type: Any) -> ObservedEntity:
     """Say of what types are the messages that an entity sends and takes."""
-    if thing.kind is EntityKind.PUBLISHER:
-        thing.sends_type = type
-    elif thing.kind is EntityKind.SUBSCRIPTION:
-        thing.takes_type = type
-    elif thing.kind is EntityKind.SERVICE:
-        thing.sends_type, thing.takes_type = type.Response, type.Request
+    if entity.kind is EntityKind.PUBLISHER:
+        entity.sends_type = type
+    elif entity.kind is EntityKind.SUBSCRIPTION:
+        entity.takes_type = type
+    elif entity.kind is EntityKind.SERVICE:
+        entity.sends_type, entity.takes_type = type.Response, type.Request
     else:
-        thing.sends_type, thing.takes_type = type.Request, type.Response
-    if thing.sends_type is not None:
-        thing.sends = message_type(thing.sends_type)
-    if not _is_parameter_service(thing):  # hardly ever used
-        make_codecs(thing)
-    return thing
+        entity.sends_type, entity.takes_type = type.Request, type.Response
+    if entity.sends_type is not None:
+        entity.sends = message_type(entity.sends_type)
+    if not _is_parameter_service(entity):  # hardly ever used
+        make_codecs(entity)
+    return entity
 
 
-def make_codecs(thing: Thing) -> None:
+def make_codecs(entity: ObservedEntity) -> None:
     """Generate what reads and writes its messages now: the first callback would take longer."""
-    for type in (thing.sends_type, thing.takes_type):
+    for type in (entity.sends_type, entity.takes_type):
         if type is not None:
             _ = codec_for(type).serialize
 
 
-def _is_parameter_service(thing: Thing) -> bool:
-    name = thing.name.rpartition("/")[2]
-    return thing.kind is EntityKind.SERVICE and name in NODE_SERVICES
+def _is_parameter_service(entity: ObservedEntity) -> bool:
+    name = entity.name.rpartition("/")[2]
+    return entity.kind is EntityKind.SERVICE and name in NODE_SERVICES
 
 
 def with_arguments(entry: Entry, node_name: str, given: dict[str, Any]) -> dict[str, Any]:

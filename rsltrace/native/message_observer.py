@@ -16,9 +16,16 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
 from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.native.ledger import Ledger, Logged, Sent, Span, Taken, now_ns
+from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
+from rsltrace.native.span_recorder import (
+    CallbackSpan,
+    EmittedLog,
+    ReceivedInput,
+    SentMessage,
+    SpanRecorder,
+    now_ns,
+)
 from rsltrace.native.support import patched
-from rsltrace.native.things import Thing, Things
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import OutputKind
 
@@ -56,7 +63,7 @@ _ACTION_TAKES = {
 }
 
 
-Taker = Callable[[Any, Any, bool], tuple[Any, bytes]]
+MessageTaker = Callable[[Any, Any, bool], tuple[Any, bytes]]
 """Takes a message from a subscription's handle, as its ``take_message`` does; returns what that
 does, and the gid of the publisher."""
 
@@ -66,13 +73,15 @@ def channel_of(kind: int, name: str) -> str:
     return f"{kind} {name}"
 
 
-class Boundary:
-    """Tells a ledger of what is sent, and keeps what is taken for the callback that follows."""
+class MessageObserver:
+    """Tells a recorder of what is sent, and keeps what is taken for the callback that follows."""
 
-    def __init__(self, ledger: Ledger, things: Things, taker: Taker | None = None) -> None:
+    def __init__(
+        self, recorder: SpanRecorder, entities: ObservedEntities, taker: MessageTaker | None = None
+    ) -> None:
         """``taker`` takes messages in place of rclpy, and says whose they are."""
-        self._ledger = ledger
-        self._things = things
+        self._recorder = recorder
+        self._entities = entities
         self._taker = taker
         self._local = threading.local()
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
@@ -80,9 +89,9 @@ class Boundary:
         self.unreadable = 0
         """Messages that could not be written as bytes."""
 
-    def take(self) -> Taken | None:
+    def take(self) -> ReceivedInput | None:
         """Return what was taken in this thread since this was asked last."""
-        taken: Taken | None = getattr(self._local, "taken", None)
+        taken: ReceivedInput | None = getattr(self._local, "taken", None)
         self._local.taken = None
         return taken
 
@@ -120,21 +129,21 @@ class Boundary:
         @wraps(original)
         def publish(handle: Any, message: Any) -> None:
             begun_ns = now_ns()
-            thing = self._things.find(handle)
-            if thing is None:
+            entity = self._entities.find(handle)
+            if entity is None:
                 original(handle, message)
                 return
-            sequence = next(thing.sequence)
+            sequence = next(entity.sequence)
             with self._sending() as span:
                 before_ns = time.time_ns()
                 begun_ns -= now_ns()
                 try:
                     original(handle, message)
                 except BaseException:
-                    thing.sequence = count(sequence)  # the middleware has not counted it
+                    entity.sequence = count(sequence)  # the middleware has not counted it
                     raise
                 begun_ns += now_ns()
-                self._sent(span, _MESSAGE, thing, message, sequence, before_ns, begun_ns)
+                self._sent(span, _MESSAGE, entity, message, sequence, before_ns, begun_ns)
 
         return publish
 
@@ -143,8 +152,8 @@ class Boundary:
 
         @wraps(original)
         def trigger(machine: Any, transition: Any, publish_update: bool) -> None:
-            thing = self._things.find(machine)
-            if thing is None or not publish_update:
+            entity = self._entities.find(machine)
+            if entity is None or not publish_update:
                 original(machine, transition, publish_update)
                 return
             start = machine.current_state
@@ -152,26 +161,26 @@ class Boundary:
                 before_ns = time.time_ns()
                 original(machine, transition, publish_update)
                 message = transition_event(start, machine.current_state)
-                number = next(thing.sequence)
-                self._sent(span, _MESSAGE, thing, message, number, before_ns, now_ns())
+                number = next(entity.sequence)
+                self._sent(span, _MESSAGE, entity, message, number, before_ns, now_ns())
 
         return trigger
 
     @contextmanager
-    def _sending(self) -> Iterator[Span]:
+    def _sending(self) -> Iterator[CallbackSpan]:
         """Have an event under way that sends something within the block, and says so there."""
-        span = self._ledger.sending()
+        span = self._recorder.sending()
         try:
             yield span
         except BaseException:
-            self._ledger.sent(span, None)
+            self._recorder.sent(span, None)
             raise
 
     def _sent(
         self,
-        span: Span,
+        span: CallbackSpan,
         kind: int,
-        thing: Thing,
+        entity: ObservedEntity,
         message: Any,
         sequence: int,
         before_ns: int,
@@ -180,12 +189,12 @@ class Boundary:
         """Note that a message was sent. ``begun_ns`` is when the observer began, were it not for
         the time that sending took."""
         after_ns = time.time_ns()
-        data = self._bytes_of(thing.sends_type, message)
+        data = self._bytes_of(entity.sends_type, message)
         digest = hash64(data) if data else 0
-        sent = Sent(kind, thing, digest, data, sequence, after_ns, before_ns)
-        self._ledger.sent(span, sent, begun_ns)
-        if kind == _MESSAGE and (told := self.on_message.get(thing.name)) is not None:
-            told(data, thing.sends_type)
+        sent = SentMessage(kind, entity, digest, data, sequence, after_ns, before_ns)
+        self._recorder.sent(span, sent, begun_ns)
+        if kind == _MESSAGE and (told := self.on_message.get(entity.name)) is not None:
+            told(data, entity.sends_type)
 
     def _take_message(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
@@ -196,13 +205,13 @@ class Boundary:
             else:
                 found, gid = self._taker(handle, message_type, raw)
             begun_ns = now_ns()
-            thing = self._things.find(handle)
-            if found is not None and thing is not None:
+            entity = self._entities.find(handle)
+            if found is not None and entity is not None:
                 message, info = found
                 self._took(
-                    thing,
+                    entity,
                     message,
-                    channel_of(_MESSAGE, thing.name),
+                    channel_of(_MESSAGE, entity.name),
                     info.get("publication_sequence_number") or 0,
                     info.get("source_timestamp") or 0,
                     info.get("received_timestamp") or 0,
@@ -215,7 +224,7 @@ class Boundary:
 
     def _took(
         self,
-        thing: Thing,
+        entity: ObservedEntity,
         message: Any,
         channel: str,
         sequence: int,
@@ -224,13 +233,15 @@ class Boundary:
         begun_ns: int,
         gid: bytes = b"",
     ) -> None:
-        data = self._bytes_of(thing.takes_type, message)
+        data = self._bytes_of(entity.takes_type, message)
         digest = hash64(data) if data else 0
-        earlier: Taken | None = getattr(self._local, "taken", None)
+        earlier: ReceivedInput | None = getattr(self._local, "taken", None)
         if earlier is not None:  # an action may take several at once
             earlier.input_hash = hash64(digest.to_bytes(8, "little"), earlier.input_hash)
             return
-        taken = Taken(thing, digest, digest, channel, sequence, source_ns, ready_ns, gid=gid)
+        taken = ReceivedInput(
+            entity, digest, digest, channel, sequence, source_ns, ready_ns, gid=gid
+        )
         taken.observer_ns = now_ns() - begun_ns
         self._local.taken = taken
 
@@ -252,13 +263,13 @@ class Boundary:
     def _send_request(self, original: Callable[..., int]) -> Callable[..., int]:
         @wraps(original)
         def send_request(handle: Any, request: Any) -> int:
-            thing = self._things.find(handle)
-            if thing is None:
+            entity = self._entities.find(handle)
+            if entity is None:
                 return original(handle, request)
             with self._sending() as span:
                 before_ns = time.time_ns()
                 sequence = original(handle, request)
-                self._sent(span, _REQUEST, thing, request, sequence, before_ns, now_ns())
+                self._sent(span, _REQUEST, entity, request, sequence, before_ns, now_ns())
             return sequence
 
         return send_request
@@ -266,15 +277,15 @@ class Boundary:
     def _send_response(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
         def send_response(handle: Any, response: Any, request_id: Any) -> None:
-            thing = self._things.find(handle)
-            if thing is None:
+            entity = self._entities.find(handle)
+            if entity is None:
                 original(handle, response, request_id)
                 return
             with self._sending() as span:
                 before_ns = time.time_ns()
                 original(handle, response, request_id)
                 number = request_id.sequence_number
-                self._sent(span, _RESPONSE, thing, response, number, before_ns, now_ns())
+                self._sent(span, _RESPONSE, entity, response, number, before_ns, now_ns())
 
         return send_response
 
@@ -287,12 +298,12 @@ class Boundary:
                 found = original(handle, type)
                 begun_ns = now_ns()
                 message, header = found if kind == _REQUEST else reversed(found)
-                thing = self._things.find(handle)
-                if header is not None and thing is not None:
+                entity = self._entities.find(handle)
+                if header is not None and entity is not None:
                     self._took(
-                        thing,
+                        entity,
                         message,
-                        channel_of(kind, thing.name),
+                        channel_of(kind, entity.name),
                         header.request_id.sequence_number,
                         header.source_timestamp,
                         header.received_timestamp,
@@ -310,7 +321,7 @@ class Boundary:
         def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
             @wraps(original)
             def send(handle: Any, *words: Any) -> Any:
-                parts = self._things.parts.get(handle)
+                parts = self._entities.parts.get(handle)
                 if parts is None:
                     return original(handle, *words)
                 with self._sending() as span:
@@ -335,16 +346,16 @@ class Boundary:
             def take(handle: Any, type: Any) -> Any:
                 found = original(handle, type)
                 begun_ns = now_ns()
-                parts = self._things.parts.get(handle)
+                parts = self._entities.parts.get(handle)
                 header, message = found if isinstance(found, tuple) else (None, found)
                 if message is not None and parts is not None:
-                    thing = parts[part]
+                    entity = parts[part]
                     kind = _MESSAGE if header is None else _REQUEST
                     if isinstance(header, int):
                         kind = _RESPONSE
                     number = getattr(header, "sequence_number", header) or 0
-                    channel = channel_of(kind, thing.name)
-                    self._took(thing, message, channel, number, 0, 0, begun_ns)
+                    channel = channel_of(kind, entity.name)
+                    self._took(entity, message, channel, number, 0, 0, begun_ns)
                 return found
 
             return take
@@ -357,10 +368,10 @@ class Boundary:
         @wraps(original)
         def call_timer(handle: Any) -> Any:
             begun_ns = now_ns()
-            thing = self._things.find(handle)
-            if thing is not None:
+            entity = self._entities.find(handle)
+            if entity is not None:
                 due_ns = time.time_ns() + min(handle.time_until_next_call() or 0, 0)
-                taken = Taken(thing, ready_ns=due_ns)
+                taken = ReceivedInput(entity, ready_ns=due_ns)
                 taken.observer_ns = now_ns() - begun_ns
                 self._local.taken = taken
             return original(handle)
@@ -374,18 +385,18 @@ class Boundary:
         ) -> None:
             original(severity, name, message, function, file, line)
             begun_ns = now_ns()
-            thing = self._logger(name)
-            if thing is not None:
+            entity = self._logger(name)
+            if entity is not None:
                 text = str(message).encode(errors="backslashreplace").decode()
-                self._ledger.add(
-                    Logged(thing, int(severity), name, text, function, file, line), begun_ns
+                self._recorder.add(
+                    EmittedLog(entity, int(severity), name, text, function, file, line), begun_ns
                 )
 
         return log
 
-    def _logger(self, name: str) -> Thing | None:
+    def _logger(self, name: str) -> ObservedEntity | None:
         """Return the /rosout of the node whose logger, or child of a logger, has this name."""
-        rosout = self._things.rosout
+        rosout = self._entities.rosout
         while name and name not in rosout:
             name = name.rpartition(".")[0]
         return rosout.get(name)

@@ -14,9 +14,16 @@ from typing import Protocol
 import numpy as np
 
 from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.native.boundary import channel_of
-from rsltrace.native.ledger import Failed, Logged, Scheduled, Sent, Span, Taken
-from rsltrace.native.things import Thing
+from rsltrace.native.message_observer import channel_of
+from rsltrace.native.observed_entities import ObservedEntity
+from rsltrace.native.span_recorder import (
+    CallbackError,
+    CallbackSpan,
+    EmittedLog,
+    ReceivedInput,
+    SentMessage,
+    TaskCreation,
+)
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TIMING
@@ -42,7 +49,7 @@ _Key = tuple[str, int, int]
 _Place = tuple[int, int, int, int, bytes]
 
 
-class Causes:
+class CauseIndex:
     """Remembers what was sent, and finds it again."""
 
     def __init__(self, kept: int = KEPT) -> None:
@@ -52,10 +59,10 @@ class Causes:
         self.unknown = 0
         """Messages taken whose sender was not found: another process's, or too old."""
 
-    def sent(self, sent: Sent, event: int, output: int) -> None:
+    def sent(self, sent: SentMessage, event: int, output: int) -> None:
         """Remember which output of which event a message is."""
-        key = channel_of(sent.kind, sent.thing.name), sent.sequence, sent.digest
-        self._places[key].append((event, output, sent.before_ns, sent.after_ns, sent.thing.gid))
+        key = channel_of(sent.kind, sent.entity.name), sent.sequence, sent.digest
+        self._places[key].append((event, output, sent.before_ns, sent.after_ns, sent.entity.gid))
         self._order.append(key)
         if len(self._order) > self._kept:
             oldest = self._order.popleft()
@@ -63,7 +70,7 @@ class Causes:
             if not self._places[oldest]:
                 del self._places[oldest]
 
-    def of(self, taken: Taken) -> tuple[int, int]:
+    def of(self, taken: ReceivedInput) -> tuple[int, int]:
         """Return the event and output from which an input came; ``NO_EVENT`` if that is unknown."""
         if not taken.channel:
             return NO_EVENT, 0
@@ -91,7 +98,7 @@ _PREFIX = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPO
 
 
 @dataclass(frozen=True, slots=True)
-class Clocks:
+class ClockPair:
     """The system clock and the steady one at one moment, in nanoseconds.
 
     Stamps of a trace are system time as the steady clock carries it on: it never goes back.
@@ -101,7 +108,7 @@ class Clocks:
     steady_ns: int
 
     @classmethod
-    def now(cls) -> Clocks:
+    def now(cls) -> ClockPair:
         """Read both."""
         return cls(time.time_ns(), time.monotonic_ns())
 
@@ -110,24 +117,26 @@ class Clocks:
         return self.wall_ns + steady_ns - self.steady_ns
 
 
-class Spans(Protocol):
+class SpanSource(Protocol):
     """Where spans come from."""
 
-    def finished(self, patience_ns: int | None) -> list[Span]:
+    def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take those before which all is over, in order of their starts."""
 
 
-class Pen(threading.Thread):
-    """Takes spans from a ledger and writes them, until it is told to finish."""
+class SpanWriter(threading.Thread):
+    """Takes spans from a source and writes them, until it is told to finish."""
 
-    def __init__(self, ledger: Spans, recorder: Recorder, clocks: Clocks, base_dir: Path) -> None:
+    def __init__(
+        self, source: SpanSource, recorder: Recorder, clocks: ClockPair, base_dir: Path
+    ) -> None:
         super().__init__(name="rsltrace pen", daemon=True)
-        self._ledger = ledger
+        self._source = source
         self._recorder = recorder
         self._clocks = clocks
         self._base_dir = base_dir
         self._over = threading.Event()
-        self.causes = Causes()
+        self.causes = CauseIndex()
         self.error: BaseException | None = None
         """Why nothing is written any more."""
         self._observer_ns = array("Q")
@@ -166,28 +175,28 @@ class Pen(threading.Thread):
 
     def write(self, patience_ns: int | None) -> None:
         """Write the spans that are over."""
-        for span in self._ledger.finished(patience_ns):
+        for span in self._source.finished(patience_ns):
             self._write(span)
 
-    def _write(self, span: Span) -> None:
+    def _write(self, span: CallbackSpan) -> None:
         recorder = self._recorder
         span.index = index = recorder.index
         stamp_ns = self._clocks.stamp(span.start_ns)
         for position, output in enumerate(span.outputs):
-            if isinstance(output, Sent):
+            if isinstance(output, SentMessage):
                 self._sent(output, stamp_ns)
                 self.causes.sent(output, index, position)
             elif isinstance(output, Entity):
                 recorder.entity(replace(output, created_ns=stamp_ns))
-            elif isinstance(output, Logged):
+            elif isinstance(output, EmittedLog):
                 self._logged(output, stamp_ns)
-            elif isinstance(output, Failed):
-                entity = 0 if span.thing is None else span.thing.id
+            elif isinstance(output, CallbackError):
+                entity = 0 if span.entity is None else span.entity.id
                 digest = hash64(f"{output.kind}\0{output.said}".encode())
                 recorder.detail(OutputKind.EXCEPTION, entity, stamp_ns, output.traceback, digest)
             else:
-                assert isinstance(output, Scheduled)
-                recorder.output(OutputKind.TASK, 0 if span.thing is None else span.thing.id, 0)
+                assert isinstance(output, TaskCreation)
+                recorder.output(OutputKind.TASK, 0 if span.entity is None else span.entity.id, 0)
         cause_event, cause_output = NO_EVENT, 0
         taken = span.taken
         if taken is not None:
@@ -200,13 +209,13 @@ class Pen(threading.Thread):
             stamp_ns,
             span.kind,
             span.flags,
-            0 if span.thing is None else span.thing.id,
+            0 if span.entity is None else span.entity.id,
             cause_event,
             cause_output,
             0 if taken is None else taken.input_hash,
         )
 
-    def _timing(self, span: Span, index: int, stamp_ns: int) -> None:
+    def _timing(self, span: CallbackSpan, index: int, stamp_ns: int) -> None:
         taken = span.taken
         packed = TIMING.pack(
             index,
@@ -221,28 +230,28 @@ class Pen(threading.Thread):
         )
         self._recorder.writer.add_timing(packed, stamp_ns)
 
-    def _sent(self, sent: Sent, stamp_ns: int) -> None:
+    def _sent(self, sent: SentMessage, stamp_ns: int) -> None:
         prefix = _PREFIX.get(OutputKind(sent.kind), "")
-        channel = self._channel(sent.thing, prefix) if sent.data else -1
-        self._recorder.message(sent.kind, sent.thing.id, channel, stamp_ns, sent.data, sent.digest)
+        channel = self._channel(sent.entity, prefix) if sent.data else -1
+        self._recorder.message(sent.kind, sent.entity.id, channel, stamp_ns, sent.data, sent.digest)
 
-    def _channel(self, thing: Thing, prefix: str) -> int:
-        if thing.channel is None:
-            thing.channel = -1
-            topic, recorder = prefix + thing.name, self._recorder
-            if thing.sends is not None and recorder.keep_payload(topic):
-                text, type_hash = thing.sends.describe()
-                thing.channel = recorder.writer.add_channel(
+    def _channel(self, entity: ObservedEntity, prefix: str) -> int:
+        if entity.channel is None:
+            entity.channel = -1
+            topic, recorder = prefix + entity.name, self._recorder
+            if entity.sends is not None and recorder.keep_payload(topic):
+                text, type_hash = entity.sends.describe()
+                entity.channel = recorder.writer.add_channel(
                     topic,
-                    thing.sends.name,
+                    entity.sends.name,
                     text,
-                    qos_yaml=thing.qos_yaml,
+                    qos_yaml=entity.qos_yaml,
                     type_hash="" if prefix else type_hash,
                 )
-        return thing.channel
+        return entity.channel
 
-    def _logged(self, logged: Logged, stamp_ns: int) -> None:
-        record = logged.thing.sends_type(
+    def _logged(self, logged: EmittedLog, stamp_ns: int) -> None:
+        record = logged.entity.sends_type(
             level=logged.severity,
             name=logged.name,
             msg=logged.text,
@@ -251,10 +260,10 @@ class Pen(threading.Thread):
             line=logged.line,
         )
         record.stamp.sec, record.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
-        data = codec_for(logged.thing.sends_type).serialize(record)
-        channel = self._channel(logged.thing, "")
+        data = codec_for(logged.entity.sends_type).serialize(record)
+        channel = self._channel(logged.entity, "")
         self._recorder.message(
-            OutputKind.LOG, logged.thing.id, channel, stamp_ns, data, hash64(log_content(data))
+            OutputKind.LOG, logged.entity.id, channel, stamp_ns, data, hash64(log_content(data))
         )
 
     def _portable(self, file: str) -> str:

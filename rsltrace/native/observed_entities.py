@@ -18,7 +18,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 
 
 @dataclass(slots=True)
-class Thing:
+class ObservedEntity:
     """An entity under observation.
 
     ``sends`` and ``takes`` say of what types its messages are; ``sequence`` counts what it has
@@ -40,60 +40,60 @@ class Thing:
     """That of the trace, once something has been written to it."""
 
 
-class Things:
+class ObservedEntities:
     """Gives out ids, and finds what belongs to one of rclpy's handles or wrappers."""
 
     def __init__(self, tell: Callable[[Entity], object]) -> None:
         self._tell = tell
         self._ids = count(1)
         self._lock = threading.Lock()
-        self._of: WeakKeyDictionary[Any, Thing] = WeakKeyDictionary()
-        self._news: list[Thing] | None = None
-        self.parts: WeakKeyDictionary[Any, dict[str, Thing]] = WeakKeyDictionary()
+        self._of: WeakKeyDictionary[Any, ObservedEntity] = WeakKeyDictionary()
+        self._news: list[ObservedEntity] | None = None
+        self.parts: WeakKeyDictionary[Any, dict[str, ObservedEntity]] = WeakKeyDictionary()
         """The services and topics that an end of an action has, by name."""
-        self.rosout: dict[str, Thing] = {}
+        self.rosout: dict[str, ObservedEntity] = {}
         """The publishers of /rosout by the names of loggers."""
 
-    def news(self) -> list[Thing]:
+    def news(self) -> list[ObservedEntity]:
         """Return what was made since this was asked last; all from the first time on."""
         with self._lock:
             news, self._news = self._news or [], []
         return news
 
-    def find(self, handle: Any) -> Thing | None:
+    def find(self, handle: Any) -> ObservedEntity | None:
         """Return what belongs to a handle or wrapper; None if nobody has told of it."""
         return self._of.get(handle)
 
     def add(
         self,
         keys: tuple[Any, ...],
-        node: Thing | None,
+        node: ObservedEntity | None,
         kind: EntityKind,
         name: str,
         type_name: str = "",
         *,
         runs: object = None,
         **detail: object,
-    ) -> Thing:
+    ) -> ObservedEntity:
         """Make an entity that ``keys`` lead to, and tell the trace of it as an output.
 
         ``runs`` is the function that its events run.
         """
         number = next(self._ids)
         owner = number if kind is EntityKind.NODE else 0 if node is None else node.id
-        thing = Thing(number, owner, kind, name)
+        entity = ObservedEntity(number, owner, kind, name)
         for key in keys:
-            self._of[key] = thing
+            self._of[key] = entity
         with self._lock:
             if self._news is not None:
-                self._news.append(thing)
+                self._news.append(entity)
         if source := source_of(runs):
             detail["source"] = source
         self._tell(Entity(number, owner, kind, name, type_name, 0, detail))
-        return thing
+        return entity
 
-    def unnamed(self, wrapper: Any, kind: EntityKind) -> Thing:
-        """Return the thing of a wrapper that nobody has told of (an event handler, say)."""
+    def unnamed(self, wrapper: Any, kind: EntityKind) -> ObservedEntity:
+        """Return the entity of a wrapper that nobody has told of (an event handler, say)."""
         found = self._of.get(wrapper)
         if found is not None:
             return found

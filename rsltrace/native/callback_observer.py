@@ -16,11 +16,17 @@ from rclpy.executors import (
     TimeoutException,
 )
 
-from rsltrace.native.boundary import Boundary
-from rsltrace.native.ledger import Failed, Ledger, Scheduled, Span, Taken
+from rsltrace.native.message_observer import MessageObserver
+from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.priorities import Priorities
+from rsltrace.native.span_recorder import (
+    CallbackError,
+    CallbackSpan,
+    ReceivedInput,
+    SpanRecorder,
+    TaskCreation,
+)
 from rsltrace.native.support import patched
-from rsltrace.native.things import Thing, Things
 from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
@@ -112,21 +118,21 @@ _KINDS = {
 }
 
 
-class Executors:
-    """Tells a ledger of the callbacks that any executor of this process runs."""
+class CallbackObserver:
+    """Tells a recorder of the callbacks that any executor of this process runs."""
 
     def __init__(
         self,
-        ledger: Ledger,
-        things: Things,
-        boundary: Boundary,
+        recorder: SpanRecorder,
+        entities: ObservedEntities,
+        messages: MessageObserver,
         meet: Callable[[Any, Any], object],
     ) -> None:
         """``meet`` is told, before it is taken from, of a node and of what it has."""
         self._meet = meet
-        self._ledger = ledger
-        self._things = things
-        self._boundary = boundary
+        self._recorder = recorder
+        self._entities = entities
+        self._messages = messages
         self._own = threading.local()
 
     @contextmanager
@@ -153,18 +159,18 @@ class Executors:
 
     def _take(self, take: Callable[..., Any], entity: Any) -> Callable[[], Any] | None:
         """Let an executor take what is ready; return what it is to await, told of in between."""
-        self._boundary.take()
+        self._messages.take()
         call: Callable[[], Any] | None = take(entity)
-        taken = self._boundary.take()
+        taken = self._messages.take()
         if call is None:
             return None
-        thing = taken.thing if taken is not None else self._thing(entity)
-        if thing is None:
+        observed = taken.entity if taken is not None else self._observed_entity(entity)
+        if observed is None:
             return None  # nothing was there after all
-        kind = self._kind(entity, thing)
-        return partial(ObservedTask, self._ledger, kind, thing, call, taken)
+        kind = self._kind(entity, observed)
+        return partial(ObservedTask, self._recorder, kind, observed, call, taken)
 
-    def _thing(self, entity: Any) -> Thing | None:
+    def _observed_entity(self, entity: Any) -> ObservedEntity | None:
         from rclpy.client import Client
         from rclpy.event_handler import EventHandler
         from rclpy.service import Service
@@ -175,28 +181,32 @@ class Executors:
         kind = EntityKind.GUARD_CONDITION
         if isinstance(entity, EventHandler):
             kind = EntityKind.QOS_EVENT
-        return self._things.unnamed(entity, kind)
+        return self._entities.unnamed(entity, kind)
 
-    def _kind(self, entity: Any, thing: Thing) -> int:
+    def _kind(self, entity: Any, observed: ObservedEntity) -> int:
         from rclpy.action.client import ActionClient
         from rclpy.action.server import ActionServer
 
         if isinstance(entity, (ActionServer, ActionClient)):
             return int(EventKind.ACTION)
-        return int(_KINDS.get(thing.kind, EventKind.GUARD_CONDITION))
+        return int(_KINDS.get(observed.kind, EventKind.GUARD_CONDITION))
 
     def _create_task(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def create_task(executor: Any, callback: Any, *args: Any, **kwargs: Any) -> Any:
-            under_way = self._ledger.current()
+            under_way = self._recorder.current()
             if under_way is None or _is_own(callback):
                 return original(executor, callback, *args, **kwargs)
-            ledger, thing, cause = self._ledger, under_way.thing, self._ledger.add(Scheduled())
+            recorder, observed, cause = (
+                self._recorder,
+                under_way.entity,
+                self._recorder.add(TaskCreation()),
+            )
             if inspect.iscoroutine(callback) or inspect.iscoroutinefunction(callback):
                 call = partial(_awaited, callback, args, kwargs)
-                return original(executor, partial(_run_async, ledger, thing, call, cause))
+                return original(executor, partial(_run_async, recorder, observed, call, cause))
             call = partial(callback, *args, **kwargs)
-            return original(executor, partial(_run, ledger, thing, call, cause))
+            return original(executor, partial(_run, recorder, observed, call, cause))
 
         return create_task
 
@@ -223,10 +233,13 @@ async def _awaited(callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any])
 
 
 def _run(
-    ledger: Ledger, thing: Thing | None, call: Callable[[], Any], cause: tuple[Span, int]
+    recorder: SpanRecorder,
+    observed: ObservedEntity | None,
+    call: Callable[[], Any],
+    cause: tuple[CallbackSpan, int],
 ) -> Any:
     """Run a task that is a plain function."""
-    ledger.begin(int(EventKind.TASK), thing, None, cause)
+    recorder.begin(int(EventKind.TASK), observed, None, cause)
     failure = None
     try:
         return call()
@@ -234,53 +247,56 @@ def _run(
         failure = failure_of(error)
         raise
     finally:
-        ledger.end(failure)
+        recorder.end(failure)
 
 
 async def _run_async(
-    ledger: Ledger, thing: Thing | None, call: Callable[[], Any], cause: tuple[Span, int]
+    recorder: SpanRecorder,
+    observed: ObservedEntity | None,
+    call: Callable[[], Any],
+    cause: tuple[CallbackSpan, int],
 ) -> Any:
-    return await ObservedTask(ledger, int(EventKind.TASK), thing, call, None, cause)
+    return await ObservedTask(recorder, int(EventKind.TASK), observed, call, None, cause)
 
 
 class ObservedTask:
-    """Awaits ``call()``, and tells a ledger when it runs and when it waits."""
+    """Awaits ``call()``, and tells a recorder when it runs and when it waits."""
 
     def __init__(
         self,
-        ledger: Ledger,
+        recorder: SpanRecorder,
         kind: int,
-        thing: Thing | None,
+        observed: ObservedEntity | None,
         call: Callable[[], Any],
-        taken: Taken | None,
-        cause: tuple[Span, int] | None = None,
+        taken: ReceivedInput | None,
+        cause: tuple[CallbackSpan, int] | None = None,
     ) -> None:
-        self._ledger = ledger
-        self._begin = partial(ledger.begin, kind, thing, taken, cause)
+        self._recorder = recorder
+        self._begin = partial(recorder.begin, kind, observed, taken, cause)
         self._call = call
 
     def __await__(self) -> Generator[Any, Any, Any]:
-        ledger = self._ledger
+        recorder = self._recorder
         steps = self._call().__await__()
         callback = self._begin()
         while True:
             try:
                 step = next(steps)
             except StopIteration as end:
-                ledger.end()
+                recorder.end()
                 return end.value
             except BaseException as error:
-                ledger.end(failure_of(error))
+                recorder.end(failure_of(error))
                 raise
-            ledger.suspend()
+            recorder.suspend()
             try:
                 yield step
             except BaseException:
                 steps.close()
                 raise
-            ledger.resume(callback)
+            recorder.resume(callback)
 
 
-def failure_of(error: BaseException) -> Failed:
+def failure_of(error: BaseException) -> CallbackError:
     """Return what a trace keeps of an exception."""
-    return Failed(type(error).__qualname__, text_of(error), user_traceback(error))
+    return CallbackError(type(error).__qualname__, text_of(error), user_traceback(error))

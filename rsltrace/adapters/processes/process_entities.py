@@ -9,14 +9,14 @@ from dataclasses import astuple
 from typing import Any, Protocol
 
 from rsltrace.adapters.processes.endpoints import (
-    Host,
+    HostProcess,
     ProcessClient,
     ProcessService,
     ProcessSubscription,
     ProcessTimer,
     RosoutPublisher,
 )
-from rsltrace.adapters.processes.wire import Fields, Ready, Say, packed_item
+from rsltrace.adapters.processes.wire import RecordKind, RecordReader, WakeReason, packed_item
 from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import DomainEntity, Runnable
@@ -33,7 +33,7 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind
 _RESUME = int(EventKind.RESUME)
 
 
-class Waiting(Protocol):
+class GraphWaiter(Protocol):
     """A process, as what wakes it sees it."""
 
     name: str
@@ -54,7 +54,7 @@ class Waiting(Protocol):
 class WakingTimer:
     """Wakes a thread of a process when the time is over for which it sleeps or waits."""
 
-    def __init__(self, process: Waiting, thread: int) -> None:
+    def __init__(self, process: GraphWaiter, thread: int) -> None:
         self._process = process
         self._thread = thread
         dispatcher = process.dispatcher
@@ -101,7 +101,7 @@ class WakingTimer:
 class GraphChange:
     """Wakes a process that waits for the graph to change; what changes before it waits, counts."""
 
-    def __init__(self, process: Waiting) -> None:
+    def __init__(self, process: GraphWaiter) -> None:
         self._process = process
         self._is_due = False
         self._is_queued = False
@@ -147,7 +147,7 @@ class ProcessQosEvent(QosEvent):
     """A status that a process wants to hear of. ``number`` is what the process calls it."""
 
     def __init__(
-        self, process: Host, number: int, end: Publisher | ProcessSubscription, status: str
+        self, process: HostProcess, number: int, end: Publisher | ProcessSubscription, status: str
     ) -> None:
         super().__init__(process.dispatcher, end.node)
         self.dispatcher.entities.pending.remove(self)  # it may fire at once, and is told of then
@@ -172,7 +172,7 @@ class ProcessQosEvent(QosEvent):
                 self.node,
                 _QOS_EVENT,
                 self.process.go_on_with,
-                (self.number, Ready.ENTITY, self.take()),
+                (self.number, WakeReason.ENTITY, self.take()),
                 *self.cause,
                 0,
             )
@@ -196,7 +196,7 @@ class ProcessQosEvent(QosEvent):
 _TIMER = struct.Struct("<IIq")
 
 
-class Interfaces(Door, Protocol):
+class EntityFactory(Door, Protocol):
     """Where a process finds its peers, and types by their names."""
 
     domain: Domain
@@ -204,29 +204,29 @@ class Interfaces(Door, Protocol):
     service_type: Callable[[str], ServiceType]
 
 
-class Things(dict[int, Any]):
+class ProcessEntities(dict[int, Any]):
     """What a process has made and not given up; ``records`` are those by which it says so."""
 
-    def __init__(self, door: Interfaces, process: Host) -> None:
+    def __init__(self, door: EntityFactory, process: HostProcess) -> None:
         super().__init__()
         self._door = door
         self._process = process
         self._nodes: list[Participant] = []
         self._timers_named = 0
         self._made_in = -1
-        self.records: dict[int, Callable[[Fields], None]] = {
-            Say.NODE: self._node,
-            Say.PUBLISHER: self._publisher,
-            Say.SUBSCRIPTION: self._subscription,
-            Say.SERVICE: self._service,
-            Say.CLIENT: self._client,
-            Say.TIMER: self._timer,
-            Say.QOS_EVENT: self._qos_event,
-            Say.TIMER_OF: self._timer_of,
-            Say.CALLBACK: self._callback,
+        self.records: dict[int, Callable[[RecordReader], None]] = {
+            RecordKind.NODE: self._node,
+            RecordKind.PUBLISHER: self._publisher,
+            RecordKind.SUBSCRIPTION: self._subscription,
+            RecordKind.SERVICE: self._service,
+            RecordKind.CLIENT: self._client,
+            RecordKind.TIMER: self._timer,
+            RecordKind.QOS_EVENT: self._qos_event,
+            RecordKind.TIMER_OF: self._timer_of,
+            RecordKind.CALLBACK: self._callback,
         }
 
-    def _node(self, fields: Fields) -> None:
+    def _node(self, fields: RecordReader) -> None:
         number, name, namespace = fields.number(), fields.text(), fields.text()
         domain = self._door.domain
         taken = {other.number for other in domain.graph.nodes_named(full_name(namespace, name))}
@@ -237,7 +237,7 @@ class Things(dict[int, Any]):
         self._nodes.append(node)
         self._made_in = domain.dispatcher.loop.events
 
-    def _publisher(self, fields: Fields) -> None:
+    def _publisher(self, fields: RecordReader) -> None:
         number, node = fields.number(), self[fields.number()]
         topic, type_name, qos = fields.text(), fields.text(), fields.qos()
         kind = RosoutPublisher if topic == TOPIC_ROSOUT else Publisher
@@ -247,7 +247,7 @@ class Things(dict[int, Any]):
         )
         domain.graph.add_publisher(end)
 
-    def _subscription(self, fields: Fields) -> None:
+    def _subscription(self, fields: RecordReader) -> None:
         number, node = fields.number(), self[fields.number()]
         topic, type_name, qos = fields.text(), fields.text(), fields.qos()
         graph = self._door.domain.graph
@@ -257,7 +257,7 @@ class Things(dict[int, Any]):
         self[number] = end
         graph.add_subscription(end)
 
-    def _service(self, fields: Fields) -> None:
+    def _service(self, fields: RecordReader) -> None:
         domain = self._door.domain
         number, node = fields.number(), self[fields.number()]
         name, type, qos = fields.text(), self._door.service_type(fields.text()), fields.qos()
@@ -265,7 +265,7 @@ class Things(dict[int, Any]):
         self[number] = end
         domain.graph.add_service(end)
 
-    def _client(self, fields: Fields) -> None:
+    def _client(self, fields: RecordReader) -> None:
         domain = self._door.domain
         number, node = fields.number(), self[fields.number()]
         name, type, qos = fields.text(), self._door.service_type(fields.text()), fields.qos()
@@ -273,7 +273,7 @@ class Things(dict[int, Any]):
         self[number] = end
         domain.graph.add_client(end)
 
-    def _timer(self, fields: Fields) -> None:
+    def _timer(self, fields: RecordReader) -> None:
         number, may_be_an_executors, period_ns = fields.unpack(_TIMER)
         timer = ProcessTimer(self._process.dispatcher, self._process, number, period_ns)
         timer.cancel()  # until the process says when it is due
@@ -281,7 +281,7 @@ class Things(dict[int, Any]):
         if not may_be_an_executors:
             self.own(timer)
 
-    def _qos_event(self, fields: Fields) -> None:
+    def _qos_event(self, fields: RecordReader) -> None:
         number, end = fields.number(), self[fields.number()]
         self[number] = ProcessQosEvent(self._process, number, end, fields.text())
 
@@ -302,7 +302,7 @@ class Things(dict[int, Any]):
         if event.entity == timer.entity_id:
             event.node = timer.node
 
-    def _timer_of(self, fields: Fields) -> None:
+    def _timer_of(self, fields: RecordReader) -> None:
         """Take note of whose a timer is, which rclcpp says."""
         timer, node = self[fields.number()], self[fields.number()]
         if timer.node is not node:
@@ -310,7 +310,7 @@ class Things(dict[int, Any]):
                 timer.node.timers.remove(timer)
             self._give(timer, node)
 
-    def _callback(self, fields: Fields) -> None:
+    def _callback(self, fields: RecordReader) -> None:
         """Take note of the name of a callback, which rclcpp says."""
         self[fields.number()].named_callback(fields.text())
 

@@ -24,10 +24,10 @@ from rsltrace.adapters.launch.api import (
     nodes,
     parameters,
     settings,
-    sources,
     substitutions,
 )
 from rsltrace.adapters.launch.api import actions as conditions
+from rsltrace.adapters.launch.api import description_sources as sources
 from rsltrace.errors import JobError
 
 _ROOTS = ("launch", "launch_ros", "launch_xml", "launch_yaml", "nav2_common")
@@ -115,7 +115,7 @@ _MODULES: dict[str, dict[str, Any]] = {
 }
 
 
-class _Module(ModuleType):
+class _LaunchModule(ModuleType):
     """A module of ROS's launch, with what there is of it here."""
 
     def __getattr__(self, name: str) -> Any:
@@ -144,7 +144,7 @@ def _submodules(modules: Mapping[str, dict[str, Any]]) -> Iterator[tuple[str, di
                 yield f"{module}.{'_'.join(_WORD.split(name)).lower()}", {name: value}
 
 
-class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+class _LaunchModuleFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
     """Finds the modules of ``roots``."""
 
     def __init__(self, roots: Sequence[str]) -> None:
@@ -167,7 +167,7 @@ class _Finder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
         """Return the module."""
-        return _Module(spec.name, "A stand-in of rsltrace for a module of ROS's launch.")
+        return _LaunchModule(spec.name, "A stand-in of rsltrace for a module of ROS's launch.")
 
     def exec_module(self, module: ModuleType) -> None:
         """Fill the module; those below it come with it, as in ROS."""
@@ -185,7 +185,7 @@ def own_launch() -> Iterator[None]:
     A ``launch`` that is installed without ``launch_ros`` is not ROS's.
     """
     roots = [name for name in _ROOTS if name != "nav2_common" or find_spec(name) is None]
-    finder = _Finder(roots)
+    finder = _LaunchModuleFinder(roots)
     sys.meta_path.insert(0, finder)
     try:
         yield

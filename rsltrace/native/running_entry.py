@@ -9,10 +9,10 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.entry import Entry
 from rsltrace.errors import JobError
-from rsltrace.native.executors import failure_of
-from rsltrace.native.ledger import Ledger
-from rsltrace.native.nodes import Nodes
-from rsltrace.native.things import Things
+from rsltrace.native.callback_observer import failure_of
+from rsltrace.native.node_observer import NodeObserver
+from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.span_recorder import SpanRecorder
 from rsltrace.trace.model.event import EventKind
 
 
@@ -25,8 +25,8 @@ class RunningEntry(threading.Thread):
     def __init__(
         self,
         entry: Entry,
-        ledger: Ledger,
-        nodes: Nodes,
+        recorder: SpanRecorder,
+        nodes: NodeObserver,
         make_executor: Callable[[], Any],
         start: threading.Event,
         on_end: Callable[[RunningEntry, BaseException | None], None],
@@ -36,7 +36,7 @@ class RunningEntry(threading.Thread):
         self.nodes: list[Any] = []
         self.constructed = threading.Event()
         self.stopping = False
-        self._ledger = ledger
+        self._recorder = recorder
         self._nodes = nodes
         self._make_executor = make_executor
         self._begin = start
@@ -76,8 +76,8 @@ class RunningEntry(threading.Thread):
         return f"{'a callback of' if self.nodes else 'constructing'} {self.entry.name}"
 
     def _construct(self) -> None:
-        ledger = self._ledger
-        ledger.begin(int(EventKind.CONSTRUCT), None)
+        recorder = self._recorder
+        recorder.begin(int(EventKind.CONSTRUCT), None)
         failure = None
         try:
             with self._nodes.constructing(self.entry):
@@ -88,7 +88,7 @@ class RunningEntry(threading.Thread):
             failure = failure_of(error)
             raise
         finally:
-            ledger.end(failure)
+            recorder.end(failure)
         self.constructed.set()
 
     def _check(self) -> None:
@@ -118,17 +118,17 @@ class RunningEntry(threading.Thread):
                 self.nodes[0].get_logger().error(f"{type(error).__qualname__}: {error}")
 
 
-def destroy(nodes: list[Any], ledger: Ledger, things: Things) -> None:
+def destroy(nodes: list[Any], recorder: SpanRecorder, entities: ObservedEntities) -> None:
     """Destroy nodes in the order of their construction, each as one event."""
     for node in nodes:
-        ledger.begin(int(EventKind.SHUTDOWN), things.find(node))
+        recorder.begin(int(EventKind.SHUTDOWN), entities.find(node))
         failure = None
         try:
             node.destroy_node()
         except Exception as error:
             failure = failure_of(error)
         finally:
-            ledger.end(failure)
+            recorder.end(failure)
 
 
 def _nothing() -> None:

@@ -12,7 +12,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 
-from rsltrace.native.things import Thing
+from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventFlag, EventKind
 
@@ -22,12 +22,12 @@ _RAISED = int(EventFlag.RAISED)
 
 
 @dataclass(slots=True)
-class Sent:
+class SentMessage:
     """A message, request or response that was sent. ``sequence`` is counted by its sender; it left
     between two times of the system clock. ``data`` is canonical CDR."""
 
     kind: int
-    thing: Thing
+    entity: ObservedEntity
     digest: int
     data: bytes
     sequence: int
@@ -36,10 +36,10 @@ class Sent:
 
 
 @dataclass(slots=True)
-class Logged:
+class EmittedLog:
     """A log record, and the publisher of /rosout that it went to."""
 
-    thing: Thing
+    entity: ObservedEntity
     severity: int
     name: str
     text: str
@@ -49,7 +49,7 @@ class Logged:
 
 
 @dataclass(slots=True)
-class Failed:
+class CallbackError:
     """An exception that came out of a callback."""
 
     kind: str
@@ -58,22 +58,22 @@ class Failed:
 
 
 @dataclass(slots=True)
-class Scheduled:
+class TaskCreation:
     """A task that was made."""
 
 
-Output = Sent | Logged | Failed | Scheduled | Entity
+Output = SentMessage | EmittedLog | CallbackError | TaskCreation | Entity
 
 
 @dataclass(slots=True)
-class Taken:
+class ReceivedInput:
     """What a callback got. ``source_ns`` and ``ready_ns`` are system clock; 0 where unknown.
 
     Of several messages that an action takes at once all but ``input_hash`` is of the first.
     ``gid`` is the publisher's, empty where the middleware was not asked.
     """
 
-    thing: Thing
+    entity: ObservedEntity
     digest: int = 0
     input_hash: int = 0
     channel: str = ""
@@ -85,19 +85,19 @@ class Taken:
 
 
 @dataclass(slots=True)
-class Span:
+class CallbackSpan:
     """A callback, or a part of it up to where something else ran. ``start_ns`` and ``end_ns`` are
     of the steady clock, ``wall_ns`` of the system clock; ``cause`` is a span and which of its
     outputs."""
 
     kind: int
-    thing: Thing | None
+    entity: ObservedEntity | None
     start_ns: int
     wall_ns: int
     thread: int
-    owner: Callback | None
-    taken: Taken | None = None
-    cause: tuple[Span, int] | None = None
+    owner: RunningCallback | None
+    taken: ReceivedInput | None = None
+    cause: tuple[CallbackSpan, int] | None = None
     flags: int = 0
     end_ns: int = 0
     observer_ns: int = 0
@@ -109,19 +109,19 @@ class Span:
 
 
 @dataclass(slots=True)
-class Callback:
+class RunningCallback:
     """A callback under way. ``span`` is None while another one runs in its thread."""
 
-    thing: Thing | None
-    span: Span | None = None
+    entity: ObservedEntity | None
+    span: CallbackSpan | None = None
 
 
-class Ledger:
+class SpanRecorder:
     """Takes what happens, from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._spans: deque[Span] = deque()
+        self._spans: deque[CallbackSpan] = deque()
         self._local = threading.local()
         self._threads = 0
         self.count = 0
@@ -132,18 +132,18 @@ class Ledger:
     def begin(
         self,
         kind: int,
-        thing: Thing | None,
-        taken: Taken | None = None,
-        cause: tuple[Span, int] | None = None,
-    ) -> Callback:
+        entity: ObservedEntity | None,
+        taken: ReceivedInput | None = None,
+        cause: tuple[CallbackSpan, int] | None = None,
+    ) -> RunningCallback:
         """Note that a callback begins in this thread; what ran there is suspended."""
         stack = self._stack()
         if stack:
             self._suspend(stack[-1])
-        callback = Callback(thing)
+        callback = RunningCallback(entity)
         stack.append(callback)
         with self._lock:
-            callback.span = self._open(kind, thing, callback)
+            callback.span = self._open(kind, entity, callback)
             callback.span.taken, callback.span.cause = taken, cause
             if taken is not None:
                 callback.span.observer_ns = taken.observer_ns
@@ -154,7 +154,7 @@ class Ledger:
         callback = self._stack().pop()
         self._suspend(callback)
 
-    def resume(self, callback: Callback) -> None:
+    def resume(self, callback: RunningCallback) -> None:
         """Note that a callback goes on that awaited something.
 
         It is an event once something comes of it: rclpy asks callbacks that wait again and again.
@@ -164,7 +164,7 @@ class Ledger:
             self._suspend(stack[-1])
         stack.append(callback)
 
-    def end(self, failure: Failed | None = None) -> None:
+    def end(self, failure: CallbackError | None = None) -> None:
         """Note that the callback that runs in this thread is over."""
         if failure is not None:
             self.add(failure)
@@ -175,7 +175,7 @@ class Ledger:
                 self._close(callback.span)
                 callback.span = None
 
-    def add(self, output: Output, begun_ns: int = 0) -> tuple[Span, int]:
+    def add(self, output: Output, begun_ns: int = 0) -> tuple[CallbackSpan, int]:
         """Add an output of what runs in this thread; return where it is.
 
         Outside of all callbacks (a thread of the user's) it is an event of its own. ``begun_ns`` is
@@ -191,7 +191,7 @@ class Ledger:
                 span.observer_ns += now_ns() - begun_ns
             return span, len(span.outputs) - 1
 
-    def sending(self) -> Span:
+    def sending(self) -> CallbackSpan:
         """Return the event that is about to send something, which has begun then: whoever gets it
         at once, in another process, begins later. ``sent`` has to follow."""
         stack = self._stack()
@@ -200,7 +200,7 @@ class Ledger:
             span.sending += 1
             return span
 
-    def sent(self, span: Span, output: Sent | None, begun_ns: int = 0) -> None:
+    def sent(self, span: CallbackSpan, output: SentMessage | None, begun_ns: int = 0) -> None:
         """Add what an event has sent, None if sending it has failed."""
         with self._lock:
             span.sending -= 1
@@ -212,12 +212,12 @@ class Ledger:
             if span.owner is None:
                 self._close(span)
 
-    def current(self) -> Callback | None:
+    def current(self) -> RunningCallback | None:
         """Return the callback that runs in this thread."""
         stack = self._stack()
         return stack[-1] if stack else None
 
-    def finished(self, patience_ns: int | None) -> list[Span]:
+    def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take the spans before which all is over, in order.
 
         One that goes on for longer than ``patience_ns`` is cut in two: it must not keep all others
@@ -225,7 +225,7 @@ class Ledger:
         """
         return self.finished_until(patience_ns)[0]
 
-    def finished_until(self, patience_ns: int | None) -> tuple[list[Span], int]:
+    def finished_until(self, patience_ns: int | None) -> tuple[list[CallbackSpan], int]:
         """Return ``finished``, and the steady time before which no other span begins."""
         with self._lock:
             spans, taken = self._spans, []
@@ -243,9 +243,9 @@ class Ledger:
                 taken.append(spans.popleft())
             return taken, spans[0].start_ns if spans else now_ns()
 
-    def _stack(self) -> list[Callback]:
+    def _stack(self) -> list[RunningCallback]:
         try:
-            stack: list[Callback] = self._local.stack
+            stack: list[RunningCallback] = self._local.stack
         except AttributeError:
             stack = self._local.stack = []
             with self._lock:
@@ -253,33 +253,35 @@ class Ledger:
                 self._local.thread = self._threads
         return stack
 
-    def pause(self, thing: Thing) -> None:
+    def pause(self, entity: ObservedEntity) -> None:
         """Note that a main waits: what comes of it afterwards is another event."""
         stack = self._stack()
-        if stack and stack[-1].thing is thing:
+        if stack and stack[-1].entity is entity:
             self._suspend(stack[-1])
 
-    def _under_way(self, stack: list[Callback]) -> Span:
+    def _under_way(self, stack: list[RunningCallback]) -> CallbackSpan:
         """Return what runs in this thread, which begins now if nothing has come of it so far."""
         if not stack:
             return self._open(int(EventKind.OUTSIDE), None, None)
         callback = stack[-1]
         if callback.span is None:
-            callback.span = self._open(int(EventKind.RESUME), callback.thing, callback)
+            callback.span = self._open(int(EventKind.RESUME), callback.entity, callback)
         return callback.span
 
-    def _suspend(self, callback: Callback) -> None:
+    def _suspend(self, callback: RunningCallback) -> None:
         with self._lock:
             if callback.span is not None:
                 callback.span.flags |= _SUSPENDED
                 self._close(callback.span)
                 callback.span = None
 
-    def _open(self, kind: int, thing: Thing | None, owner: Callback | None) -> Span:
-        span = Span(kind, thing, now_ns(), time.time_ns(), self._local.thread, owner)
+    def _open(
+        self, kind: int, entity: ObservedEntity | None, owner: RunningCallback | None
+    ) -> CallbackSpan:
+        span = CallbackSpan(kind, entity, now_ns(), time.time_ns(), self._local.thread, owner)
         self._spans.append(span)
         return span
 
-    def _close(self, span: Span) -> None:
+    def _close(self, span: CallbackSpan) -> None:
         span.end_ns = now_ns()
         self.count += 1

@@ -7,25 +7,25 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from rsltrace.adapters.rclpy.entry import StartRule
-from rsltrace.native.ledger import Sent, Span, now_ns
+from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 
 if TYPE_CHECKING:
     from rsltrace.native.apart.children import Child
 
-Fact = tuple[str, str]
+StartFact = tuple[str, str]
 """What has come true: ``topic``, ``service``, ``node``, ``started`` or ``ended``, and its name."""
 
 _MADE = {EntityKind.NODE: "node", EntityKind.SERVICE: "service"}
 
 
-class Starts:
+class StartQueue:
     """Takes facts from threads, and says which entries begin."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._facts: set[Fact] = set()
+        self._facts: set[StartFact] = set()
         self._waiting: list[tuple[Child, StartRule, int]] = []
         self._since_ns: dict[int, int] = {}
 
@@ -43,13 +43,13 @@ class Starts:
         with self._lock:
             self._facts.add((what, name))
 
-    def look_at(self, spans: Iterable[Span]) -> None:
+    def look_at(self, spans: Iterable[CallbackSpan]) -> None:
         """Find in what was observed what has come true."""
-        found: set[Fact] = set()
+        found: set[StartFact] = set()
         for span in spans:
             for output in span.outputs:
-                if isinstance(output, Sent) and output.kind == OutputKind.MESSAGE:
-                    found.add(("topic", output.thing.name))
+                if isinstance(output, SentMessage) and output.kind == OutputKind.MESSAGE:
+                    found.add(("topic", output.entity.name))
                 elif isinstance(output, Entity) and output.kind in _MADE:
                     found.add((_MADE[output.kind], output.name))
         with self._lock:
