@@ -1,4 +1,4 @@
-"""``rsltrace init``: a first job, written from what there is: bags, nodes, or nothing."""
+"""``rsltrace init``: write a first job file from bags and nodes."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
-# A job of rsltrace; with the schema beside it editors complete and check it.
-# `rsltrace check {name}` shows what it means, `rsltrace record {name}` runs it.
+# A job of rsltrace. Editors use the schema beside it to complete and check it.
+# `rsltrace check {name}` checks it, `rsltrace record {name}` runs it.
 # Every key is explained in docs/jobs.md.
 """
 _SCHEMA = "job.schema.json"
 _PLACES = (".", "src", "scripts", "..")
 _TOPICS_MAX = 3
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
-"""Recorded with everything else, and hardly ever meant: the nodes of the run have their own."""
+"""Topics of every node. The nodes of a run publish their own, so a bag should not play them."""
 
 
 @click.command()
@@ -40,14 +40,14 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
     "sources",
     multiple=True,
     metavar="BAG|MODULE:CLASS|FILE.py:CLASS",
-    help="A bag to play, or a node to run; may be given several times.",
+    help="A bag to play, or a node to run. Repeatable.",
 )
 def init(job: Path, sources: tuple[str, ...]) -> None:
-    """Write a commented first job to JOB (job.yaml), from bags and nodes.
+    """Write a first job file with comments to JOB (default job.yaml), from bags and nodes.
 
-    Of a bag it lists the topics, their types and how long it is, of a node its name and the
-    parameters that its source declares. Nothing is imported or run. A file that exists is left
-    alone. The job's schema goes beside it, for editors (job.schema.json).
+    The file lists the topics, types and duration of each bag, and the name and declared parameters
+    of each node. Nothing is imported or run, and an existing file is never replaced. The JSON
+    Schema for editors is written beside it (job.schema.json).
     """
     if ":" in job.name and job.suffix not in (".yaml", ".yml"):
         raise click.UsageError(
@@ -78,7 +78,7 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     from rsltrace.job import load_job
 
     if sources:
-        load_job(job)  # what was written must be a job
+        load_job(job)
     if path:
         why = "the nodes are there" if nodes else "there is Python code"
         tell(f"search_path: [{', '.join(path)}], relative to {job}: {why}")

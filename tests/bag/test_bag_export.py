@@ -192,7 +192,7 @@ def test_the_commands(trace: Path, tmp_path: Path) -> None:
     assert (refused.returncode, (tmp_path / "u.mcap").exists()) == (2, False)
     assert "cannot write the bag bag: it exists" in refused.stderr
     assert call("record", "job.yaml", "-o", "t.mcap", "--bag", "bag", "--force").returncode == 0
-    assert call("export", "t.mcap", "--bag", "other", "--topics", "/chatter").returncode == 0
+    assert call("export", "t.mcap", "--bag", "other", "--topic", "/chatter").returncode == 0
     whole = (tmp_path / "t.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) - 300])
     cut = call("export", "cut.mcap", "--bag", "part")

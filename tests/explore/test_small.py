@@ -212,7 +212,7 @@ def test_the_command_searches_faults_and_makes_what_it_finds_small(
 ) -> None:
     folder = tmp_path / "found"
     words = ["explore", robot / "job.yaml", "--strategy", "faults", "--jobs", 1, "-o", folder]
-    done = command(*words, "--budget", 30, "--stop-at-first", "--small")
+    done = command(*words, "--budget", 30, "--stop-at-first", "--minimize")
     assert done.returncode == 1, done.stderr
     readme = Path(done.stdout.partition("made small: two is last: ")[2].splitlines()[0])
     assert readme.is_file()

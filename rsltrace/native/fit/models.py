@@ -150,7 +150,7 @@ def _nearest_family(ordered: Durations) -> Model:
     """Return the family of the least BIC, fitted by maximum likelihood."""
     if importlib.util.find_spec("scipy") is None:
         raise SetupError(
-            "fitting families of distributions needs SciPy: pip install 'rsltrace[fit]'"
+            "--as distributions needs SciPy: pip install 'rsltrace[fit]'"
         )
     from scipy import stats
 
