@@ -127,7 +127,7 @@ def check(
 def _check_trace(path: Path, other: Path | None, form: str) -> int:
     """Evaluate checks on a trace without running code that its own job names."""
     from rsltrace.checks.evaluate import job_of_checks
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import load_job
     from rsltrace.trace.reader import Trace
 
@@ -141,7 +141,7 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
         none = f"{named} has neither checks (checks:) nor metrics"
         tell(f"rsltrace: error: {none}; use --job to name another job")
         return EXIT_USAGE
-    checked = Checked(job, path, functions=other is not None)
+    checked = CheckReport(job, path, functions=other is not None)
     if form == "json":
         say(json.dumps(checked.values(), indent=2))
     else:

@@ -25,7 +25,13 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import waits_of
 from rsltrace.trace.model.operation import is_built_in
-from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import (
+    NS_PER_S,
+    format_duration,
+    format_milliseconds,
+    format_seconds,
+    printable,
+)
 from rsltrace.trace.native import Spread, busy_threads, callback_figures, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
@@ -113,11 +119,9 @@ def native_json(trace: Trace) -> dict[str, Any]:
 def _text(found: Spread | None) -> str:
     if found is None:
         return "-"
-    return " ".join(_ms(value) for value in (found.median_ns, found.p95_ns, found.max_ns))
-
-
-def _ms(duration_ns: int) -> str:
-    return f"{duration_ns / 1e6:.3g}" if abs(duration_ns) < 10**9 else f"{duration_ns / 1e6:.0f}"
+    return " ".join(
+        format_milliseconds(value) for value in (found.median_ns, found.p95_ns, found.max_ns)
+    )
 
 
 _Kinds: TypeAlias = type[EventKind] | type[OutputKind]

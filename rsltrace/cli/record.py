@@ -25,7 +25,7 @@ from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.logs import silent_topics, without_server
 
 if TYPE_CHECKING:
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
     from rsltrace.run import RunResult
     from rsltrace.simulation.loop.stop import Stop
@@ -345,21 +345,23 @@ def _silent_topics(result: RunResult) -> list[str]:
     return [f"{text}; rsltrace check shows the graph" for text in found if text]
 
 
-def _checked(job: Job, path: Path | None) -> tuple[Checked | None, int]:
+def _checked(job: Job, path: Path | None) -> tuple[CheckReport | None, int]:
     """Evaluate the job's checks on the trace; return the results and an exit status."""
     if not (job.checks or job.metrics) or path is None:
         return None, 0
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
 
     try:
-        checked = Checked(job, path)
+        checked = CheckReport(job, path)
     except RsltraceError as error:  # the trace itself is complete
         tell(f"rsltrace: error: {error}")
         return None, EXIT_USAGE
     return checked, 1 if checked.violated else 0
 
 
-def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_json: bool) -> None:
+def _report(
+    result: RunResult, told: list[str], checked: CheckReport | None, *, as_json: bool
+) -> None:
     error = result.error
     silent = _silent_topics(result)
     for note in (*result.notes, *silent):

@@ -33,8 +33,7 @@ class Fit:
 
 
 def fit(measured: Measured, how: str = TABLES) -> Fit:
-    """Return models of all that was measured: ``tables`` or ``distributions`` (see ``model_of``), or
-    ``series`` (see ``series_of``).
+    """Return models of the measured times: ``tables``, ``distributions`` or ``series``.
 
     :raises SetupError: of ``distributions``, if SciPy is missing.
     """
