@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
-from rsltrace.job import Job, locate
+from rsltrace.job import Job
 from rsltrace.run.full_queues import drop_notes, drops
 from rsltrace.run.inputs import check_output, without_launch_files
 from rsltrace.run.numerical_libraries import LateLibraries
@@ -36,13 +36,10 @@ from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
 from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import (
-    end_ns_of,
     going_on,
     is_ordered,
     policy_of_job,
     scheduling_plan,
-    stop_at_size,
-    stop_conditions,
     stop_with,
     switches_at_lines,
     unmet_departures,
@@ -57,6 +54,14 @@ from rsltrace.run.process import (
     search_path,
 )
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.run.stop_rules import (
+    StopInputs,
+    StopRule,
+    conditions_of,
+    end_ns_of,
+    stop_rules,
+    watch_messages,
+)
 from rsltrace.run.unused_rules import (
     has_rules,
     unused_parameters,
@@ -161,6 +166,7 @@ class Session:
         self._replay = replay
         self._recorded_by = writer
         self.stop: Stop | None = None
+        self._stop_rules: list[StopRule] = []
         self._output = output
         self._has_begun = False
         self._force = force
@@ -305,9 +311,15 @@ class Session:
     def _import_what_is_named(self) -> None:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
-        self.loop.stop_conditions = tuple(
-            stop_conditions(job, self.start_ns, world.domain.dispatcher.outside_events)
+        self._stop_rules = stop_rules(
+            StopInputs(
+                job,
+                self.start_ns,
+                trace_size=lambda: 0 if self._writer is None else self._writer.size,
+                outside_events=world.domain.dispatcher.outside_events,
+            )
         )
+        self.loop.stop_conditions = conditions_of(self._stop_rules)
         with world.importing():
             self._entries = [
                 *hook_entries(job, "before", job.hooks.before, lambda: job),
@@ -345,8 +357,6 @@ class Session:
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
         note_choices(self.loop)
-        if job.stop.size is not None:
-            self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
     def _payload_filter(self) -> Callable[[str], bool]:
         return payload_filter(self.job)
@@ -383,15 +393,7 @@ class Session:
 
     def begin(self) -> None:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
-        if self.job.stop.topic is not None:
-            from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
-
-            watch = watch_exit_code(
-                self.loop,
-                self.job.stop.topic,
-                where=locate(self.job, ("stop", "topic", "exit_code")),
-            )
-            self.world.domain.watch(self.job.stop.topic.name, watch)
+        watch_messages(self._stop_rules, self.world.domain.watch, self.loop.stop_after_step)
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
             if not self.whole_graph:

@@ -24,8 +24,8 @@ from rsltrace.native.executors import EXECUTORS
 from rsltrace.native.ledger import Sent, Span, now_ns
 from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording, Spent
 from rsltrace.native.support import check_loopback, domain
-from rsltrace.run.plans.scheduling import has_stop
 from rsltrace.run.plans.starts import missed_starts
+from rsltrace.run.stop_rules import has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
@@ -165,7 +165,7 @@ class InProcesses(Recording):
                 "seen where it arrives, and its cause is unknown"
             )
         self.create(stack, output, self.merge, described, self._sources, force=force)
-        self.watch_topic(self._on_message)
+        self.watch_stop_topics(self._on_message)
 
     def _start(self, start: Start) -> Child:
         child = Child(start, self._hear, self._ended)
