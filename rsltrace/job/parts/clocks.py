@@ -72,16 +72,16 @@ attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "patt
 
 
 class JumpSpec(Part):
-    """A clock is set: when, and by how much."""
+    """A jump of a clock."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
     LISTED: ClassVar[tuple[str, ...]] = ("at", "by")
 
     at_ns: Annotated[int, check(parse_time)] = Field(
-        alias="at", description="When, since the start of the run.", examples=["5s"]
+        alias="at", description="Time since the start.", examples=["5s"]
     )
     by_ns: Annotated[int, check(parse_signed_time)] = Field(
-        alias="by", description="How far; backwards if negative.", examples=["100ms", "-1s"]
+        alias="by", description="Size; negative is backwards.", examples=["100ms", "-1s"]
     )
 
 
@@ -94,52 +94,50 @@ class RandomJumpsSpec(Part):
         alias="every", description="Mean time between two jumps.", examples=["10s"]
     )
     most_ns: Annotated[int, check(positive_time)] = Field(
-        alias="most", description="Largest size, forwards or backwards.", examples=["50ms"]
+        alias="most", description="Largest size, in either direction.", examples=["50ms"]
     )
 
 
 class ClockSpec(Part):
-    """The clock of some nodes, compared with simulated time."""
+    """How the clock of some nodes differs from simulated time."""
 
     TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
 
     node: Annotated[str, check(text(check_node_glob))] = Field(
         default="*",
-        description="Node, a glob; the first entry that fits counts.",
+        description="Node glob. The first match counts.",
         examples=["/lidar"],
     )
     advances: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether each look at a ROS clock shows a nanosecond more than the one before "
-        "it at the same time, though never the time of the next event. Otherwise ROS clocks stand "
-        "still throughout a callback.",
+        description="Whether each reading of a ROS clock advances it by a nanosecond. By default "
+        "it stands still during a callback.",
         examples=[True],
     )
     source: Annotated[Literal["run", "topic"], check(one_of("run", "topic"))] = Field(
         default="run",
-        description="What drives ROS time where `use_sim_time` is on: the `run` itself, or the "
-        "`topic` /clock (and `set_ros_time_override`), as natively: then it stands at 0 until the "
-        "first message, and timers of the ROS clock wait for it, too.",
+        description="What drives ROS time with `use_sim_time`: the `run`, or the `topic` /clock, "
+        "with time 0 before its first message.",
         examples=["topic"],
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(
         default=0,
         alias="offset",
-        description="How far it is ahead; behind if negative.",
+        description="How far it is ahead of simulated time.",
         examples=["-20ms"],
     )
     drift_ppm: Annotated[float, check(parse_ppm)] = Field(
         default=0.0,
         alias="drift",
-        description="How much too fast it is, in parts per million since the start of the run.",
+        description="Drift in parts per million since the start.",
         examples=["50ppm"],
     )
     jumps: Annotated[tuple[JumpSpec, ...], parts()] = Field(
-        default=(), description="When it is set.", examples=[[{"at": "5s", "by": "100ms"}]]
+        default=(), description="When it jumps.", examples=[[{"at": "5s", "by": "100ms"}]]
     )
     random_jumps: Annotated[RandomJumpsSpec | None, given] = Field(
         default=None,
-        description="It is set now and then.",
+        description="Jumps at random times.",
         examples=[{"every": "10s", "most": "50ms"}],
     )
 

@@ -33,7 +33,7 @@ attach(parse_short_time, schema=TIME_SCHEMA)
 
 
 class UniformSpec(Part):
-    """Evenly between two bounds."""
+    """Uniform between two bounds."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
     TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
@@ -119,7 +119,7 @@ class GammaSpec(Part):
 
 
 class SamplesSpec(Part):
-    """Measured values, each as likely as the others: listed here, or in a file."""
+    """Measured values with equal probabilities, in a list or a file."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("values",), ("file", "unit"))
     MEANT: ClassVar[str] = "values"
@@ -132,13 +132,12 @@ class SamplesSpec(Part):
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A text file with one value per line, rounded to nanoseconds; empty lines and "
-        "# comments are skipped.",
+        description="Text file with one value per line.",
         examples=["delays.txt"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
         default="s",
-        description="Unit of the values in the file that have none.",
+        description="Unit of values without one.",
         examples=["ms"],
     )
 
@@ -152,8 +151,7 @@ class SamplesSpec(Part):
 
 
 class EmpiricalSpec(Part):
-    """A table of quantiles: how many percent of all values are at most this; what lies between two
-    lines of it is evenly spread."""
+    """A table of quantiles with linear interpolation."""
 
     MEANT: ClassVar[str] = "values"
     MEANT_LIST: ClassVar[bool] = True
@@ -166,8 +164,8 @@ class EmpiricalSpec(Part):
     percent: Annotated[tuple[float, ...] | None, check(items(number(0, 100)), optional=True)] = (
         Field(
             default=None,
-            description="Of each value, the percentage of all that do not exceed it: from 0 to "
-            "100. Without it they are equally far apart.",
+            description="Percentage of samples up to each value, 0 to 100. Default: equally "
+            "spaced.",
             examples=[[0, 90, 100]],
         )
     )
@@ -206,7 +204,7 @@ attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 
 
 
 class SeriesSpec(Part):
-    """A value that changes over time: listed here, or in a file."""
+    """Values over time, in a list or a file."""
 
     OF_TIMES: ClassVar[tuple[str, ...]] = ("points",)
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("points",), ("file", "unit"))
@@ -217,21 +215,20 @@ class SeriesSpec(Part):
         tuple[tuple[int, int], ...] | None, check(items(_check_point), optional=True)
     ] = Field(
         default=None,
-        description="Pairs [time since the start of the run, value], in order of time.",
+        description="Pairs of time since the start and value.",
         examples=[[["0s", "1ms"], ["60s", "20ms"]]],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A CSV file with two columns: time since the start, value. A first line "
-        "without numbers is a header.",
+        description="CSV file with two columns: time since the start, value.",
         examples=["link.csv"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
-        default="s", description="Unit of the numbers in the file that have none.", examples=["s"]
+        default="s", description="Unit of numbers without one.", examples=["s"]
     )
     steps: bool = Field(
         default=False,
-        description="Hold each value until the next point instead of interpolating.",
+        description="Hold each value instead of interpolating.",
         examples=[True],
     )
 
@@ -259,11 +256,11 @@ class DistributionSpec(Part):
     TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
 
     constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
-        default=None, alias="constant", description="Always this.", examples=["5ms"]
+        default=None, alias="constant", description="Constant.", examples=["5ms"]
     )
     uniform: Annotated[UniformSpec | None, given] = Field(
         default=None,
-        description="Evenly between two bounds.",
+        description="Uniform.",
         examples=[{"min": "1ms", "max": "3ms"}],
     )
     normal: Annotated[NormalSpec | None, given] = Field(
@@ -281,17 +278,17 @@ class DistributionSpec(Part):
     )
     samples: Annotated[SamplesSpec | None, given] = Field(
         default=None,
-        description="One of some measured values.",
+        description="Random choice of measured values.",
         examples=[{"file": "delays.txt", "unit": "ms"}],
     )
     empirical: Annotated[EmpiricalSpec | None, given] = Field(
         default=None,
-        description="A table of quantiles: what `rsltrace fit` writes.",
+        description="Table of quantiles, from `rsltrace fit`.",
         examples=[{"values": ["1ms", "1.2ms", "4ms"], "percent": [0, 90, 100]}],
     )
     series: Annotated[SeriesSpec | None, given] = Field(
         default=None,
-        description="A value that changes over time.",
+        description="Values over time.",
         examples=[{"points": [["0s", "1ms"], ["60s", "20ms"]]}],
     )
 

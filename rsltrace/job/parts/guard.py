@@ -21,17 +21,17 @@ def _module_glob(value: str) -> None:
 
 
 class SourceSpec(Part):
-    """What is done about one source, and the modules (globs) that may use it nevertheless."""
+    """How one source is handled."""
 
     mode: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="`virtual`: the run makes the answer; `record`: the real one is kept in the "
-        "trace; `warn`: the call is a finding; `error`: it ends the run; `allow`: nothing.",
+        description="`virtual`: simulated; `record`: real, and kept in the trace; `warn`: a "
+        "finding; `error`: ends the run; `allow`: nothing.",
         examples=["warn"],
     )
     allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = Field(
         default=(),
-        description="Modules that may use the source nevertheless, globs.",
+        description="Modules that may use the source, as globs.",
         examples=[["my_robot.logging", "rerun.*"]],
     )
 
@@ -71,8 +71,8 @@ def _about(source: Source, what: str) -> Any:
     default = DEFAULT_MODES[source].value
     return Field(
         default=None,
-        description=f"{what} Unless said otherwise: `{default}`.",
-        examples=[MODES[source][0].value, {"mode": "error", "allow": ["my_robot.logging"]}],
+        description=f"{what} Default: `{default}`.",
+        examples=[MODES[source][0].value],
     )
 
 
@@ -86,7 +86,7 @@ attach(_state, schema={"enum": [True, False, "record"]})
 
 
 class GuardSpec(Part):
-    """``guard:`` of a job, or of a node, where it overrides the job's key by key.
+    """``guard:`` of a job, or of a node, which overrides the job's keys.
 
     ``enabled`` false (``guard: false``) leaves everything as it is. ``state`` hashes a node's state
     after each callback; ``record`` keeps its attributes, too. A source that is None keeps what the
@@ -95,20 +95,19 @@ class GuardSpec(Part):
 
     enabled: Annotated[bool, check(flag)] = Field(
         default=True,
-        description="`false` leaves every source as it is; `guard: false` is short for it.",
+        description="`false` allows every source.",
         examples=[False],
     )
     pin: Annotated[bool | None, check(flag, optional=True)] = Field(
         default=None,
-        description="Whether `rsltrace record` starts its process once more with a fixed hash "
-        "seed, fixed addresses, in UTC, in C.UTF-8, with one thread per numerical library. For "
-        "the job as a whole only. Unless said otherwise: `true`.",
+        description="Whether `rsltrace record` pins its process: hash seed, memory addresses, time "
+        "zone, locale and thread counts. Only for the whole job. Default: `true`.",
         examples=[False],
     )
     state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
         default=None,
-        description="Whether a node's state is hashed after each of its callbacks; `record` keeps "
-        "its attributes in the trace, too.",
+        description="Whether node states are hashed after each callback; `record` also keeps the "
+        "attributes.",
         examples=[True, "record"],
     )
     clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = _about(

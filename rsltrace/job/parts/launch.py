@@ -39,9 +39,9 @@ EntryName = Annotated[str | int | None, check(_check_entry, optional=True)]
 
 
 class StartAfterSpec(Part):
-    """When an entry starts: once all that is given has come true, and ``delay`` later. A plain
-    time stands for ``{delay: time}``. The name of an entry is its ``name``, what it runs
-    (``package/name``, ``module:main``), or its number in the list."""
+    """When an entry starts: ``delay`` after all conditions are true. A plain
+    time stands for ``{delay: time}``. Entries are named by
+    ``name``, by what they run, or by number."""
 
     MEANT: ClassVar[str] = "delay"
     TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
@@ -50,27 +50,26 @@ class StartAfterSpec(Part):
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="delay",
-        description="This much later: after the start of the run, or after the last of the other "
-        "conditions has come true.",
+        description="Delay after the start, or after the last of the other conditions.",
         examples=["2s"],
     )
     topic: FullName = Field(
         default=None,
-        description="After the first message on this topic.",
+        description="After the first message on a topic.",
         examples=["/map"],
     )
     service: FullName = Field(
         default=None,
-        description="After this service has got a server.",
+        description="After a service has a server.",
         examples=["/set_mode"],
     )
     node: FullName = Field(
-        default=None, description="After this node has been made.", examples=["/robot/driver"]
+        default=None, description="After a node exists.", examples=["/robot/driver"]
     )
     started: EntryName = Field(
         default=None,
-        description="After another entry has started: its constructor is done, or its main waits "
-        "or spins for the first time.",
+        description="After another entry has started: its constructor returned, or its main "
+        "waits or spins.",
         examples=["driver", 0],
     )
     ended: EntryName = Field(
@@ -113,18 +112,17 @@ class LaunchSpec(Part):
     """A launch file; a path stands for ``{file: ...}``."""
 
     file: Annotated[str, check(check_path)] = Field(
-        description="Launch file (XML, YAML, or Python, which is run in a process of its own).",
+        description="Launch file in XML, YAML or Python.",
         examples=["launch/robot.launch.xml"],
     )
     arguments: Annotated[dict[str, str], check(_check_arguments)] = Field(
         default_factory=dict,
-        description="Launch arguments by name, as `name:=value` on a command line.",
+        description="Launch arguments.",
         examples=[{"robot": "husky", "use_lidar": True}],
     )
     skip_unsupported: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Leave out what cannot be simulated (compiled executables, other processes) "
-        "instead of refusing the launch file.",
+        description="Skip what cannot be simulated instead of refusing the file.",
         examples=[True],
     )
 

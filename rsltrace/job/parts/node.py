@@ -79,86 +79,79 @@ class NodeSpec(Part):
 
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="What to construct: `module:Class`, a Node subclass, or `module:function`, "
-        "which returns a node or a list of nodes. Looked for in `search_path`. A file in the job's "
-        "folder may be named as `folder/file.py:Class`.",
+        description="A Node subclass, or a function that returns nodes: `module:Class` or "
+        "`folder/file.py:Class`.",
         examples=["my_robot.ekf:EkfNode"],
     )
     main: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a function that initializes rclpy, makes nodes and spins, "
-        "as `module:function`.",
+        description="A function that initializes rclpy, makes nodes and spins.",
         examples=["my_robot.talker:main"],
     )
     executable: Annotated[str | None, check(text(check_executable), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: an installed executable, as `ros2 run` would start it, as "
-        "`package/name`. A compiled one runs as a process of its own.",
+        description="An installed executable: `package/name`, as for `ros2 run`. Compiled ones "
+        "run in their own process.",
         examples=["demo_nodes_py/talker"],
     )
     script: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a Python file, run as `python script.py` runs it.",
+        description="A Python file.",
         examples=["scripts/talker.py"],
     )
     module: Annotated[str | None, check(text(check_module), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a module (or package), run as `python -m module` runs it. "
-        "Looked for in `search_path`.",
+        description="A module, run as `python -m` does.",
         examples=["my_robot.talker"],
     )
     program: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a file that uses rcl and can be executed (C, C++), run as "
-        "a process of its own.",
+        description="An executable file that uses rcl (C, C++), run in its own process.",
         examples=["build/talker"],
     )
     component: Annotated[str | None, check(text(check_component), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a component, as `package/plugin`, that a `container` is "
-        "asked to load once it is there.",
+        description="A component, `package/plugin`, which a `container` loads.",
         examples=["image_proc/image_proc::RectifyNode"],
     )
     container: Annotated[str | None, check(text(check_container), optional=True)] = Field(
         default=None,
-        description="Which node loads a `component`, by its name in full: an executable of "
-        "`rclcpp_components`, or whatever serves `<name>/_container/load_node`.",
+        description="Full name of the node that loads a `component`.",
         examples=["/camera/container"],
     )
     extra_arguments: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
-        description="Extra arguments of a `component`, as `ros2 component load -e` takes them.",
+        description="Extra arguments of a `component`.",
         examples=[{"use_intra_process_comms": True}],
     )
     isolated: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether Python code runs as a process of its own, like a `program`, and not "
-        "in the process of the run. For `executable`, `script` and `module`.",
+        description="Whether an `executable`, `script` or `module` runs in its own process.",
         examples=[True],
     )
     environment: Annotated[dict[str, str], check(check_environment)] = Field(
         default_factory=dict,
-        description="Environment variables of a process, beside those that rsltrace has itself.",
+        description="Additional environment variables of a process.",
         examples=[{"RCUTILS_LOGGING_USE_STDOUT": "1"}],
     )
     working_directory: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="The folder in which a process runs, if not that of rsltrace.",
+        description="Working directory of a process. Default: that of rsltrace.",
         examples=["data"],
     )
     respawn: Annotated[RespawnSpec | None, part("delay")] = Field(
         default=None,
-        description="How long after its end a process is started again; without it, it is not.",
+        description="Delay after which an ended process starts again. Default: it does not.",
         examples=["1s", {"delay": "500ms", "times": 3}],
     )
     required: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether the run ends when this entry has ended. Not for a `node`.",
+        description="Whether the run ends when this entry ends. Not for a `node`.",
         examples=[True],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
         default=None,
-        description="Name of the node, in place of the one it gives itself.",
+        description="Name of the node, replacing its own.",
         examples=["ekf"],
     )
     namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = Field(
@@ -166,50 +159,46 @@ class NodeSpec(Part):
     )
     parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
-        description="Its ROS parameters; `a: {b: 1}` and `a.b: 1` are the same. They win over "
-        "`parameter_files`. An empty list has no type: as in ROS, the parameter is then declared "
-        "but not set, whatever its default.",
+        description="ROS parameters, overriding `parameter_files`. `a: {b: 1}` is the same as "
+        "`a.b: 1`. An empty list is declared but not set.",
         examples=[{"frequency": 50.0, "noise": {"x": 0.1, "y": 0.1}}],
     )
     parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = Field(
         default=(),
-        description="ROS parameter files, wildcards and all; later ones win.",
+        description="ROS parameter files; later ones override earlier ones.",
         examples=[["ekf.yaml"]],
     )
     remappings: Annotated[dict[str, str], check(check_remappings)] = Field(
         default_factory=dict,
-        description="Names of topics and services that become others, as in `--ros-args -r`.",
+        description="Remapped topics and services.",
         examples=[{"odom": "/husky/odom"}],
     )
     arguments: Annotated[dict[str, Any] | tuple[str, ...], check(check_arguments)] = Field(
         default_factory=dict,
-        description="Keyword arguments of a `node`; a list of command-line words of all others.",
+        description="Keyword arguments of a `node`; else a list of command-line arguments.",
         examples=[{"robots": 3}, ["--rate", 10]],
     )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
         default="stop",
-        description="What happens when a callback raises: `stop` ends the run (exit status 3); "
-        "`log` writes exception and traceback to the trace, logs an error, and goes on. A "
-        "constructor that raises always ends the run.",
+        description="What an exception in a callback does: `stop` ends the run with status 3, "
+        "`log` records it and continues. A constructor that raises always ends the "
+        "run.",
         examples=["log"],
     )
     guard: Annotated[GuardSpec | None, guard_part] = Field(
         default=None,
-        description="What is done about sources of nondeterminism in this node, where that differs "
-        "from the job's `guard`.",
+        description="Guard settings of this node that differ from the job's.",
         examples=[{"random": "allow"}],
     )
     start_after: Annotated[StartAfterSpec | None, part("delay")] = Field(
         default=None,
-        description="When it starts, if not with the run: after a time (which may stand for "
-        "`{delay: ...}`), after a topic, service or node is there, or after another entry has "
-        "started or ended.",
+        description="When the entry starts: after a time, or after a topic, service, node or "
+        "entry is there.",
         examples=["2s", {"service": "/set_mode"}, {"ended": "my_robot/calibrate", "delay": "1s"}],
     )
     stdin: Annotated[tuple[InputSpec, ...] | None, inputs] = Field(
         default=None,
-        description="What is typed at the terminal that it reads from (`input()`, `sys.stdin`, "
-        "`termios`, `curses`): the name of a text file, or a list. Not for a `node`.",
+        description="Terminal input of the process: a text file or a list. Not for a `node`.",
         examples=["answers.txt", ["start", {"at": "2s", "keys": "wwq"}]],
     )
     # Not a key of a job file: where the entry came from, if not from the job itself.

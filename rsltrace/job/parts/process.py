@@ -34,7 +34,7 @@ attach(_line, schema={"type": ["string", "number"]})
 
 
 class InputSpec(Part):
-    """Something that is typed: one of ``line``, ``keys``, ``file`` and ``end``. Text alone is a
+    """Terminal input: one of ``line``, ``keys``, ``file`` and ``end``. Text alone is a
     ``line``."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ("line", "keys", "file", "end")
@@ -43,17 +43,16 @@ class InputSpec(Part):
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="When, since the start of the run. Without it, as soon as what comes before "
-        "has been read.",
+        description="Time since the start. Default: when the input before has been read.",
         examples=["2.5s"],
     )
     line: Annotated[str | None, check(_line, optional=True)] = Field(
-        default=None, description="A line, and the Enter key.", examples=["start", 42]
+        default=None, description="A line with Enter.", examples=["start", 42]
     )
     keys: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="Keys one after the other, without Enter (which is `\\r`): `\\e[A` is the up "
-        "arrow, `\\x03` is Ctrl-C.",
+        description="Keys without Enter (which is `\\r`): `\\e[A` is the up arrow, `\\x03` is "
+        "Ctrl-C.",
         examples=["wwad", "\x1b[A"],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
@@ -61,7 +60,7 @@ class InputSpec(Part):
     )
     end: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="The end of the input (Ctrl-D): who reads a line gets an end of file.",
+        description="End of the input (Ctrl-D).",
         examples=[True],
     )
 
@@ -115,8 +114,7 @@ attach(
 
 
 class RespawnSpec(Part):
-    """A process is started again when it has ended, even by a failure. A plain time stands for
-    ``{delay: time}``."""
+    """Restart of a process that has ended. A plain time stands for ``{delay: time}``."""
 
     MEANT: ClassVar[str] = "delay"
     TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
@@ -124,12 +122,12 @@ class RespawnSpec(Part):
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="delay",
-        description="How much simulated time passes before it starts again.",
+        description="Simulated time before the restart.",
         examples=["1s"],
     )
     times: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None,
-        description="How often it is started again at most; without it there is no limit.",
+        description="Maximum number of restarts. Default: unlimited.",
         examples=[3],
     )
 

@@ -17,18 +17,18 @@ from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 
 class HooksSpec(Part):
-    """What is called before the first and after the last node is constructed."""
+    """Functions called around the construction of the nodes."""
 
     before: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function called with the job before the first node is constructed. It may "
-        "return nodes of its own (one, or a list).",
+        description="Function of the job, called before the first node is constructed. It may "
+        "return nodes.",
         examples=["my_robot.setup:prepare"],
     )
     after: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function called with the list of all nodes after the last one is constructed, "
-        "before the run starts. It may return more nodes.",
+        description="Function of the list of nodes, called after construction and before the "
+        "run. It may return more nodes.",
         examples=["my_robot.setup:wire"],
     )
 
@@ -40,27 +40,27 @@ class HooksSpec(Part):
 
 
 class RecordSpec(Part):
-    """Which payloads the trace keeps. Hashes are kept in any case."""
+    """Which messages the trace keeps. Hashes are always kept."""
 
     payloads: Annotated[bool, check(flag)] = Field(
         default=True,
-        description="Whether messages are kept at all; their hashes are in any case.",
+        description="Whether to keep messages. Their hashes are always kept.",
         examples=[False],
     )
     topics: Globs = Field(
         default=("*",),
-        description="Topics and services whose messages are kept, globs.",
+        description="Topics and services to keep, as globs.",
         examples=[["/odom", "/robot1/*"]],
     )
     exclude: Globs = Field(
         default=(),
-        description="Topics and services whose messages are not kept, globs.",
+        description="Topics and services not to keep, as globs.",
         examples=[["/camera/*"]],
     )
     segment_events: Annotated[int, check(whole(1, SEGMENT_EVENTS))] = Field(
         default=SEGMENT_EVENTS,
-        description="After how many events they are written to the file; what a killed or crashed "
-        "run loses is fewer. 1 is slow, and right for finding out what happened before a crash.",
+        description="Write the file after this many events; a killed run loses fewer. Use 1 "
+        "(slow) to investigate a crash.",
         examples=[1],
     )
 

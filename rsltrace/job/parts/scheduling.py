@@ -30,17 +30,17 @@ class PriorityRuleSpec(Part):
     """A priority for a node, for one of its entities, or for a whole callback group."""
 
     priority: Annotated[int, check(whole(-PRIORITY_MAX, PRIORITY_MAX))] = Field(
-        description="Higher runs first; what no rule fits has 0.", examples=[10]
+        description="Higher runs first. Default: 0.", examples=[10]
     )
     node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/controller"])
     entity: NameGlob = Field(
         default=None,
-        description="Topic, service, or name of a timer's callback, a glob.",
+        description="Glob of a topic, service or timer callback.",
         examples=["/scan", "Controller.on_timer"],
     )
     group_of: NameGlob = Field(
         default=None,
-        description="Everything in the callback group of this entity, a glob.",
+        description="Glob of an entity: everything in its callback group.",
         examples=["/scan"],
     )
 
@@ -52,20 +52,19 @@ class PriorityRuleSpec(Part):
 
 
 class DepartureSpec(Part):
-    """A choice at which another than the first that became ready runs."""
+    """A choice at which a callback other than the first ready one runs."""
 
     choice: Annotated[int, check(whole(0))] = Field(
-        description="Which choice, from 0. Only times at which more than one can run count.",
+        description="Index of the choice. Only times with several candidates count.",
         examples=[37],
     )
     run: Annotated[int, check(whole(0))] = Field(
-        description="Which of those that can run, from 0, in the order in which they became ready, "
-        "timers last.",
+        description="Index of the candidate, by the time it became ready, timers last.",
         examples=[2],
     )
     of: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="Its node and entity, to read and to be checked: another one is an error.",
+        description="Node and entity of the candidate; others are an error.",
         examples=["/planner /scan"],
     )
 
@@ -75,19 +74,19 @@ class PctSpec(Part):
 
     depth: Annotated[int, check(whole(1, 100))] = Field(
         default=3,
-        description="How many constraints of order the bug needs: 1 for one pair of events.",
+        description="Number of ordering constraints of the bug: 1 for one pair of events.",
         examples=[3],
     )
     choices: Annotated[int, check(whole(1))] = Field(
         default=1000,
-        description="How many choices a run has, at most: priorities change within so many.",
+        description="Maximum number of choices in a run.",
         examples=[500],
     )
 
 
 class PolicySpec(Part):
-    """Which of the callbacks that are ready runs next. Exactly one of the keys but ``after`` and
-    ``seed``; a word alone is an ``order``."""
+    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone is an
+    ``order``."""
 
     TIMES: ClassVar[dict[str, str]] = {"after": "after_ns"}
     ONE_OF: ClassVar[tuple[str, ...]] = (
@@ -102,50 +101,46 @@ class PolicySpec(Part):
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
-        description="`fifo` (first come, first served; timers last), `rate_monotonic` (shortest "
-        "period first: of the timer that a callback is, or that its chain begins with), `wait_set` "
-        "(rclcpp's executors: timers first, the rest as polling points find it), `rclpy` (rclpy's) "
-        "or `permutation` (what is ready at one instant in an order that the seed decides).",
+        description="`fifo`: first come, first served, timers last. `rate_monotonic`: shortest "
+        "period of the chain first. `wait_set`: as rclcpp's executors. `rclpy`: as "
+        "rclpy's. `permutation`: random order at each instant.",
         examples=["rate_monotonic"],
     )
     priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
-        description="Highest priority first; the first rule that fits counts.",
+        description="Highest priority first. The first matching rule counts.",
         examples=[[{"node": "/controller", "priority": 10}]],
     )
     departures: Annotated[tuple[DepartureSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
-        description="First come, first served, but for these choices: what `rsltrace explore` "
-        "writes of an order that it has found.",
+        description="First come, first served, except for these choices, which `rsltrace "
+        "explore` writes.",
         examples=[[{"choice": 37, "run": 2}]],
     )
     pct: Annotated[PctSpec | None, part("depth")] = Field(
         default=None,
-        description="Random priorities of entities, as the job's `seed` decides, that change at "
-        "`depth` - 1 random choices.",
+        description="Random priorities that change at `depth` - 1 random choices.",
         examples=[{"depth": 3, "choices": 500}],
     )
     recorded: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A trace whose order of events is followed exactly.",
+        description="A trace whose order is followed exactly.",
         examples=["run1.mcap"],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="A class of your own, called without arguments: see docs/policies.md.",
+        description="Your own policy class (docs/policies.md).",
         examples=["my_robot.policy:LongestQueue"],
     )
     after_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="after",
-        description="Up to this time, since the start of the run, it is first come, first served: "
-        "with `order`, `priority`, `pct` and `function`.",
+        description="First come, first served until this time.",
         examples=["30s"],
     )
     seed: Annotated[int | None, check(whole(0), optional=True)] = Field(
         default=None,
-        description="What `permutation` and `pct` draw from, instead of the job's `seed`: another "
-        "order, with the same delays, losses and the like.",
+        description="Seed of `permutation` and `pct`. Default: the job's.",
         examples=[7],
     )
 
@@ -188,53 +183,51 @@ class ExecutorSpec(Part):
     """A simulated executor: a number of workers for some nodes."""
 
     nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
-        default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]
+        default=("*",), description="Nodes, as globs.", examples=[["/camera", "/detector"]]
     )
     workers: Annotated[int, check(whole(1, 1024))] = Field(
         default=1,
-        description="Callbacks it can run at once; 1 is a single-threaded executor.",
+        description="Number of callbacks it runs in parallel.",
         examples=[4],
     )
 
 
 class EntityExecutionSpec(DistributionSpec):
-    """How long the callbacks of some entities of some nodes take."""
+    """Execution times of some entities."""
 
     node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/detector"])
     entity: Annotated[str, check(text())] = Field(
-        description="Topic, service, or name of a timer's callback, a glob.", examples=["/image"]
+        description="Glob of a topic, service or timer callback.", examples=["/image"]
     )
 
 
 class ExecutionSpec(Part):
-    """How long callbacks take. Of ``entities`` the first that fits counts, then ``nodes``, then
-    ``default``."""
+    """Execution times: the first match among ``entities``, ``nodes`` and ``default``."""
 
     MEANT: ClassVar[str] = "default"
 
     default: Annotated[DistributionSpec | None, part("constant")] = Field(
-        default=None, description="For every callback without a time of its own.", examples=["1ms"]
+        default=None, description="Default of all callbacks.", examples=["1ms"]
     )
     nodes: Annotated[dict[str, DistributionSpec], named_parts("constant", check_node_glob)] = Field(
         default_factory=dict,
-        description="By node, a glob.",
+        description="By node glob.",
         examples=[{"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}],
     )
     entities: Annotated[tuple[EntityExecutionSpec, ...], parts()] = Field(
         default=(),
-        description="By entity of a node.",
+        description="By entity.",
         examples=[[{"node": "/detector", "entity": "/image", "constant": "50ms"}]],
     )
 
 
 class ThreadsSpec(Part):
-    """Where threads of one process, and callbacks that its executors run at once, take turns."""
+    """Where threads of one process take turns."""
 
     switch: Annotated[str, check(one_of(WHEN_BLOCKED, EVERY_LINE))] = Field(
         default=WHEN_BLOCKED,
-        description="`when_blocked`: each runs until it blocks or ends. `every_line`: before each "
-        "line of the user's own code the policy is asked whether it goes on, or another one that "
-        "could run at the same time; `fifo` lets it go on.",
+        description="`when_blocked`: a thread runs until it blocks or ends. `every_line`: the "
+        "policy chooses a thread before each line of user code.",
         examples=["every_line"],
     )
 

@@ -87,30 +87,30 @@ class SettingSpec(Part):
 
     values: Annotated[tuple[Any, ...] | None, check(_values, optional=True)] = Field(
         default=None,
-        description="These, each as a job file has it there.",
+        description="The values.",
         examples=[["slow", "fast"]],
     )
     uniform: Pair = Field(
         default=None,
-        description="Evenly between two numbers, or two times.",
+        description="Uniform between two numbers or times.",
         examples=[[0.5, 2.0], ["1ms", "20ms"]],
     )
     log_uniform: Pair = Field(
         default=None,
-        description="Between two numbers or times above 0, evenly in their logarithm.",
+        description="Uniform in the logarithm.",
         examples=[[0.001, 1.0]],
     )
     normal: Pair = Field(
         default=None,
-        description="Normal: mean and standard deviation. Times are not less than 0.",
+        description="Normal: mean and standard deviation. Times are at least 0.",
         examples=[[1.0, 0.1]],
     )
     integers: Pair = Field(
-        default=None, description="The integers from one to another.", examples=[[1, 10]]
+        default=None, description="Integers from one to another.", examples=[[1, 10]]
     )
     steps: Annotated[int | None, check(whole(2, 100_000), optional=True)] = Field(
         default=None,
-        description="How many values, equally far apart, a grid has of `uniform` or `log_uniform`.",
+        description="Number of values in a grid of `uniform` or `log_uniform`.",
         examples=[5],
     )
 
@@ -178,7 +178,7 @@ class VarySpec(Part):
         dict[str, SettingSpec],
         check(_settings, names={"pattern": r"^\S.*$"}, value_shorthand="values"),
     ] = Field(
-        description="By key of the job, written as for `--set`: a list of values, or a range.",
+        description="By key, as for `--set`: a list of values, or a range.",
         examples=[
             {
                 "nodes.ekf.parameters.rate": [10.0, 50.0],
@@ -189,16 +189,15 @@ class VarySpec(Part):
     method: Annotated[Literal["grid", "random", "latin_hypercube"], check(one_of(*METHODS))] = (
         Field(
             default="random",
-            description="Which values go together: every combination (`grid`), each drawn by "
-            "itself (`random`), or so that each setting's range is covered evenly "
-            "(`latin_hypercube`, of SciPy).",
+            description="How values are combined: every combination (`grid`), `random`, or "
+            "evenly spread (`latin_hypercube`, needs SciPy).",
             examples=["latin_hypercube"],
         )
     )
     samples: Annotated[int | None, check(whole(1, SAMPLES_MAX), optional=True)] = Field(
         default=None,
-        description="How many combinations there are. A grid says so itself; `random` has no end "
-        "without it, `latin_hypercube` 100.",
+        description="Number of combinations. Default: all of a grid, unlimited for `random`, 100 "
+        "for `latin_hypercube`.",
         examples=[200],
     )
 

@@ -66,28 +66,22 @@ class Composition(Part):
 
     base: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="A job file to extend, relative to this file. What is written here wins: "
-        "mappings are merged key by key (of keys that exclude each other, such as distributions, "
-        "the base's goes), an entry of `nodes` changes the base's node of the same "
-        "`name` (others are added), other lists replace the base's, and `null` takes away what "
-        "the base says.",
+        description="A job file to extend. Mappings are merged key by key, entries of `nodes` by "
+        "`name`; other lists replace those of the base, and `null` removes a key.",
         examples=["../robot/job.yaml"],
     )
     include: Annotated[tuple[str, ...], check(_paths)] = Field(
         default=(),
-        description="Files whose keys belong to this job, too: a path or a list of paths, relative "
-        "to this file. Their `nodes`, `launch` and `bags` are added in front of this file's; apart "
-        "from that they are merged like a base, later ones over earlier ones.",
+        description="Job files to merge, later ones over earlier ones. Their `nodes`, `launch` "
+        "and `bags` are added before this file's.",
         examples=[["sensors.yaml", "../common/recording.yaml"]],
     )
     vars: Annotated[dict[str, Any], check(_variables)] = Field(
         default_factory=dict,
-        description="Values to use elsewhere in the job as `$(var NAME)`; "
-        "`--set vars.NAME=...` gives them others. Also understood in every value: "
-        "`$(env NAME default)`, `$(find-pkg-share PACKAGE)`, `$(find-pkg-prefix PACKAGE)` and "
-        "`$(dirname)`, the folder of the file; the share of a package in `search_path` that nobody "
-        "has built is its folder. Text without quotes is read again after that, so "
-        "`seed: $(env SEED 7)` is a number. `\\$(` stands for itself.",
+        description="Values for `$(var NAME)`, which `--set vars.NAME=...` overrides. Values may "
+        "also contain `$(env NAME default)`, `$(find-pkg-share PACKAGE)`, "
+        "`$(find-pkg-prefix PACKAGE)` and `$(dirname)`, the folder of the file. "
+        "Unquoted text is parsed again afterwards. Write `\\$(` for a plain `$(`.",
         examples=[{"robot": "husky", "rate": 50.0}],
     )
 
