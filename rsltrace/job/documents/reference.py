@@ -102,7 +102,9 @@ def _section(
         if base is not None:
             known = dict(file_fields(base))
             fields = [(key, field) for key, field in fields if key not in known]
-            out += [f"It has the keys of `{done[base]}`{', and:' if fields else '.'}", ""]
+            keys = ", ".join(f"`{key}`" for key, _ in file_fields(model))
+            same = f"It has the keys of `{done[base]}`, and:"
+            out += [same if fields else f"Keys as in `{done[base]}`: {keys}.", ""]
     for key, field in fields:
         out += _entry(key, field)
     return [*out, ""]

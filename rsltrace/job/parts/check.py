@@ -31,7 +31,7 @@ Topic = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
 class LatencySpec(Part):
-    """A limit of an end-to-end latency. Give the chain by ``from`` and ``to``, or by all of its topics."""
+    """A limit of an end-to-end latency. Give ``from`` and ``to``, or all topics of the chain."""
 
     TIMES: ClassVar[dict[str, str]] = {"below": "below_ns"}
 

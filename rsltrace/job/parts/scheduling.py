@@ -85,8 +85,8 @@ class PctSpec(Part):
 
 
 class PolicySpec(Part):
-    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone is an
-    ``order``."""
+    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone
+    is an ``order``."""
 
     TIMES: ClassVar[dict[str, str]] = {"after": "after_ns"}
     ONE_OF: ClassVar[tuple[str, ...]] = (

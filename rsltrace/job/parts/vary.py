@@ -169,8 +169,7 @@ def _settings(values: object) -> object:
 
 
 class VarySpec(Part):
-    """What differs from run to run when a job is explored (`rsltrace explore`). Other commands run
-    the job as it is."""
+    """Settings that ``rsltrace explore --strategy vary`` changes."""
 
     MEANT: ClassVar[str] = "settings"
 
