@@ -19,7 +19,7 @@ from rsltrace.cli.options import (
     timeout_option,
     until_option,
 )
-from rsltrace.cli.verify import Given, terminated
+from rsltrace.cli.verify import JobArguments, handling_signals
 from rsltrace.errors import BisectError, JobError, OutputError
 from rsltrace.terminal import say, tell
 
@@ -114,7 +114,7 @@ def bisect(
 
     if expression is not None and shell is not None:
         raise click.UsageError("give --check or --run, not both")
-    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     files = _named(given)
     if output is not None and not force:
         _check_free(output)
@@ -129,7 +129,7 @@ def bisect(
     notes = [] if job is None else list(_same_everywhere(repository, job))
     for note in notes:
         tell(f"note: {note}")
-    with terminated(), Worktree(repository, links) as tree:
+    with handling_signals(), Worktree(repository, links) as tree:
         runner = Runner(repository, tree, tuple(given.arguments(tree.path)), processes, timeout)
         try:
             search = Search(
@@ -154,7 +154,7 @@ def _check(expression: str | None, shell: str | None, processes: Processes) -> C
     return None if shell is None else command(shell, processes)
 
 
-def _named(given: Given) -> list[Path]:
+def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
     files = [Path(word) for word in given.words if ":=" not in word]
     files += [given.launch] if given.launch is not None else []
@@ -182,7 +182,7 @@ def _check_ends(repository: Repository, good: Any, bad: Any) -> None:
         raise BisectError(f"--bad {bad} is an ancestor of --good {good}: exchange them")
 
 
-def _job_here(given: Given) -> Job | None:
+def _job_here(given: JobArguments) -> Job | None:
     """Return the job in the checkout, or None if it is broken: revisions have their own."""
     try:
         return job_of(given.words, given.launch, given.skip, given.overrides)[0]

@@ -18,7 +18,7 @@ from rsltrace.cli.job_source import (
     job_words,
 )
 from rsltrace.cli.record import default_output
-from rsltrace.cli.verify import terminated
+from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
@@ -209,7 +209,7 @@ def explore(
     about = _about(source, job, strategy, seed, depth)
     if fork_after is not None:
         about["fork after"] = fork_after[1]
-    with terminated(), Table(folder, about, resume=resume, force=force) as table:
+    with handling_signals(), Table(folder, about, resume=resume, force=force) as table:
         chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
         search = Search(
             job,

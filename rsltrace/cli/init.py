@@ -16,7 +16,7 @@ from rsltrace.terminal import tell
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.job.reading.node_source import Found
+    from rsltrace.job.reading.node_source import NodeSource
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
@@ -90,16 +90,16 @@ def _is_python(source: str) -> bool:
     return source.partition(":")[0].endswith(".py")
 
 
-def _look(target: str, folder: Path) -> Found:
-    from rsltrace.job.reading.node_source import look_up, look_up_file
+def _look(target: str, folder: Path) -> NodeSource:
+    from rsltrace.job.reading.node_source import inspect_file, inspect_target
 
     if _is_python(target):
-        return look_up_file(target)
+        return inspect_file(target)
     places = [folder / place for place in _PLACES]
-    return look_up(target, [place for place in places if place.is_dir()])
+    return inspect_target(target, [place for place in places if place.is_dir()])
 
 
-def _search_path(nodes: list[Found], folder: Path, *, guess: bool) -> list[str]:
+def _search_path(nodes: list[NodeSource], folder: Path, *, guess: bool) -> list[str]:
     """Return where modules are, if that is not only beside the job; ``guess`` without any node."""
     found = {os.path.relpath(n.folder, folder) for n in nodes if n.folder is not None}
     if guess:
@@ -116,7 +116,7 @@ def _holds_modules(folder: Path) -> bool:
 
 
 def _job_text(
-    job: Path, bags: list[str], nodes: list[Found], search_path: list[str]
+    job: Path, bags: list[str], nodes: list[NodeSource], search_path: list[str]
 ) -> Iterator[str]:
     yield _HEAD.format(name=job)
     # A key without a value is a mistake, so of a job of bags alone this is a comment.
@@ -148,7 +148,7 @@ def _job_text(
     yield "# record: {exclude: [/camera/*]}  # payloads to leave out; hashes are always kept\n"
 
 
-def _checks_text(nodes: list[Found]) -> Iterator[str]:
+def _checks_text(nodes: list[NodeSource]) -> Iterator[str]:
     """Offer checks that fit the nodes."""
     topics = list(dict.fromkeys(topic for node in nodes for topic in node.topics))
     yield "# checks:  # what has to be true of every run: docs/checks.md\n"
@@ -158,7 +158,7 @@ def _checks_text(nodes: list[Found]) -> Iterator[str]:
         yield f"#   - {{rate: {topic}, at_least: 1 Hz}}\n"
 
 
-def _node_text(node: Found) -> Iterator[str]:
+def _node_text(node: NodeSource) -> Iterator[str]:
     if node.is_main:
         yield f"  - main: {node.target}  # it runs as it is, and makes its nodes itself\n"
         return

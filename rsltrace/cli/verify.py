@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
+class JobArguments:
     """The options of a command line that choose the job, for its child processes."""
 
     words: tuple[str, ...]
@@ -140,9 +140,9 @@ def verify(
     """
     if (only or output) and number is None:
         raise click.UsageError("--only and --output need --run N")
-    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     job_of(words, launch, skip, overrides)  # report a broken job once, before the runs
-    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, terminated():
+    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, handling_signals():
         folder = Path(name)
         if number is not None:
             return _one_run(given, folder, number, perturbations, only, output)
@@ -150,7 +150,7 @@ def verify(
 
 
 def _verify(
-    given: Given,
+    given: JobArguments,
     folder: Path,
     runs: int,
     jobs: int,
@@ -199,7 +199,7 @@ def _two(result: Verified) -> list[Recorded]:
     return [result.first] if second is None or second is result.first else [result.first, second]
 
 
-def _again(given: Given, perturbations: int, around: Surroundings) -> str:
+def _again(given: JobArguments, perturbations: int, around: Surroundings) -> str:
     """Return the command that repeats one run."""
     words = ["rsltrace", "verify", *given.arguments()]
     if perturbations:
@@ -208,7 +208,7 @@ def _again(given: Given, perturbations: int, around: Surroundings) -> str:
 
 
 def _one_run(
-    given: Given,
+    given: JobArguments,
     folder: Path,
     number: int,
     perturbations: int,
@@ -233,7 +233,7 @@ def _one_run(
 
 
 @contextmanager
-def terminated() -> Iterator[None]:
+def handling_signals() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the child processes, too."""
 
     def end(number: int, frame: object) -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from rsltrace.conditions.bounds import LimitError
 from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, Moment
+from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, RsltraceError
 
 _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
@@ -52,7 +52,7 @@ class Condition:
     before: bool
     after: bool
     reads: frozenset[str]
-    arm: Callable[[Moment], Armed] = field(repr=False)
+    arm: Callable[[PausedRun], Armed] = field(repr=False)
 
 
 def is_true(

@@ -18,7 +18,7 @@ from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.launch import LaunchSpec
 from rsltrace.job.parts.node import NodeSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.parts.record import HooksSpec, RecordSpec
 from rsltrace.job.parts.scheduling import (
     ExecutionSpec,
@@ -44,7 +44,7 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.problem import Loc, Problem, describe
+from rsltrace.job.values.problem import JobProblem, Loc, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 
 SEED_MAX = 2**64 - 1
@@ -57,14 +57,14 @@ def _folder(value: object) -> Path:
 
 def _word(value: object) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise Problem(f"expected a word of a command line, got {describe(value)}")
+        raise JobProblem(f"expected a word of a command line, got {describe(value)}")
     return str(getattr(value, "text", value))
 
 
 attach(_word, schema={"type": ["string", "number"]})
 
 
-class JobFields(Part):
+class JobFields(JobPart):
     """The keys of a job, each by itself; ``Job`` adds what must hold between them."""
 
     TIMES: ClassVar[dict[str, str]] = {

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.checks.latency.instances import Figures, Parts, Passage, figures
+from rsltrace.checks.latency.instances import Figures, HopMessages, HopTimes, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
 from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
@@ -113,7 +113,7 @@ def _figures(of: Figures) -> dict[str, Any]:
     return {**asdict(of), "jitter_ns": of.jitter_ns}
 
 
-def _between(parts: Parts, passed: Passage) -> dict[str, Any]:
+def _between(parts: HopTimes, passed: HopMessages) -> dict[str, Any]:
     times = {part: figures(getattr(parts, part)) for part in _PARTS}
     return {
         **{part: None if of is None else _figures(of) for part, of in times.items()},

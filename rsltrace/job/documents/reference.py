@@ -18,7 +18,7 @@ from ruamel.yaml import YAML
 from rsltrace.job.documents.schema import field_schema, file_default, summary
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import attached, file_fields, models_in
-from rsltrace.job.reading.compose import Composition
+from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA
 
 _HEAD = """\
@@ -49,7 +49,7 @@ def reference() -> str:
     """Return the text of ``docs/jobs.md``."""
     out = [_HEAD]
     done: dict[type[BaseModel], str] = {}
-    out += _section("The job", None, [*file_fields(Job), *file_fields(Composition)], done)
+    out += _section("The job", None, [*file_fields(Job), *file_fields(CompositionKeys)], done)
     queue = list(_parts([*file_fields(Job)], ""))
     while queue:
         path, model = queue.pop(0)
@@ -65,7 +65,7 @@ def reference() -> str:
 def undocumented() -> list[str]:
     """Return the keys whose fields lack a description or an example."""
     missing, done = [], set()
-    queue: list[type[BaseModel]] = [Job, Composition]
+    queue: list[type[BaseModel]] = [Job, CompositionKeys]
     while queue:
         model = queue.pop()
         done.add(model)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     Globs,
     attach,
@@ -22,11 +22,11 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path, names_to_names
 from rsltrace.job.values.names import check_glob, check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 
 
-class QosSpec(Part):
+class QosSpec(JobPart):
     """QoS that replaces the recorded one."""
 
     reliability: Annotated[
@@ -68,7 +68,7 @@ attach(
 
 def _check_qos(value: object) -> object:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of topics to QoS, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of topics to QoS, got {describe(value)}")
     check_names(value, check_glob)
     return value
 
@@ -77,14 +77,14 @@ def _check_loop(value: object) -> bool | int:
     if isinstance(value, bool):
         return value
     if not isinstance(value, int):
-        raise Problem(f"expected true, false or how often it plays, got {describe(value)}")
+        raise JobProblem(f"expected true, false or how often it plays, got {describe(value)}")
     return whole(1)(value)
 
 
 attach(_check_loop, schema={"anyOf": [{"type": "boolean"}, {"type": "integer", "minimum": 1}]})
 
 
-class BagSpec(Part):
+class BagSpec(JobPart):
     """One entry of ``bags:``.
 
     ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
@@ -183,5 +183,7 @@ class BagSpec(Part):
     @classmethod
     def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if not value and from_file(info):
-            raise Problem("an empty list would play nothing: leave the key out to play all topics")
+            raise JobProblem(
+                "an empty list would play nothing: leave the key out to play all topics"
+            )
         return value

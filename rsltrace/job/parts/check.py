@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -19,7 +19,7 @@ from rsltrace.job.values.checks import (
     text,
 )
 from rsltrace.job.values.names import check_node_glob, check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike
 
@@ -30,7 +30,7 @@ MEASURES = ("latency", "age", "last_age", "reaction", "worst_reaction")
 Topic = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
-class LatencySpec(Part):
+class LatencySpec(JobPart):
     """A limit of an end-to-end latency. Give ``from`` and ``to``, or all topics of the chain."""
 
     TIMES: ClassVar[dict[str, str]] = {"below": "below_ns"}
@@ -76,13 +76,13 @@ class LatencySpec(Part):
     @model_validator(mode="after")
     def _says_which_chain(self) -> LatencySpec:
         if self.chain and (self.start is not None or self.end is not None):
-            raise Problem("give either chain, or from and to", ("chain",))
+            raise JobProblem("give either chain, or from and to", ("chain",))
         if not self.chain and (self.start is None or self.end is None):
-            raise Problem("which chain? Give from and to, or chain")
+            raise JobProblem("which chain? Give from and to, or chain")
         if self.chain and len(self.chain) < 2:
-            raise Problem("a chain has two topics at least", ("chain",))
+            raise JobProblem("a chain has two topics at least", ("chain",))
         if self.start is not None and self.start == self.end:
-            raise Problem("from and to are the same topic; give a loop as a chain", ("to",))
+            raise JobProblem("from and to are the same topic; give a loop as a chain", ("to",))
         return self
 
     @property
@@ -103,7 +103,7 @@ def check_metric_name(name: str) -> None:
 check_metric_name.pattern = r"\S"  # type: ignore[attr-defined]
 
 
-class MetricSpec(Part):
+class MetricSpec(JobPart):
     """One number. Exactly one of ``expression`` and ``function``; a text alone is an
     ``expression``."""
 
@@ -136,7 +136,7 @@ class MetricSpec(Part):
     @model_validator(mode="after")
     def _says_one_thing(self) -> MetricSpec:
         if (self.expression is None) == (self.function is None):
-            raise Problem("give expression or function")
+            raise JobProblem("give expression or function")
         return self
 
 
@@ -148,12 +148,12 @@ def _rate(value: object) -> float:
     found = _RATE.fullmatch(value) if isinstance(value, str) else None
     if found is None:
         if isinstance(value, str):
-            raise Problem(f"expected a rate (9 Hz), got {describe(value)}")
+            raise JobProblem(f"expected a rate (9 Hz), got {describe(value)}")
         return float(_positive(value))
     try:
         return float(_positive(float(found[1])))
     except ValueError:
-        raise Problem(f"expected a rate above 0 (9 Hz), got {describe(value)}") from None
+        raise JobProblem(f"expected a rate above 0 (9 Hz), got {describe(value)}") from None
 
 
 attach(
@@ -169,7 +169,7 @@ attach(
 Condition = Annotated[str | None, check(text(), optional=True)]
 
 
-class CheckSpec(Part):
+class CheckSpec(JobPart):
     """One property of the run. Exactly one of ``always``, ``never``,
     ``eventually``, ``rate``, ``latency`` and ``function``."""
 
@@ -276,10 +276,10 @@ class CheckSpec(Part):
         given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.KINDS)}: {what}")
+            raise JobProblem(f"give one of {', '.join(self.KINDS)}: {what}")
         (kind,) = given
         if kind == "rate" and self.at_least is None and self.at_most is None:
-            raise Problem("how often? Give at_least or at_most (9 Hz)", ("rate",))
+            raise JobProblem("how often? Give at_least or at_most (9 Hz)", ("rate",))
         for keys, kinds in (
             (("after", "within_ns"), ("always", "never", "eventually")),
             (("at_least", "at_most", "over_ns"), ("rate",)),
@@ -287,5 +287,5 @@ class CheckSpec(Part):
             for key in keys:
                 if getattr(self, key) is not None and kind not in kinds:
                     named = key.removesuffix("_ns")
-                    raise Problem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
+                    raise JobProblem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
         return self

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -20,7 +20,7 @@ from rsltrace.job.values.checks import (
     text,
 )
 from rsltrace.job.values.names import check_node_glob
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
 
 DRIFT_MAX_PPM = 100_000
@@ -45,7 +45,7 @@ def parse_interval(value: object) -> int:
     """Return a mean time between jumps: each jump of a run is drawn and kept."""
     time_ns = parse_time(value)
     if time_ns < JUMPS_EVERY_NS_MIN:
-        raise Problem("must be at least 1ms")
+        raise JobProblem("must be at least 1ms")
     return time_ns
 
 
@@ -57,9 +57,11 @@ def parse_ppm(value: object) -> float:
             raise ValueError
         ppm = float(bare)
     except ValueError:
-        raise Problem(f"expected parts per million such as 50ppm, got {describe(value)}") from None
+        raise JobProblem(
+            f"expected parts per million such as 50ppm, got {describe(value)}"
+        ) from None
     if not -DRIFT_MAX_PPM <= ppm <= DRIFT_MAX_PPM:
-        raise Problem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
+        raise JobProblem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
     return ppm
 
 
@@ -71,7 +73,7 @@ attach(parse_interval, schema=TIME_SCHEMA)
 attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "pattern": "ppm\\s*$"}]})
 
 
-class JumpSpec(Part):
+class JumpSpec(JobPart):
     """A jump of a clock."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
@@ -85,7 +87,7 @@ class JumpSpec(Part):
     )
 
 
-class RandomJumpsSpec(Part):
+class RandomJumpsSpec(JobPart):
     """Jumps at random times (a Poisson process) of random size (uniform), from the job's seed."""
 
     TIMES: ClassVar[dict[str, str]] = {"every": "every_ns", "most": "most_ns"}
@@ -98,7 +100,7 @@ class RandomJumpsSpec(Part):
     )
 
 
-class ClockSpec(Part):
+class ClockSpec(JobPart):
     """How the clock of some nodes differs from simulated time."""
 
     TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
@@ -145,7 +147,7 @@ class ClockSpec(Part):
     def _jumps_in_order(self) -> ClockSpec:
         for index in range(1, len(self.jumps)):
             if self.jumps[index].at_ns < self.jumps[index - 1].at_ns:
-                raise Problem("it is before the jump above", ("jumps", index, "at"))
+                raise JobProblem("it is before the jump above", ("jumps", index, "at"))
         return self
 
     def drift(self) -> Fraction:
@@ -158,7 +160,7 @@ def _clocks(value: object) -> object:
     if isinstance(value, dict):
         return (value,)
     if not isinstance(value, (list, tuple)):
-        raise Problem(
+        raise JobProblem(
             "expected a list of clocks, or what is different about all of them "
             f"(advances: true), got {describe(value)}"
         )

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     check,
     given,
@@ -20,13 +20,13 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_glob, check_node_glob, check_service_glob
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import parse_time
 
 Probability = Annotated[float, check(number(0, 1))]
 
 
-class BurstSpec(Part):
+class BurstSpec(JobPart):
     """Loss in bursts, after Gilbert and Elliott: a good and a bad state, probabilities per message.
 
     A burst lasts 1 / ``bad_to_good`` messages on average.
@@ -97,7 +97,7 @@ class LinkSpec(DelaySpec):
     )
 
 
-class OutageSpec(Part):
+class OutageSpec(JobPart):
     """A topic, service or node is cut off for some time."""
 
     TIMES: ClassVar[dict[str, str]] = {"from": "from_ns", "to": "to_ns"}
@@ -121,11 +121,11 @@ class OutageSpec(Part):
     @model_validator(mode="after")
     def _one_thing(self) -> OutageSpec:
         if sum(name is not None for name in (self.topic, self.service, self.node)) != 1:
-            raise Problem("give one of topic, service or node")
+            raise JobProblem("give one of topic, service or node")
         if self.to_ns < self.from_ns:
-            raise Problem("the outage ends before it begins", ("to",))
+            raise JobProblem("the outage ends before it begins", ("to",))
         if self.to_ns == self.from_ns:
-            raise Problem("the outage ends when it begins: 'to' has to be later", ("to",))
+            raise JobProblem("the outage ends when it begins: 'to' has to be later", ("to",))
         return self
 
     @property
@@ -138,7 +138,7 @@ class OutageSpec(Part):
         raise AssertionError("checked when it was made")
 
 
-class DelaysSpec(Part):
+class DelaysSpec(JobPart):
     """Delays and losses: the first match among ``links``, ``topics`` (exact names before globs),
     ``file`` and ``default``."""
 
@@ -181,5 +181,5 @@ class DelaysSpec(Part):
         for name, model in self.services.items():
             if model.duplicate:
                 place = ("services", name, "duplicate")
-                raise Problem("requests and responses of services never arrive twice", place)
+                raise JobProblem("requests and responses of services never arrive twice", place)
         return self

@@ -6,18 +6,18 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, number, text, whole
 from rsltrace.job.values.field_path import check_field, field_value
 from rsltrace.job.values.names import check_node_glob, check_topic
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import TimeLike, parse_time
 
 _HUGE = 1.7976931348623157e308
 FullName = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
-class FaultSpec(Part):
+class FaultSpec(JobPart):
     """One fault. Exactly one of ``crash``, ``hang`` and ``restart`` (a node, and
     when: ``at``, ``event``, or ``message`` of a ``topic``), of ``drop``, ``duplicate`` and
     ``delay`` (a topic, and which ``message``), or of ``change``, ``swap`` and ``repeat`` (a topic
@@ -203,7 +203,7 @@ class FaultSpec(Part):
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}: {what}")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}: {what}")
         for key, field, kinds in (
             ("at", self.at_ns, self.OF_NODES),
             ("event", self.event, self.OF_NODES),
@@ -214,40 +214,42 @@ class FaultSpec(Part):
             *((key, getattr(self, key), ("change",)) for key in ("field", *self.CHANGES)),
         ):
             if field is not None and self.kind not in kinds:
-                raise Problem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
+                raise JobProblem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
         self._says_when()
         self._says_what()
         if self.hang is not None and self.for_ns == 0:
-            raise Problem("must be more than 0; without it the node hangs up to the end", ("for",))
+            raise JobProblem(
+                "must be more than 0; without it the node hangs up to the end", ("for",)
+            )
         if self.delay is not None and not self.by_ns:
-            raise Problem("how late is the message? Give by: 200ms", ("delay",))
+            raise JobProblem("how late is the message? Give by: 200ms", ("delay",))
         return self
 
     def _says_what(self) -> None:
         if self.repeat is not None and self.message == 1:
-            raise Problem("there is no message before the first one", ("message",))
+            raise JobProblem("there is no message before the first one", ("message",))
         if self.change is None:
             return
         if self.field is None:
-            raise Problem(f"what changes? Give field: a field of {self.change}", ("change",))
+            raise JobProblem(f"what changes? Give field: a field of {self.change}", ("change",))
         given = [key for key in self.CHANGES if getattr(self, key) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
+            raise JobProblem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
 
     def _says_when(self) -> None:
         if not self.of_node:
             if self.message is None:
-                raise Problem(f"which message of {self.name}? Give message: 3", (self.kind,))
+                raise JobProblem(f"which message of {self.name}? Give message: 3", (self.kind,))
             return
         given = [key for key in ("at_ns", "event", "topic") if getattr(self, key) is not None]
         if len(given) > 1:
             names = " and ".join(key.removesuffix("_ns") for key in given)
-            raise Problem(f"{names} are given: say only once when it happens", (self.kind,))
+            raise JobProblem(f"{names} are given: say only once when it happens", (self.kind,))
         if (self.topic is None) != (self.message is None):
             missing = "message: 3" if self.message is None else "topic: /goal"
-            raise Problem(f"topic and message go together: give {missing}", (self.kind,))
+            raise JobProblem(f"topic and message go together: give {missing}", (self.kind,))
         if not given:
-            raise Problem(
+            raise JobProblem(
                 "when? Give at: 2s, event: 1280, or topic: /goal with message: 3", (self.kind,)
             )

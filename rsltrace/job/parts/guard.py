@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, items, text
-from rsltrace.job.values.problem import Problem, as_flag, describe
+from rsltrace.job.values.problem import JobProblem, as_flag, describe
 from rsltrace.trace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
@@ -17,10 +17,10 @@ ModeName = Literal["virtual", "record", "warn", "error", "allow"]
 
 def _module_glob(value: str) -> None:
     if not value.replace("*", "a").replace("?", "a").replace(".", "a").isidentifier():
-        raise Problem(f"expected the name of a module, or a glob like my_robot.*, got {value!r}")
+        raise JobProblem(f"expected the name of a module, or a glob like my_robot.*, got {value!r}")
 
 
-class SourceSpec(Part):
+class SourceSpec(JobPart):
     """How one source is handled."""
 
     mode: Annotated[str | None, check(text(), optional=True)] = Field(
@@ -53,7 +53,9 @@ def _source(source: Source) -> BeforeValidator:
                 if given == Mode.RECORD:
                     hint = "; what this source answers cannot be recorded"
             place = ("mode",) if isinstance(value, dict) else ()
-            raise Problem(f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place)
+            raise JobProblem(
+                f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place
+            )
         return {"mode": value} if isinstance(value, str) else value
 
     mode = {"enum": valid}
@@ -79,13 +81,13 @@ def _about(source: Source, what: str) -> Any:
 def _state(value: object) -> object:
     if value is True or value is False or value == "record":
         return value
-    raise Problem(f"expected true, false or record, got {describe(value)}")
+    raise JobProblem(f"expected true, false or record, got {describe(value)}")
 
 
 attach(_state, schema={"enum": [True, False, "record"]})
 
 
-class GuardSpec(Part):
+class GuardSpec(JobPart):
     """``guard:`` of a job, or of a node, which overrides the job's keys.
 
     ``enabled`` false (``guard: false``) leaves everything as it is. ``state`` hashes a node's state
@@ -173,7 +175,7 @@ def _guard(value: object) -> object:
     """Let true and false stand for ``{enabled: …}``."""
     if isinstance(value, str):
         hint = as_flag(value)
-        raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
+        raise JobProblem(f"expected true, false or a mapping, got {describe(value)}{hint}")
     return {"enabled": value} if isinstance(value, bool) else value
 
 

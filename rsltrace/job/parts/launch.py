@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, text
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import parse_time
 
 # ``start_after:`` of an entry: it starts later than the run does, as a launch file's timers and
@@ -21,13 +21,13 @@ from rsltrace.job.values.times import parse_time
 def _check_entry(value: object) -> str | int:
     """Check what names an entry of ``nodes:``: text, or its number in the list."""
     if isinstance(value, bool) or not isinstance(value, (str, int)) or value == "":
-        raise Problem(
+        raise JobProblem(
             "expected an entry of nodes: its name, what it runs, or its number in the list "
             f"(from 0), got {describe(value)}"
         )
     if isinstance(value, int):
         if value < 0:
-            raise Problem(f"entries of nodes are counted from 0, got {value}")
+            raise JobProblem(f"entries of nodes are counted from 0, got {value}")
         return int(value)
     return str(value)
 
@@ -38,7 +38,7 @@ FullName = Annotated[str | None, check(text(check_topic), optional=True)]
 EntryName = Annotated[str | int | None, check(_check_entry, optional=True)]
 
 
-class StartAfterSpec(Part):
+class StartAfterSpec(JobPart):
     """When an entry starts: ``delay`` after all conditions are true. A plain
     time stands for ``{delay: time}``. Entries are named by
     ``name``, by what they run, or by number."""
@@ -86,17 +86,17 @@ class StartAfterSpec(Part):
     @model_validator(mode="after")
     def _says_something(self) -> StartAfterSpec:
         if not self.model_fields_set:
-            raise Problem(f"give one of delay, {', '.join(self.CONDITIONS)}")
+            raise JobProblem(f"give one of delay, {', '.join(self.CONDITIONS)}")
         return self
 
 
 def _check_arguments(value: object) -> dict[str, str]:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of launch arguments to values, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of launch arguments to values, got {describe(value)}")
     found: dict[str, str] = {}
     for name, given in value.items():
         if not isinstance(given, (str, int, float)):
-            raise Problem(f"expected text or a number, got {describe(given)}", (str(name),))
+            raise JobProblem(f"expected text or a number, got {describe(given)}", (str(name),))
         text = str(given).lower() if isinstance(given, bool) else str(getattr(given, "text", given))
         found[str(name)] = text
     return found
@@ -108,7 +108,7 @@ attach(
 )
 
 
-class LaunchSpec(Part):
+class LaunchSpec(JobPart):
     """A launch file; a path stands for ``{file: ...}``."""
 
     file: Annotated[str, check(check_path)] = Field(

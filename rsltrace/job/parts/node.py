@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.launch import StartAfterSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.parts.process import InputSpec, RespawnSpec, check_environment, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
 from rsltrace.job.values.mappings import check_arguments, check_path, check_remappings
@@ -24,7 +24,7 @@ from rsltrace.job.values.names import (
     check_node_name,
 )
 from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target, target_text
 from rsltrace.job.values.times import TimeLike
 
@@ -55,7 +55,7 @@ attach(
 )
 
 
-class NodeSpec(Part):
+class NodeSpec(JobPart):
     """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``,
     ``program``, ``component``.
 
@@ -242,26 +242,26 @@ class NodeSpec(Part):
     def _check_kind(self) -> NodeSpec:
         kinds = [name for name in _KINDS if getattr(self, name) is not None]
         if not kinds:
-            raise Problem(f"missing key: give one of {_ONE_OF}")
+            raise JobProblem(f"missing key: give one of {_ONE_OF}")
         if len(kinds) > 1:
-            raise Problem(
+            raise JobProblem(
                 f"'{kinds[0]}' says what to run already: give only one of {_ONE_OF}",
                 (kinds[1],),
                 at_key=True,
             )
         if self.guard is not None and self.guard.pin is not None:
-            raise Problem(
+            raise JobProblem(
                 "'pin' is for the process that all nodes share: write it in the job's own 'guard:'",
                 ("guard", "pin"),
             )
         if self.node is not None and isinstance(self.arguments, tuple):
-            raise Problem(
+            raise JobProblem(
                 "a node takes arguments by name (a mapping); a list of command-line words is for "
                 f"{_WITH_WORDS}",
                 ("arguments",),
             )
         if self.node is not None and self.stdin is not None:
-            raise Problem(
+            raise JobProblem(
                 "a 'node' has no terminal of its own, all of them are in one process: give a "
                 f"function that spins it as {_WITH_WORDS}",
                 ("stdin",),
@@ -270,7 +270,7 @@ class NodeSpec(Part):
         self._check_process(kinds[0])
         self._check_loading(kinds[0])
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
-            raise Problem(
+            raise JobProblem(
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
                 ("arguments",),
             )
@@ -278,22 +278,22 @@ class NodeSpec(Part):
 
     def _check_process(self, kind: str) -> None:
         if self.isolated and kind in ("node", "main", "component"):
-            raise Problem(
+            raise JobProblem(
                 f"a '{kind}' is a part of a program: name what runs it as 'script', 'module' or "
                 "'executable' to have it in a process of its own",
                 ("isolated",),
             )
         if self.is_process and self.stdin is not None:
-            raise Problem("a process has no terminal in a run", ("stdin",), at_key=True)
+            raise JobProblem("a process has no terminal in a run", ("stdin",), at_key=True)
         if self.is_process and self.guard is not None:
-            raise Problem(
+            raise JobProblem(
                 "the guard is for Python code in the process of the run", ("guard",), at_key=True
             )
         for key in ("environment", "working_directory", "respawn"):
             if getattr(self, key) and not (self.is_process or kind == "executable"):
-                raise Problem(_ONLY_A_PROCESS[key], (key,), at_key=True)
+                raise JobProblem(_ONLY_A_PROCESS[key], (key,), at_key=True)
         if self.required and kind in ("node", "component"):
-            raise Problem(
+            raise JobProblem(
                 f"a '{kind}' lasts as long as the run: only a program ends", ("required",)
             )
 
@@ -301,17 +301,17 @@ class NodeSpec(Part):
         if kind != "component":
             for key in ("container", "extra_arguments"):
                 if getattr(self, key):
-                    raise Problem(f"only a 'component' has '{key}:'", (key,), at_key=True)
+                    raise JobProblem(f"only a 'component' has '{key}:'", (key,), at_key=True)
             return
         if self.container is None:
-            raise Problem("say which 'container:' loads the component, by its name: /container")
+            raise JobProblem("say which 'container:' loads the component, by its name: /container")
         for key, instead in (
             ("arguments", "a component takes 'parameters:' and 'extra_arguments:'"),
             ("stdin", "a component has no terminal in a run"),
             ("guard", "the guard is for Python code in the process of the run"),
         ):
             if getattr(self, key):
-                raise Problem(instead, (key,), at_key=True)
+                raise JobProblem(instead, (key,), at_key=True)
 
     @property
     def is_process(self) -> bool:

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, field_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import Globs, check, flag, whole
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 # ``hooks:``: functions that are called around the construction of the nodes.
 
 
-class HooksSpec(Part):
+class HooksSpec(JobPart):
     """Functions called around the construction of the nodes."""
 
     before: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
@@ -39,7 +39,7 @@ class HooksSpec(Part):
         ) -> None: ...
 
 
-class RecordSpec(Part):
+class RecordSpec(JobPart):
     """Which messages the trace keeps. Hashes are always kept."""
 
     payloads: Annotated[bool, check(flag)] = Field(
@@ -79,5 +79,7 @@ class RecordSpec(Part):
     @classmethod
     def _not_empty(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not value:
-            raise Problem("an empty list would keep no payload: write 'payloads: false' for that")
+            raise JobProblem(
+                "an empty list would keep no payload: write 'payloads: false' for that"
+            )
         return value

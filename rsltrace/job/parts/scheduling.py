@@ -10,11 +10,11 @@ from pydantic import Field, model_validator
 
 from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_node_glob
-from rsltrace.job.values.problem import Problem, describe, meant_by
+from rsltrace.job.values.problem import JobProblem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time
 
@@ -26,7 +26,7 @@ NodeGlob = Annotated[str, check(text(check_node_glob))]
 NameGlob = Annotated[str | None, check(text(), optional=True)]
 
 
-class PriorityRuleSpec(Part):
+class PriorityRuleSpec(JobPart):
     """A priority for a node, for one of its entities, or for a whole callback group."""
 
     priority: Annotated[int, check(whole(-PRIORITY_MAX, PRIORITY_MAX))] = Field(
@@ -47,11 +47,11 @@ class PriorityRuleSpec(Part):
     @model_validator(mode="after")
     def _not_both(self) -> PriorityRuleSpec:
         if self.entity is not None and self.group_of is not None:
-            raise Problem("give entity or group_of, not both", ("group_of",), at_key=True)
+            raise JobProblem("give entity or group_of, not both", ("group_of",), at_key=True)
         return self
 
 
-class DepartureSpec(Part):
+class DepartureSpec(JobPart):
     """A choice at which a callback other than the first ready one runs."""
 
     choice: Annotated[int, check(whole(0))] = Field(
@@ -69,7 +69,7 @@ class DepartureSpec(Part):
     )
 
 
-class PctSpec(Part):
+class PctSpec(JobPart):
     """Probabilistic concurrency testing: random priorities, changed at random choices."""
 
     depth: Annotated[int, check(whole(1, 100))] = Field(
@@ -84,7 +84,7 @@ class PctSpec(Part):
     )
 
 
-class PolicySpec(Part):
+class PolicySpec(JobPart):
     """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone
     is an ``order``."""
 
@@ -163,23 +163,23 @@ class PolicySpec(Part):
     def _one(self) -> PolicySpec:
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
         if len(given) != 1:
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}")
         if self.after_ns is not None and given[0] in ("departures", "recorded"):
-            raise Problem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
+            raise JobProblem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
         draws = self.pct is not None or self.order == "permutation"
         if self.seed is not None and not draws:
-            raise Problem("only permutation and pct draw anything", ("seed",), at_key=True)
+            raise JobProblem("only permutation and pct draw anything", ("seed",), at_key=True)
         choices: set[int] = set()
         for index, departure in enumerate(self.departures or ()):
             if departure.choice in choices:
-                raise Problem(
+                raise JobProblem(
                     f"choice {departure.choice} is there twice", ("departures", index, "choice")
                 )
             choices.add(departure.choice)
         return self
 
 
-class ExecutorSpec(Part):
+class ExecutorSpec(JobPart):
     """A simulated executor: a number of workers for some nodes."""
 
     nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
@@ -201,7 +201,7 @@ class EntityExecutionSpec(DistributionSpec):
     )
 
 
-class ExecutionSpec(Part):
+class ExecutionSpec(JobPart):
     """Execution times: the first match among ``entities``, ``nodes`` and ``default``."""
 
     MEANT: ClassVar[str] = "default"
@@ -221,7 +221,7 @@ class ExecutionSpec(Part):
     )
 
 
-class ThreadsSpec(Part):
+class ThreadsSpec(JobPart):
     """Where threads of one process take turns."""
 
     switch: Annotated[str, check(one_of(WHEN_BLOCKED, EVERY_LINE))] = Field(
@@ -239,12 +239,12 @@ def _policy(value: object) -> object:
     if value in PolicySpec.ONE_OF:
         example = PolicySpec.model_fields[value].examples or [None]
         shown = json.dumps({value: example[0]}).replace('"', "")
-        raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
+        raise JobProblem(f"{value!r} alone does not say enough; write for example {shown}")
     if value not in ORDERS:
         word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
         near = meant_by(word, names) or nearest(word, names)
         hint = f"; did you mean {near}?" if near else ""
-        raise Problem(
+        raise JobProblem(
             f"expected {' or '.join(ORDERS)}, or a mapping with "
             f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
         )
@@ -267,7 +267,7 @@ def _executors(value: object) -> object:
         hint = ""
         if isinstance(value, str) and value.startswith("multi"):
             hint = "; write [{workers: 4}]"
-        raise Problem(
+        raise JobProblem(
             f"expected {' or '.join(_EXECUTORS)} or a list of executors, got "
             f"{describe(value)}{hint}"
         )

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, part, positive_time, text, whole
 from rsltrace.job.values.names import check_field_path, check_topic
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_size, parse_time
 
 
-class TopicStop(Part):
+class TopicStop(JobPart):
     """A message that ends the run."""
 
     name: Annotated[str, check(text(check_topic))] = Field(
@@ -26,7 +26,7 @@ class TopicStop(Part):
     )
 
 
-class StopSpec(Part):
+class StopSpec(JobPart):
     """What ends a run: the first of these conditions."""
 
     MEANT: ClassVar[str] = "duration"

@@ -18,14 +18,14 @@ from pydantic import Field
 from rsltrace.errors import JobError
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import shorthand_at, without_alternatives
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.override import apply_override
-from rsltrace.job.reading.substitute import Substitution
+from rsltrace.job.reading.substitute import JobSubstitution
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource
 from rsltrace.job.values.checks import attach, check, check_names, is_plain, items, text
 from rsltrace.job.values.mappings import check_path, near_path
 from rsltrace.job.values.names import check_variable
-from rsltrace.job.values.problem import Collected, Loc, Problem, describe
+from rsltrace.job.values.problem import JobProblem, Loc, ProblemCollector, describe
 
 DEPTH_MAX = 20
 _WHAT = frozenset(("node", "main", "executable", "script", "module", "launch"))
@@ -42,13 +42,15 @@ attach(_paths, schema={"anyOf": [_PATH, {"type": "array", "items": _PATH}]})
 
 def _variables(value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to values, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of names to values, got {describe(value)}")
     check_names(value, check_variable)
-    problems = Collected()
+    problems = ProblemCollector()
     for name, inner in value.items():
         with problems.at(name):
             if inner is None or isinstance(inner, (dict, list)):
-                raise Problem(f"a variable is text, a number, true or false, got {describe(inner)}")
+                raise JobProblem(
+                    f"a variable is text, a number, true or false, got {describe(inner)}"
+                )
     problems.check()
     return value
 
@@ -61,7 +63,7 @@ attach(
 )
 
 
-class Composition(Part):
+class CompositionKeys(JobPart):
     """The keys that say what a job file is put together from. They are gone once it is read."""
 
     base: Annotated[str | None, check(text(), optional=True)] = Field(
@@ -87,7 +89,7 @@ class Composition(Part):
 
 
 @dataclass(eq=False)
-class Composed:
+class ComposedJob:
     """A job put together: its values, its own file, and from what else it was made."""
 
     root: Item
@@ -111,14 +113,14 @@ class Composed:
 
 def compose(
     name: str, read: Callable[[str], YamlSource], overrides: Sequence[tuple[str, str]]
-) -> Composed:
+) -> ComposedJob:
     """Return the job of the file ``name``, which ``read`` parses, with overrides applied.
 
     An override is (what messages call it, ``key=value``). Raises ``JobError``.
     """
     source = read(name)
-    composed = Composed(_root(source, name), source)
-    early = Substitution(None)
+    composed = ComposedJob(_root(source, name), source)
+    early = JobSubstitution(None)
     composed.root = _with_others(composed.root, name, read, early, [], composed)
     for label, override in overrides:
         composed.root = apply_override(composed.root, label, override, folder=os.getcwd())
@@ -126,7 +128,7 @@ def compose(
     values = dict(composed.root.value)
     variables = values.get("vars")
     known = variables.value if variables is not None and _is_mapping(variables) else {}
-    late = Substitution(known, lambda: _search_path(composed.root, Substitution(known)))
+    late = JobSubstitution(known, lambda: _search_path(composed.root, JobSubstitution(known)))
     composed.root = late.tree(composed.root)
     composed.substituted = early.used or late.used or bool(variables)
     return composed
@@ -145,9 +147,9 @@ def _with_others(
     root: Item,
     name: str,
     read: Callable[[str], YamlSource],
-    early: Substitution,
+    early: JobSubstitution,
     outer: list[str],
-    composed: Composed,
+    composed: ComposedJob,
 ) -> Item:
     """Return the values of a file with those of its base and included files below them."""
     outer = [*outer, os.path.realpath(name)]
@@ -174,9 +176,9 @@ def _other(
     root: Item,
     name: str,
     read: Callable[[str], YamlSource],
-    early: Substitution,
+    early: JobSubstitution,
     outer: list[str],
-    composed: Composed,
+    composed: ComposedJob,
     item: Item,
     role: str,
 ) -> Item:
@@ -209,7 +211,7 @@ def _other(
     return _with_search_path(_with_others(other, shown, read, early, outer, composed))
 
 
-def _search_path(root: Item, substitution: Substitution) -> list[Path]:
+def _search_path(root: Item, substitution: JobSubstitution) -> list[Path]:
     """Return the folders of a job's ``search_path``, or the folder of its file."""
     listed = root.value.get("search_path")
     items = listed.value if listed is not None and isinstance(listed.value, list) else [listed]
