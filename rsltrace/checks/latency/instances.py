@@ -70,7 +70,7 @@ class ChainMessages:
     """The inputs and outputs of a chain, each in the order in which they left.
 
     ``came`` has a row for each output and a column for each hop: the rows of its messages in
-    ``MessageFlow.messages``, shape (outputs, hops). ``source`` is the place of each output's input among
+    ``MessageFlow.messages``, shape (outputs, hops). ``source`` is the place of its input among
     the inputs. Times are in ns.
     """
 
