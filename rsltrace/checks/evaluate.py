@@ -8,16 +8,21 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from rsltrace.checks.functions import violations
-from rsltrace.checks.latency_checks import Known, LatencyResult, check_latency, latency_title
+from rsltrace.checks.latency_checks import (
+    LatencyResult,
+    MeasuredChains,
+    check_latency,
+    latency_title,
+)
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
 from rsltrace.conditions.condition import Armed, Condition, is_true
 from rsltrace.conditions.expressions import Expression, parse_expression
 from rsltrace.conditions.names import Names, names_of
-from rsltrace.conditions.occurrences import OnTopic
+from rsltrace.conditions.occurrences import TopicCondition
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.topic_fields import OF_MESSAGE, plain, topic_of
 from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
-from rsltrace.conditions.view import EventView, Moment
+from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
@@ -56,16 +61,16 @@ def opposite(text: str, names: Names) -> Condition:
             text,
         )
 
-    def arm(moment: Moment) -> Armed:
+    def arm(moment: PausedRun) -> Armed:
         armed = read.arm(moment)
-        assert isinstance(armed, OnTopic)
-        return _Unless(armed.text, armed.pattern, armed.expression)
+        assert isinstance(armed, TopicCondition)
+        return _FalseMessageCondition(armed.text, armed.pattern, armed.expression)
 
     return replace(read, arm=arm)
 
 
 @dataclass
-class _Unless(OnTopic):
+class _FalseMessageCondition(TopicCondition):
     """After an event that sends a message of which an expression is not true."""
 
     def _why(self, what: str, view: EventView, message: object) -> str:
@@ -196,7 +201,7 @@ def evaluating(
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
     results = []
-    known: Known = {}
+    known: MeasuredChains = {}
     for spec, held_one in zip(job.checks, held, strict=True):
         if held_one is not None:
             results.append(_result(spec, held_one))

@@ -42,12 +42,12 @@ def latency_title(spec: LatencySpec) -> str:
     return f"{_WORDS[spec.measure]} of {named} below {format_duration(spec.below_ns)}{most}"
 
 
-Known = dict[tuple[object, ...], Latencies]
+MeasuredChains = dict[tuple[object, ...], Latencies]
 """Chains that are measured already, by what was asked for."""
 
 
 def check_latency(
-    trace: Trace, spec: LatencySpec, known: Known | None = None
+    trace: Trace, spec: LatencySpec, known: MeasuredChains | None = None
 ) -> Iterator[LatencyResult | None]:
     """Hold a check against a trace: yield None now and then, and in the end what came of it.
 

@@ -1,4 +1,4 @@
-"""``rsltrace analyze``: bounds of response times, beside the worst that runs have shown."""
+"""``rsltrace analyze``: worst-case response times, beside those that runs have shown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import set_option
+from rsltrace.cli.options import set_option
 from rsltrace.cli.output.text_file import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
@@ -32,33 +32,33 @@ if TYPE_CHECKING:
 @click.option(
     "--times",
     type=click.Choice(("job", "max", "p99")),
-    help="How long callbacks take: as the job's execution: says (default where it does), or as "
-    "measured in the TRACES, the longest or the 99 % quantile.",
+    help="Take the execution times of callbacks from the job's execution: (default if it has one), "
+    "or from TRACES: the maximum or the 99 % quantile.",
 )
 @click.option(
     "--deadline",
     "deadlines",
     multiple=True,
     metavar="[END=]TIME",
-    help="Deadline of all chains, or of those that end in a topic, service or node: "
-    "/cmd_vel=50ms. Default: the period of each. Can be given several times.",
+    help="Set the deadline of all chains, or of those that end in a topic, service or node: "
+    "/cmd_vel=50ms. Default: the period of each chain. Repeatable.",
 )
 @click.option(
     "--reservation",
     metavar="BUDGET/PERIOD",
-    help="Each executor has a reservation, 2ms/5ms, not a processor of its own.",
+    help="Give each executor a CPU reservation, such as 2ms/5ms, instead of a CPU of its own.",
 )
 @click.option(
     "--one-processor",
     is_flag=True,
-    help="All executors share one processor: those with faster timers interrupt the others.",
+    help="Let all executors share one CPU. Those with faster timers preempt the others.",
 )
 @set_option
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Draw bounds and observations: .png, .svg or .pdf (needs matplotlib).",
+    help="Plot bounds and observations as .png, .svg or .pdf (needs matplotlib).",
 )
 @click.option(
     "--format",
@@ -66,7 +66,7 @@ if TYPE_CHECKING:
     type=click.Choice(("text", "json")),
     default="text",
     show_default=True,
-    help="What to print: a table, or JSON (times in nanoseconds).",
+    help="Print a table, or JSON (times in nanoseconds).",
 )
 def analyze(
     job: Path,
@@ -79,13 +79,16 @@ def analyze(
     plot: Path | None,
     form: str,
 ) -> None:
-    """Print how long the chains of JOB take at most, in any run: from the release of a timer (or a
-    message from outside) to the end of the last callback; beside that the worst that a simulated
-    run has shown, and each of the native TRACES.
+    """Compute the worst-case response time of each callback chain of JOB.
 
-    The job is simulated to see who sends what to whom, unless one of the TRACES is a simulated
-    one. Which analysis holds depends on the job's policy (see docs/real-time.md). The exit status
-    is 0 if every chain meets its deadline, 1 if one does not, or may not.
+    A response time runs from the release of a timer (or an external message) to the end of the
+    last callback of the chain. The table also shows the worst response time of a simulated run
+    and of each of the native TRACES.
+
+    The job is simulated to find its chains, unless one of the TRACES is a simulated one. The
+    analysis depends on the job's policy (see docs/real-time.md).
+
+    Exit status: 0 if every chain meets its deadline, 1 if one does not or may not.
 
     \b
       rsltrace analyze job.yaml
@@ -110,13 +113,13 @@ def analyze(
             sources = native or simulated
             if not sources:
                 raise click.UsageError(
-                    "nothing says how long callbacks take: give native traces of the job "
-                    "(rsltrace record --native), or execution: in it"
+                    "the execution times of callbacks are unknown: give native traces of the job "
+                    "(rsltrace record --native), or add execution: to it"
                 )
             given = timing.measured_times(sources, measured)
             loaded = timing.with_times(loaded, given)
         elif not loaded.execution:
-            raise click.UsageError(f"{job} has no execution:, which --times job would take")
+            raise click.UsageError(f"{job} has no execution:, which --times job needs")
         shown = simulated[0] if simulated else _simulated(loaded, stack)
         found = timing.analyze(
             loaded,
@@ -151,7 +154,7 @@ def _supply(reservation: str | None) -> Supply:
             raise ValueError
     except ValueError:
         raise click.BadParameter(
-            f"{reservation!r} is no reservation: give budget and period, as in 2ms/5ms",
+            f"{reservation!r} is not a reservation: give budget and period, such as 2ms/5ms",
             param_hint="--reservation",
         ) from None
     return Supply(budget, period)
@@ -183,8 +186,8 @@ def _opened(
         (native if is_native(trace) else simulated).append(ObservedChains(trace))
     if len(simulated) > 1:
         raise TraceError(
-            f"{simulated[1].trace.name} is of a simulated run, as {simulated[0].trace.name} is: "
-            "give one at most, and any number of native ones"
+            f"{simulated[0].trace.name} and {simulated[1].trace.name} are both simulated runs: "
+            "give at most one, and any number of native ones"
         )
     return simulated, native
 

@@ -1,4 +1,4 @@
-"""``rsltrace audit``: what in the nodes' sources could make runs differ."""
+"""``rsltrace audit``: scan the sources of nodes for nondeterminism."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _FORMATS = ("text", "json", "github")
     type=click.Choice(_FORMATS),
     default="text",
     show_default=True,
-    help="What to print: lines for people, JSON, or GitHub's annotations.",
+    help="Print text, JSON or GitHub annotations.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Short for --format json.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON (the same as --format json).")
 @click.option(
     "--unguarded",
     is_flag=True,
-    help="Only what the guard does not make deterministic.",
+    help="Show only what the guard does not make deterministic.",
 )
 def audit(
     words: tuple[str, ...],
@@ -47,17 +47,17 @@ def audit(
     as_json: bool,
     unguarded: bool,
 ) -> int:
-    """Look into the sources of JOB's nodes, or of a .py file or folder, for what makes runs differ.
+    """Scan the sources of JOB's nodes, a .py file or a folder for nondeterminism.
 
     \b
-      rsltrace audit job.yaml      the nodes' modules, and what they import below search_path
-      rsltrace audit src/my_robot  every Python file below a folder
+      rsltrace audit job.yaml      scan the nodes' modules and their imports below search_path
+      rsltrace audit src/my_robot  scan every Python file below a folder
 
-    Nothing is executed. Each line names the place, the call, what the guard does about it (virtual,
-    pinned, recorded, detected, refused, nothing) and what to write instead. A comment on the line,
-    "# rsltrace: allow" or "# rsltrace: allow clock", silences it.
+    Nothing is executed. Each finding has the file and line, the call, what the guard does about it
+    (virtual, pinned, recorded, detected, refused, nothing) and what to write instead. To silence a
+    finding, add the comment "# rsltrace: allow" or "# rsltrace: allow clock" to its line.
 
-    The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
+    Exit status: 0 without findings, 1 with findings, 2 for an error.
     """
     result = _look(words, launch, skip, overrides)
     from rsltrace.guard.audit.rules import IS_SAFE
@@ -82,7 +82,7 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
     only = Path(words[0]) if len(words) == 1 and launch is None else None
     if only is not None and (only.is_dir() or only.suffix == ".py"):
         if overrides:
-            raise click.UsageError(f"--set changes a job, and {only} is none")
+            raise click.UsageError(f"--set needs a job, and {only} is not one")
         return audit_path(only)
     from rsltrace.run.inputs import without_launch_files
     from rsltrace.run.plans.executables import source_of
@@ -144,7 +144,7 @@ def _annotation(one: Found) -> str:
 
 
 def _shown(path: Path) -> str:
-    """Return a path as seen from here, if it is below."""
+    """Return a path relative to the working directory, if it is below that."""
     try:
         return str(path.absolute().relative_to(Path.cwd()))
     except ValueError:

@@ -1,4 +1,4 @@
-"""``rsltrace bisect``: which commit changed what a job does?"""
+"""``rsltrace bisect``: find the commit that changed a job's behaviour."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
-from rsltrace.cli.verify import Given, terminated
+from rsltrace.cli.options import (
+    json_option,
+    no_pin_option,
+    seed_option,
+    timeout_option,
+    until_option,
+)
+from rsltrace.cli.verify import JobArguments, handling_signals
 from rsltrace.errors import BisectError, JobError, OutputError
 from rsltrace.terminal import say, tell
 
@@ -34,47 +41,39 @@ _BEFORE, _AFTER = "before.mcap", "after.mcap"
     "--check",
     "expression",
     metavar="EXPR",
-    help="Judge by this, not by the digest: 'count(\"/odom\") > 0', or MODULE:FUNCTION of a Trace.",
+    help="Test this instead of the digest: 'count(\"/odom\") > 0', or MODULE:FUNCTION that takes "
+    "a Trace.",
 )
 @click.option(
     "--run",
     "shell",
     metavar="COMMAND",
-    help="Judge by the exit status of a shell command: 0 good, 125 skip, others bad; "
-    "RSLTRACE_TRACE names the trace.",
+    help="Test with a shell command: exit status 0 is good, 125 skip, others bad. RSLTRACE_TRACE "
+    "is the path of the trace.",
 )
-@click.option("--first-parent", is_flag=True, help="Of merges, follow the first parent only.")
+@click.option("--first-parent", is_flag=True, help="Follow only the first parent of merges.")
 @click.option(
     "--share",
     "shared",
     multiple=True,
     type=click.Path(path_type=Path, exists=True),
     metavar="PATH",
-    help="A file or folder here that git does not track, and that the nodes need.",
+    help="Make this untracked file or folder available to every revision. Repeatable.",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help=f"Keep the traces before and after the change there ({_BEFORE}, {_AFTER}).",
+    help=f"Keep the traces before and after the change in DIR ({_BEFORE}, {_AFTER}).",
 )
-@click.option("--force", is_flag=True, help="Replace traces that are in DIR.")
-@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option(
-    "--until",
-    metavar="T",
-    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
-)
-@click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
-@click.option(
-    "--timeout",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="S",
-    help="Kill a run after so many seconds (default: 30 times what the first took, at least 120).",
-)
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+@click.option("--force", is_flag=True, help="Replace existing traces in DIR.")
+@seed_option
+@until_option
+@no_pin_option
+@timeout_option
+@json_option
+@click.option("-q", "--quiet", is_flag=True, help="Show no progress.")
 def bisect(
     words: tuple[str, ...],
     launch: Path | None,
@@ -95,15 +94,16 @@ def bisect(
     as_json: bool,
     quiet: bool,
 ) -> int:
-    """Run JOB at revisions of its git repository and name the first commit that changed it.
+    """Run JOB at revisions of its git repository and find the first commit that changed its
+    behaviour.
 
-    The job and its nodes are those of each revision, in a git worktree of their own; the checkout
-    is not touched. What changes is the run's digest, or what --check or --run says. Both ends are
-    run first, and twice. Revisions that do not run (or in which a node raises, unless it does so
-    at an end) are skipped, as by "git bisect skip".
+    A change is a different digest, or a different result of --check or --run. Each revision runs
+    with its own job and nodes in a separate git worktree; your checkout is not touched. Both end
+    revisions run first, and twice. Revisions that do not run are skipped, as by "git bisect skip",
+    and so are those in which a node raises an exception that neither end raises.
 
-    The exit status is 0 if one commit is named, 1 if only several of which one is it, 2 for
-    trouble: ends that do not differ, a job that is not deterministic, no repository.
+    Exit status: 0 if one commit was found; 1 if skipped revisions leave several candidates; 2 for
+    an error: the ends do not differ, the job is nondeterministic, or there is no repository.
     """
     from rsltrace.child_processes import Processes
     from rsltrace.cli.output.search_text import line_of
@@ -113,8 +113,8 @@ def bisect(
     from rsltrace.search.bisect.worktree import Worktree
 
     if expression is not None and shell is not None:
-        raise click.UsageError("--check or --run, not both")
-    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+        raise click.UsageError("give --check or --run, not both")
+    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     files = _named(given)
     if output is not None and not force:
         _check_free(output)
@@ -129,7 +129,7 @@ def bisect(
     notes = [] if job is None else list(_same_everywhere(repository, job))
     for note in notes:
         tell(f"note: {note}")
-    with terminated(), Worktree(repository, links) as tree:
+    with handling_signals(), Worktree(repository, links) as tree:
         runner = Runner(repository, tree, tuple(given.arguments(tree.path)), processes, timeout)
         try:
             search = Search(
@@ -154,7 +154,7 @@ def _check(expression: str | None, shell: str | None, processes: Processes) -> C
     return None if shell is None else command(shell, processes)
 
 
-def _named(given: Given) -> list[Path]:
+def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
     files = [Path(word) for word in given.words if ":=" not in word]
     files += [given.launch] if given.launch is not None else []
@@ -168,25 +168,22 @@ def _named(given: Given) -> list[Path]:
 def _check_free(folder: Path) -> None:
     for name in (_BEFORE, _AFTER):
         if (folder / name).exists():
-            raise OutputError(f"{folder / name} exists; --force replaces it")
+            raise OutputError(f"{folder / name} exists; use --force to replace it")
 
 
 def _check_ends(repository: Repository, good: Any, bad: Any) -> None:
-    """See that the search has a beginning and an end.
+    """Check the two ends of the search.
 
-    :raises BisectError: they are one commit, or in the wrong order.
+    :raises BisectError: they are the same commit, or in the wrong order.
     """
     if good == bad:
-        raise BisectError(f"the good and the bad revision are one commit, {good}")
+        raise BisectError(f"the good and the bad revision are the same commit, {good}")
     if repository.is_ancestor(bad, good):
-        raise BisectError(
-            f"{bad} is older than {good}: the first commit that changed something is looked for, "
-            "so --good is the older one"
-        )
+        raise BisectError(f"--bad {bad} is an ancestor of --good {good}: exchange them")
 
 
-def _job_here(given: Given) -> Job | None:
-    """Return the job in the checkout; None if it is broken: what counts is that of a revision."""
+def _job_here(given: JobArguments) -> Job | None:
+    """Return the job in the checkout, or None if it is broken: revisions have their own."""
     try:
         return job_of(given.words, given.launch, given.skip, given.overrides)[0]
     except JobError:
@@ -194,7 +191,7 @@ def _job_here(given: Given) -> Job | None:
 
 
 def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> Iterator[Path]:
-    """Yield what the job here names in the checkout and git does not track: it is shared."""
+    """Yield untracked files of the checkout that the job names, to share with all revisions."""
     candidates = list(files)
     if job is not None:
         texts = _texts(job.resolved())
@@ -206,7 +203,7 @@ def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> It
 
 
 def _same_everywhere(repository: Repository, job: Job) -> Iterator[str]:
-    """Yield notes on code that no revision has another version of, as far as runs are concerned."""
+    """Yield notes on code that is the same at every revision because of where it is loaded from."""
     from rsltrace.replay.code import code_of, file_of
     from rsltrace.search.bisect.runs import python_folders
 
@@ -218,8 +215,8 @@ def _same_everywhere(repository: Repository, job: Job) -> Iterator[str]:
         is_module = all(part.isidentifier() for part in name.split("."))
         if is_ours and is_module and file_of(name, folders, installed=False) is None:
             yield (
-                f"{name} is loaded from {file} at every revision: name its folder, relative to the "
-                "job, in search_path"
+                f"{name} is loaded from {file} at every revision: add its folder, relative to the "
+                "job, to search_path"
             )
     if found and not any(file.resolve().is_relative_to(repository.top) for _, file in found):
         name, file = found[0]
@@ -241,7 +238,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _report(found: Found, runner: Runner, output: Path | None, *, as_json: bool) -> int:
-    """Say what was found, keep the traces if asked for, and return the exit status."""
+    """Print the result, keep the traces if wanted, and return the exit status."""
     from rsltrace.cli.output.search_text import as_text, as_values
 
     kept = None

@@ -1,4 +1,4 @@
-"""``rsltrace cat``: the events of a trace, one per line, for people and pipes."""
+"""``rsltrace cat``: the events of a trace, one per line."""
 
 from __future__ import annotations
 
@@ -29,20 +29,17 @@ from rsltrace.trace.words.code import code_places, output_places, places_text
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.kinds import flag_names
 
-# One event as a line of aligned columns, for ``rsltrace cat``.
-
 _VALUE_MAX = 200
 _COLUMN_MAX = 40
 """A column is as wide as its longest name, up to here; longer names push the rest to the right."""
 
 
 class EventLines:
-    """Writes the events of a trace as lines.
+    """Formats the events of a trace as lines.
 
-    Index, simulated seconds, node, kind, entity, input hash, output hash, outputs, flags. Columns
-    without a value hold ``-``; outputs and flags come last because they have any length. With
-    ``code``, the place of the function that ran comes before the outputs, and each of these has its
-    line.
+    Columns without a value hold ``-``; outputs and flags come last because their length varies.
+    With ``code``, the source line of the callback comes before the outputs, and each output has its
+    own.
     """
 
     def __init__(self, trace: Trace, *, code: bool = False) -> None:
@@ -61,7 +58,7 @@ class EventLines:
         self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
 
     def line(self, event: Event, outputs: list[Output]) -> str:
-        """Return the line of an event, without a line end; findings of the guard on their own."""
+        """Return the line of an event, then a line for each finding of the guard in it."""
         node = self._words.node(event, outputs) or "-"
         name = self._words.names.name(event.entity) or "-"
         columns = (
@@ -81,7 +78,7 @@ class EventLines:
 
     def _from_where(self, output: Output) -> str:
         if output.kind is OutputKind.DRAW:
-            return ""  # it says so itself
+            return ""  # its text has the line
         places = printable(places_text(output_places(self._trace, output)))
         return f"at {places}" if places else ""
 
@@ -106,9 +103,8 @@ else:
     _TimeParam = click.ParamType  # not generic before click 8.2
 
 
-class _Time(_TimeParam):
-    """A time of the run: seconds, or a number with a unit as in a job; or ``@`` and a simulated
-    time."""
+class _RunTimeParam(_TimeParam):
+    """A time of the run, or a simulated time after ``@``."""
 
     name = "time"
 
@@ -127,50 +123,52 @@ class _Time(_TimeParam):
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
-@click.option("--payloads", is_flag=True, help="With --json: add the decoded messages.")
+@click.option("--payloads", is_flag=True, help="With --json: include the decoded messages.")
 @click.option(
     "--code",
     is_flag=True,
-    help="Add where the function that ran is (module.py:24), and the lines of its outputs. "
-    "'or elsewhere': this output was not looked at.",
+    help="Add the source line of each callback (module.py:24) and of its outputs. 'or elsewhere' "
+    "marks an output whose line was not recorded.",
 )
 @click.option(
     "--topic",
     "topics",
     multiple=True,
     metavar="GLOB",
-    help="Only events that receive from or send to such a topic or service.",
+    help="Print only events that receive from or send to these topics or services.",
 )
-@click.option("--node", "nodes", multiple=True, metavar="GLOB", help="Only events of such nodes.")
+@click.option(
+    "--node", "nodes", multiple=True, metavar="GLOB", help="Print only events of these nodes."
+)
 @click.option(
     "--entity",
     "entities",
     multiple=True,
     metavar="ID|GLOB",
-    help="Only events of these entities, by id or name.",
+    help="Print only events of these entities, by id or name.",
 )
 @click.option(
     "--kind",
     "kinds",
     multiple=True,
     type=click.Choice([kind.label for kind in EventKind]),
-    help="Only events of this kind.",
+    help="Print only events of this kind.",
 )
 @click.option(
     "--from",
     "first",
-    type=_Time(),
+    type=_RunTimeParam(),
     metavar="T",
-    help="Only from time T of the run on (seconds, or 90s, 5ms, …; @T: from simulated time T on).",
+    help="Start at time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
 )
-@click.option("--to", "last", type=_Time(), metavar="T", help="Only up to time T, T included.")
+@click.option("--to", "last", type=_RunTimeParam(), metavar="T", help="End at time T, inclusive.")
 @click.option(
     "--where",
     metavar="CONDITION",
-    help="Only events of which a condition is true, as of a breakpoint: "
+    help="Print only events that match a condition, written as a breakpoint: "
     "'/odom: pose.pose.position.x > 3', 'log warn', 'exception'.",
 )
-@click.option("--limit", type=click.IntRange(min=0), metavar="N", help="At most N events.")
+@click.option("--limit", type=click.IntRange(min=0), metavar="N", help="Print at most N events.")
 def cat(
     trace: Path,
     as_json: bool,
@@ -187,13 +185,13 @@ def cat(
 ) -> None:
     """Print the events of TRACE, one per line, in the order they happened.
 
-    Columns: index, simulated time in seconds, node, kind, entity, hash of the input, hash of the
-    outputs, the outputs (/topic, call /service, reply /service, log LEVEL text, …), [flags].
-    Lines that begin with "!" are what the guard found in the event above them. What rclpy makes
-    for every node is counted; --json lists it.
+    The columns are: index, simulated time in seconds, node, kind, entity, hash of the input, hash
+    of the outputs, outputs (/topic, call /service, reply /service, log LEVEL text and so on), and
+    [flags]. A line that starts with "!" is a finding of the guard in the event above it. Entities
+    that rclpy creates in every node are only counted; --json lists them.
 
-    Options of different names must all hold; of several values of one option, any. Globs are
-    shell patterns that match whole names: --topic '/robot1/*'.
+    All filter options are repeatable, except times. An event must match one value of each option
+    given. Globs match whole names: --topic '/robot1/*'.
     """
     if payloads and not as_json:
         raise click.UsageError("--payloads needs --json")
@@ -213,8 +211,8 @@ def _json_form(trace: Trace, payloads: bool) -> Callable[[Event, list[Output]], 
 
 
 @dataclass(frozen=True, slots=True)
-class _Choice:
-    """Which events are wanted. None stands for all; arrays hold sorted numbers."""
+class _EventFilter:
+    """Which events to print. None stands for all; arrays are sorted."""
 
     entities: npt.NDArray[np.uint32] | None
     touching: npt.NDArray[np.uint32] | None
@@ -231,7 +229,7 @@ def _choice(
     kinds: tuple[str, ...],
     first: TimeInRun | None,
     last: TimeInRun | None,
-) -> _Choice:
+) -> _EventFilter:
     everything = list(trace.entities.values())
     wanted: set[int] | None = None
     touching = None
@@ -246,7 +244,7 @@ def _choice(
         on_topic = _named(trace, "topic or service", topics, with_topic)
         touching = np.array(sorted(on_topic), dtype=np.uint32)
     labels = [kind for kind in EventKind if kind.label in kinds]
-    return _Choice(
+    return _EventFilter(
         entities=None if wanted is None else np.array(sorted(wanted), dtype=np.uint32),
         touching=touching,
         kinds=np.array(labels, dtype=np.uint8) if kinds else None,
@@ -260,8 +258,8 @@ def _named(
 ) -> set[int]:
     """Return the entities that match one of ``globs``.
 
-    :raises TraceError: if none matches one of them: an empty answer to a mistyped name looks like
-        a run in which nothing happened.
+    :raises TraceError: a glob matches nothing, so that a typing mistake does not look like a run
+        in which nothing happened.
     """
     names = sorted({entity.name for entity in there if entity.name})
     found: set[int] = set()
@@ -280,7 +278,7 @@ def _named(
 
 
 def _events(
-    trace: Trace, choice: _Choice, where: TraceCondition | None
+    trace: Trace, choice: _EventFilter, where: TraceCondition | None
 ) -> Iterator[tuple[Event, list[Output]]]:
     """Yield the chosen events with their outputs; memory is that of one segment."""
     segments = trace.segments
@@ -304,7 +302,7 @@ def _events(
 
 
 def _mask(
-    events: npt.NDArray[np.void], outputs: npt.NDArray[np.void], choice: _Choice
+    events: npt.NDArray[np.void], outputs: npt.NDArray[np.void], choice: _EventFilter
 ) -> npt.NDArray[np.bool_]:
     stamps = events["stamp"]
     mask: npt.NDArray[np.bool_] = (stamps >= np.uint64(choice.from_ns)) & (

@@ -1,4 +1,4 @@
-"""``rsltrace check``: what a job means, and what its graph looks like, without running it."""
+"""``rsltrace check``: a job and its graph, without running it."""
 
 from __future__ import annotations
 
@@ -31,23 +31,26 @@ if TYPE_CHECKING:
     type=click.Choice(("text", "json")),
     default="text",
     show_default=True,
-    help="What to print: text for people, or JSON with every default filled in.",
+    help="Print text, or JSON with every default filled in.",
 )
 @click.option(
     "--graph",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE.svg",
-    help="Draw the graph of nodes and topics.",
+    help="Draw the graph of nodes and topics into an SVG file.",
 )
 @click.option(
     "--job",
     "other",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="JOB",
-    help="Hold the checks of this job against the trace, instead of those of its own.",
+    help="Evaluate the checks of this job on the trace, instead of the trace's own.",
 )
 @click.option(
-    "--all", "everything", is_flag=True, help="With what every node has: /rosout, parameters, …"
+    "--all",
+    "everything",
+    is_flag=True,
+    help="Include what every node has: /rosout, parameter services and so on.",
 )
 def check(
     words: tuple[str, ...],
@@ -59,18 +62,17 @@ def check(
     other: Path | None,
     everything: bool,
 ) -> int:
-    """Check JOB (or a launch file) and print what it means: all of the job, and its nodes' graph.
+    """Check JOB (or a launch file) and print the complete job and the graph of its nodes.
 
-    The nodes are constructed (so their constructors run), the loop never is: what a node creates
-    later, in a callback, is not seen.
+    The nodes are constructed but no callback runs, so the graph lacks what nodes create in
+    callbacks.
 
-    With a trace instead of a job (rsltrace check run.mcap), the job's checks (checks:) are held
-    against it; functions among them are called only where --job names a file.
+    Given a trace instead (rsltrace check run.mcap), evaluate the job's checks (checks:) on it.
+    Checks that are Python functions run only if --job names the job file.
 
-    The exit status is 0 if all is well, 1 if a check fails, or something in the graph looks
-    wrong (QoS that keeps a publisher and a subscription apart, a subscription or a client without
-    anybody at the other end, a topic that a bag plays and a node publishes, a rule of the job that
-    fits nothing), 2 if the job cannot run.
+    Exit status: 0 if nothing is wrong; 1 if a check fails or the graph looks wrong (incompatible
+    QoS, a subscription without a publisher, a client without a server, a topic that both a bag
+    and a node publish, a rule of the job that matches nothing); 2 if the job cannot run.
     """
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
@@ -83,10 +85,12 @@ def check(
         raise click.BadParameter(f"{graph} should end in .svg", param_hint="--graph")
     if len(words) == 1 and is_trace(words[0]):
         if graph is not None or everything or overrides or launch is not None:
-            raise click.UsageError(f"{words[0]} is a trace: --graph, --all and --set are for a job")
+            raise click.UsageError(
+                f"{words[0]} is a trace: --graph, --all, --set and --launch need a job"
+            )
         return _check_trace(Path(words[0]), other, form)
     if other is not None:
-        raise click.UsageError("--job is for a trace: rsltrace check run.mcap --job job.yaml")
+        raise click.UsageError("--job needs a trace: rsltrace check run.mcap --job job.yaml")
     loaded, _ = job_of(words, launch, skip, overrides)
     check_texts(loaded)
     check_metrics(loaded)
@@ -121,9 +125,9 @@ def check(
 
 
 def _check_trace(path: Path, other: Path | None, form: str) -> int:
-    """Hold checks against a trace; the code that its own job names is not run."""
+    """Evaluate checks on a trace without running code that its own job names."""
     from rsltrace.checks.evaluate import job_of_checks
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import load_job
     from rsltrace.trace.reader import Trace
 
@@ -135,9 +139,9 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
     if not (job.checks or job.metrics):
         named = other if other is not None else f"the job of {path}"
         none = f"{named} has neither checks (checks:) nor metrics"
-        tell(f"rsltrace: error: {none}; --job names another job")
+        tell(f"rsltrace: error: {none}; use --job to name another job")
         return EXIT_USAGE
-    checked = Checked(job, path, functions=other is not None)
+    checked = CheckReport(job, path, functions=other is not None)
     if form == "json":
         say(json.dumps(checked.values(), indent=2))
     else:

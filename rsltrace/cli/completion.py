@@ -1,4 +1,4 @@
-"""``rsltrace completion``: what a shell needs to complete commands, options and files."""
+"""``rsltrace completion``: scripts for the completion of commands, options and files."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _PROGRAM = "rsltrace"
 def complete_files(
     context: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
-    """Have the shell offer files, for arguments that may be something else, too (addresses)."""
+    """Let the shell complete files for arguments that may also be addresses."""
     from click.shell_completion import CompletionItem
 
     return [CompletionItem(incomplete, type="file")]
@@ -26,7 +26,7 @@ def complete_files(
 @click.command()
 @click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
 def completion(shell: str) -> None:
-    """Print the script that lets SHELL complete rsltrace's commands and options.
+    """Print the script that completes the commands and options of rsltrace in a shell.
 
     \b
       bash: eval "$(rsltrace completion bash)"                 in ~/.bashrc

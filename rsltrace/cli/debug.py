@@ -1,4 +1,4 @@
-"""``rsltrace debug``: stop a run where you like, look into its nodes, go back."""
+"""``rsltrace debug``: breakpoints, inspection of nodes, steps backwards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from rsltrace.cli.job_source import set_option
+from rsltrace.cli.options import job_folder_option, set_option, trust_option
 from rsltrace.cli.replay import agree, code_lines
 from rsltrace.terminal import tell
 from rsltrace.trace.model.texts import printable
@@ -23,15 +23,10 @@ from rsltrace.trace.model.texts import printable
     "commands",
     multiple=True,
     metavar="COMMAND",
-    help="Carry this out first: -c 'break node /ekf' -c continue.",
+    help="Run this command first: -c 'break node /ekf' -c continue. Repeatable.",
 )
-@click.option(
-    "--job-folder",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="The folder of the job file (default: that of the trace, or the present one).",
-)
-@click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
+@job_folder_option
+@trust_option
 @set_option
 @click.option(
     "--checkpoints",
@@ -39,7 +34,8 @@ from rsltrace.trace.model.texts import printable
     default=64,
     show_default=True,
     metavar="N",
-    help="At most N copies of the run to go back to; 0: run again from the beginning.",
+    help="Keep at most N checkpoints to step back to; with 0, step back by running again from "
+    "the start.",
 )
 @click.option(
     "--memory",
@@ -47,9 +43,9 @@ from rsltrace.trace.model.texts import printable
     default=2048,
     show_default=True,
     metavar="MIB",
-    help="Memory that these copies may take.",
+    help="Limit the memory of all checkpoints.",
 )
-@click.option("-q", "--quiet", is_flag=True, help="No log records of the nodes.")
+@click.option("-q", "--quiet", is_flag=True, help="Do not print the log records of the nodes.")
 def debug(
     source: Path,
     commands: tuple[str, ...],
@@ -60,18 +56,18 @@ def debug(
     memory: int,
     quiet: bool,
 ) -> int:
-    """Run the job in TRACE (or JOB) under a debugger that can go back.
+    """Run JOB, or the job in TRACE, under a debugger that can step backwards.
 
-    Step by event, node or time; stop where messages, logs, exceptions or the state of a node say
-    so; evaluate expressions in nodes; go back, and ask who changed an attribute or sent a message.
-    "help" at the prompt lists the commands. They may also come from a pipe: each is printed with
-    what came of it, and the first that cannot be carried out ends the session.
+    Step by event, node or time. Break on messages, logs, exceptions or the state of a node.
+    Evaluate expressions in nodes. Step backwards, and find the callback that changed an attribute
+    or sent a message. Enter "help" at the prompt for the commands. You can also pipe commands in:
+    each is printed with its result, and the first that fails ends the session.
 
-    As with "rsltrace replay", every event is compared with TRACE, and code that a trace names runs
-    only if you agree to it.
+    As with "rsltrace replay", every event is compared with TRACE, and code that TRACE names runs
+    only if you agree.
 
-    The exit status is 0 when the session ends, 1 if the run has diverged from TRACE in it, and 2
-    for trouble: it could not begin, or a command of a script could not be carried out.
+    Exit status: 0 when the session ends, 1 if the run diverged from TRACE, 2 for an error: the
+    session could not start, or a command of a script failed.
     """
     from rsltrace.conditions.names import names_of
     from rsltrace.debug.client import DebugSession

@@ -63,7 +63,7 @@ class Tolerance(_Type):
     type=click.Choice(_FORMATS),
     default="text",
     show_default=True,
-    help="What to print: a report for people, or one for programs.",
+    help="Format of the report.",
 )
 @click.option(
     "--context",
@@ -71,18 +71,30 @@ class Tolerance(_Type):
     default=5,
     show_default=True,
     metavar="N",
-    help="Show N events (of recordings: messages) before the divergence.",
+    help="Show N events before the divergence (for recordings: messages).",
 )
-@click.option("--all", "everything", is_flag=True, help="Every independent divergence, in full.")
-@click.option("--node", "nodes", multiple=True, metavar="GLOB", help="Only events of such nodes.")
 @click.option(
-    "--topic", "topics", multiple=True, metavar="GLOB", help="Only such topics and services."
+    "--all", "everything", is_flag=True, help="Show every independent divergence in full."
+)
+@click.option(
+    "--node",
+    "nodes",
+    multiple=True,
+    metavar="GLOB",
+    help="Compare only events of these nodes. Repeatable.",
+)
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="GLOB",
+    help="Compare only these topics and services. Repeatable.",
 )
 @click.option(
     "--ignore",
     multiple=True,
     metavar="FIELD",
-    help="Do not compare such fields: header.stamp, *.covariance, /odom:twist.",
+    help="Do not compare these fields: header.stamp, *.covariance, /odom:twist. Repeatable.",
 )
 @click.option(
     "--abs",
@@ -90,7 +102,7 @@ class Tolerance(_Type):
     multiple=True,
     type=Tolerance(),
     metavar="FIELD=TOL",
-    help="Tolerate |a-b| <= TOL in such fields (times: in seconds).",
+    help="Tolerate |a-b| <= TOL in these fields (times in seconds). Repeatable.",
 )
 @click.option(
     "--rel",
@@ -98,36 +110,36 @@ class Tolerance(_Type):
     multiple=True,
     type=Tolerance(),
     metavar="FIELD=TOL",
-    help="Tolerate |a-b| <= TOL * max(|a|, |b|) in such fields.",
+    help="Tolerate |a-b| <= TOL * max(|a|, |b|) in these fields. Repeatable.",
 )
 @click.option(
     "--by",
     type=click.Choice((BY_ORDER, BY_STAMP)),
     default=BY_ORDER,
     show_default=True,
-    help="Match the messages of recordings by their order or by their log time.",
+    help="Match the messages of recordings by order or by log time.",
 )
 @click.option(
     "--check",
     is_flag=True,
-    help="First read all of both traces; check all checksums, hashes and messages.",
+    help="First verify all checksums, hashes and messages of both traces.",
 )
 @click.option(
-    "--as-far-as-they-go",
+    "--allow-truncated",
     is_flag=True,
-    help="It is enough if recordings that are cut agree until there.",
+    help="Accept truncated files that agree up to their ends.",
 )
 @click.option(
     "--again",
     metavar="FILE",
-    help="Say which of A and B a third trace repeats where they diverge: A, B, or neither.",
+    help="Show whether a third trace FILE follows A, B or neither where they diverge.",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Write the report to FILE, and only its first sentence here.",
+    help="Write the report to FILE and print only its first sentence.",
 )
 def diff(
     golden: str,
@@ -142,22 +154,21 @@ def diff(
     relative: tuple[tuple[str, float], ...],
     by: str,
     check: bool,
-    as_far_as_they_go: bool,
+    allow_truncated: bool,
     again: str | None,
     output: Path | None,
 ) -> int:
-    """Find where A and B first diverge, and why.
+    """Compare two traces and show where they first diverge, and why.
 
-    A and B are traces (files or addresses: https://, s3://, ...), rosbag2 recordings (folders,
-    .mcap or .db3 files), or one of each. With more than two, A is the golden one that all others
-    are compared with, and the report is a table.
+    A and B are traces (files, or addresses such as https:// and s3://), rosbag2 recordings
+    (folders, .mcap or .db3 files), or one of each. With several B, A is the reference: each B is
+    compared with it, and the report is a table.
 
-    FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
-    topics and a colon. A tolerance never makes two traces identical.
+    FIELD is a glob on field paths (pose.pose.position.x, ranges[17]). It may start with a glob of
+    topics and a colon.
 
-    The exit status is 0 if nothing differs, 1 if the runs diverge, or one of the files is cut (then
-    nobody knows, unless --as-far-as-they-go is enough), 2 for trouble, 3 if they are equal within
-    tolerance and not identical.
+    Exit status: 0 if they are identical; 1 if they diverge, or if a file is truncated (unless
+    --allow-truncated); 2 for an error; 3 if they are equal within tolerance but not identical.
     """
     if again is not None:
         return _which(golden, others, again)
@@ -170,7 +181,7 @@ def diff(
         absolute=absolute,
         relative=relative,
         by=by,
-        as_far_as_they_go=as_far_as_they_go,
+        as_far_as_they_go=allow_truncated,
     )
     return _diff(golden, others, form, options, output, check=check)
 
@@ -193,7 +204,7 @@ def _diff(
         except RsltraceError as error:
             if len(others) == 1:
                 raise
-            # One bad file among many must not hide what the others say.
+            # One unreadable file must not hide the results of the others.
             tell(f"rsltrace: error: {error}")
             trouble = True
     if done:
@@ -204,7 +215,7 @@ def _diff(
 
 
 def _which(a: str, others: Sequence[str], again: str) -> int:
-    """Say which of two traces a third one repeats."""
+    """Print which of two traces a third one follows."""
     from rsltrace.diff.file_kind import is_recording
     from rsltrace.diff.traces.reproduction import reproduction
     from rsltrace.trace.words.phrases import as_sentence
@@ -222,14 +233,14 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
 
     if is_recording(a) or is_recording(b):
         if options.nodes:
-            raise click.UsageError("--node needs two traces; a recording does not know the nodes")
+            raise click.UsageError("--node needs two traces: a recording has no nodes")
         if check:
-            raise click.UsageError("--check needs two traces; a recording has no hashes")
+            raise click.UsageError("--check needs two traces: a recording has no hashes")
         from rsltrace.diff.bags.comparison import diff_bags
 
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
-        raise click.UsageError("--by is for recordings; the events of two traces are aligned")
+        raise click.UsageError("--by needs a recording: the events of two traces are aligned")
     from rsltrace.cli.output.search_progress import working
     from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.trace.contents import check_contents
@@ -252,7 +263,7 @@ def _opened(place: str) -> Trace:
         if "://" not in place:
             raise
         raise TraceFormatError(
-            f"{error}; only traces are read from addresses: download a recording to compare it"
+            f"{error}; only traces can be read from an address: download the recording first"
         ) from error
 
 

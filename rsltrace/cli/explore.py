@@ -1,4 +1,4 @@
-"""``rsltrace explore``: search the orders of a job for the run that fails."""
+"""``rsltrace explore``: search the callback orders of a job for runs that fail."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rsltrace.cli.job_source import (
     job_words,
 )
 from rsltrace.cli.record import default_output
-from rsltrace.cli.verify import terminated
+from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
@@ -42,7 +42,7 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:
-            raise click.BadParameter("nothing can be tried with a budget of 0")
+            raise click.BadParameter("the budget must be greater than 0")
         return Budget(trials=int(text))
     try:
         seconds = parse_time(text) / NS_PER_S
@@ -51,7 +51,7 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
             f"expected a number of runs (1000) or a time (10min, 90s, 2h), got {text!r}"
         ) from None
     if seconds == 0:
-        raise click.BadParameter("nothing can be tried with a budget of 0")
+        raise click.BadParameter("the budget must be greater than 0")
     return Budget(seconds=seconds)
 
 
@@ -76,7 +76,7 @@ def _fork_after(
     type=click.Choice(STRATEGIES),
     default="mixed",
     show_default=True,
-    help="What is tried: see docs/exploring.md.",
+    help="How the search chooses runs: see docs/exploring.md.",
 )
 @click.option(
     "--budget",
@@ -84,59 +84,60 @@ def _fork_after(
     show_default=True,
     metavar="N|TIME",
     callback=_budget,
-    help="How many runs, or how long (10min).",
+    help="Try N runs, or search for this long (10min).",
 )
-@click.option("--stop-at-first", is_flag=True, help="End the search with the first run that fails.")
-@click.option("--resume", is_flag=True, help="Go on with the search in the output folder.")
+@click.option("--stop-at-first", is_flag=True, help="Stop at the first run that fails.")
+@click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
 @click.option("--force", is_flag=True, help="Replace the search in the output folder.")
 @click.option(
     "--jobs",
     type=click.IntRange(min=1),
     metavar="W",
-    help="How many runs at a time (default: one for each processor).",
+    help="Run W runs in parallel (default: one per CPU).",
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
-    help="Folder for results and traces (default: the job's name with .explore, here).",
+    help="Write results and traces to this folder (default: the job's name with .explore).",
 )
 @click.option(
     "--depth",
     type=click.IntRange(1, 100),
-    help="Depth of bugs that pct looks for (default: 1 to 3); departures from the plain order "
-    "that systematic makes at most (default: any number).",
+    help="For pct: depth of the bugs to find (default: 1 to 3). For systematic: maximum number of "
+    "deviations from the default order (default: unlimited).",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     default=0,
     show_default=True,
-    help="Search with other random choices.",
+    help="Make other random choices with this seed.",
 )
 @click.option(
     "--until",
     metavar="T",
-    help="Stop at time T of each run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
+    help="Stop each run at time T: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
 )
 @click.option(
     "--fork-after",
     metavar="T",
     callback=_fork_after,
-    help="Differ from the job as it is only after simulated time T (30s), and go on from there in "
-    "copies of its run.",
+    help="Change the order only after simulated time T (30s): run the job up to T once, and fork "
+    "that run for each trial.",
 )
 @click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
     metavar="S",
-    help="Kill a run after so many seconds (default: 30 times what the first took, at least 60).",
+    help="Kill a run after S seconds of real time (default: 30 times the duration of the first "
+    "run, at least 60).",
 )
 @click.option(
     "--cluster",
     metavar="ADDRESS",
-    help="Run on the workers of a Dask cluster: its scheduler (tcp://host:8786), or dask for what "
-    "Dask's configuration says.",
+    help="Run on the workers of a Dask cluster: give the address of its scheduler "
+    "(tcp://host:8786), or dask to use Dask's configuration.",
 )
 @click.option(
     "--format",
@@ -144,15 +145,15 @@ def _fork_after(
     type=click.Choice(("text", "json", "junit", "github")),
     default="text",
     show_default=True,
-    help="What to print in the end.",
+    help="Format of the final report.",
 )
 @click.option(
-    "--small",
+    "--minimize",
     is_flag=True,
-    help="Make the first run of each cause small, and write it as a folder that repeats it (with "
-    "--resume also later).",
+    help="Reduce the first failing run of each cause to the fewest faults and deviations, and "
+    "write a folder that reproduces it. Can be done later with --resume.",
 )
-@click.option("-q", "--quiet", is_flag=True, help="Only the result, nothing while it searches.")
+@click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
 def explore(
     words: tuple[str, ...],
     launch: Path | None,
@@ -172,17 +173,17 @@ def explore(
     timeout: float | None,
     cluster: str | None,
     form: str,
-    small: bool,
+    minimize: bool,
     quiet: bool,
 ) -> int:
-    """Run JOB in many orders of its callbacks, and find those in which something fails.
+    """Run JOB in many callback orders and find the runs that fail.
 
-    What fails is what the job's checks say (checks:), an exception, a deadlock, a livelock, a run
-    that does not end before its timeout (stop: {timeout: …}) or that crashes. Every run can be
-    repeated: it is the job with what sets it apart, and "rsltrace record" of that does the same.
+    A run fails if a check of the job (checks:) fails, a node raises an exception, the run
+    deadlocks or livelocks, reaches its timeout (stop: {timeout: …}) or crashes. Each failing run
+    is printed as an "rsltrace record" command that reproduces it.
 
-    The exit status is 0 if nothing failed, 1 if something did, 2 for trouble: results that are
-    there by then are kept, and --resume goes on.
+    Exit status: 0 if no run failed, 1 if one did, 2 for an error. Results so far are kept, and
+    --resume continues the search.
     """
     from rsltrace.checks.evaluate import check_texts
     from rsltrace.checks.metrics import check_metrics
@@ -193,7 +194,9 @@ def explore(
     from rsltrace.search.explore.vary import check_vary
 
     if resume and force:
-        raise click.UsageError("--resume goes on with a search, --force replaces it: give one")
+        raise click.UsageError(
+            "give --resume to continue a search or --force to replace it, not both"
+        )
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
     source = JobSource(str(named), labelled, text, str(named.parent))
@@ -206,7 +209,7 @@ def explore(
     about = _about(source, job, strategy, seed, depth)
     if fork_after is not None:
         about["fork after"] = fork_after[1]
-    with terminated(), Table(folder, about, resume=resume, force=force) as table:
+    with handling_signals(), Table(folder, about, resume=resume, force=force) as table:
         chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
         search = Search(
             job,
@@ -217,7 +220,7 @@ def explore(
             timeout_s=timeout,
             fork_ns=-1 if fork_after is None else fork_after[1],
         )
-        end = _End(search, source, folder, strategy, form)
+        end = _SearchReport(search, source, folder, strategy, form)
         interrupted = False
         with search, _pool(source, job, jobs, cluster) as pool:
             try:
@@ -229,11 +232,11 @@ def explore(
                 if search.tally.runs:
                     end.report(job)
                 raise
-    if small and not interrupted:
+    if minimize and not interrupted:
         end.make_small(job, timeout, quiet=quiet)
     end.report(job)
     if interrupted:
-        tell(f"interrupted: --resume goes on; the results are in {folder}")
+        tell(f"interrupted: continue with --resume; the results are in {folder}")
         return _INTERRUPTED
     return 1 if search.tally.failures else 0
 
@@ -241,13 +244,13 @@ def explore(
 def _pool(
     source: JobSource, job: Job, jobs: int | None, cluster: str | None
 ) -> AbstractContextManager[Pool]:
-    """Return where the trials are run: here, or on a cluster."""
+    """Return the workers of the search: processes on this machine, or a cluster."""
     from rsltrace.search.explore.workers import Workers, default_jobs
 
     if cluster is None:
         return Workers(source, jobs or default_jobs(), pins=job.guard.pins)
     if jobs is not None:
-        raise click.UsageError("--jobs is for this machine: a cluster has as many as it has")
+        raise click.UsageError("--jobs has no effect with --cluster")
     try:
         from rsltrace.search.explore.cluster import Cluster
     except ImportError:
@@ -260,7 +263,7 @@ def _pool(
 def _about(
     source: JobSource, job: Job, strategy: str, seed: int, depth: int | None
 ) -> dict[str, Any]:
-    """Return what a search is about: it can be resumed if that is the same."""
+    """Return the settings of a search. It can be resumed only with the same settings."""
     from rsltrace.trace.chain import hash64
 
     return {
@@ -278,7 +281,7 @@ def _about(
 def _telling(
     search: Search, budget: Budget, *, quiet: bool
 ) -> Iterator[Callable[[TrialResult], None]]:
-    """Tell on stderr how a search goes: a line on a terminal, causes of failures anywhere."""
+    """Show the progress of a search on stderr, and new causes of failures."""
     from rsltrace.cli.output.search_progress import search_line
 
     if quiet:
@@ -297,8 +300,8 @@ def _telling(
         yield on_result
 
 
-class _End:
-    """The end of a search: what is printed, and the page in its folder."""
+class _SearchReport:
+    """The report of a search: what is printed, and the page in its folder."""
 
     def __init__(
         self, search: Search, source: JobSource, folder: Path, strategy: str, form: str
@@ -311,12 +314,12 @@ class _End:
         self._small: dict[str, SmallRun] = {}
 
     def make_small(self, job: Job, timeout_s: float | None, *, quiet: bool) -> None:
-        """Make one run of each cause small."""
+        """Minimize one run of each cause."""
         from rsltrace.search.explore.small.causes import make_small
 
         def on_begin(cause: str) -> None:
             if not quiet:
-                tell(f"making it small: {cause}")
+                tell(f"minimizing: {cause}")
 
         self._small = make_small(
             self._source,
@@ -330,14 +333,14 @@ class _End:
     def _say_small(self) -> None:
         for cause, one in self._small.items():
             if one.trouble:
-                say(printable(f"not made small: {cause}: {one.trouble}"))
+                say(printable(f"not minimized: {cause}: {one.trouble}"))
                 continue
-            say(printable(f"made small: {cause}: {one.folder / 'README.md'}"))
+            say(printable(f"minimized: {cause}: {one.folder / 'README.md'}"))
             if one.decides:
                 say(printable(f"  {one.decides}"))
 
     def report(self, job: Job) -> None:
-        """Write the page and the table, and print what came of the search."""
+        """Write the page and the table, and print the result."""
         from rsltrace.cli.output.search_text import search_lines
         from rsltrace.search.explore.report.exploration import Exploration, Reduced
         from rsltrace.search.explore.report.formats import (
@@ -367,12 +370,12 @@ class _End:
         )
         try:
             write_page(explored, self._folder / PAGE)
-            with suppress(ExploreError):  # without pyarrow there are the rows alone
+            with suppress(ExploreError):  # pyarrow is not installed
                 write_parquet(explored, self._folder / PARQUET)
         except OSError as error:
             raise ExploreError(
                 f"the report in {self._folder} cannot be written: {error.strerror}; the results "
-                "are kept there, and --resume goes on"
+                "are kept there; continue with --resume"
             ) from None
         if self._form == "text":
             for line in search_lines(search, source, self._folder, caution=explored.caution):

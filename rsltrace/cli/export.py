@@ -1,4 +1,4 @@
-"""``rsltrace export``: what is in a trace, in the formats of others."""
+"""``rsltrace export``: the messages of a trace as a rosbag2 bag."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import click
 from rsltrace.terminal import tell
 from rsltrace.trace.model.texts import format_seconds
 
-EXIT_CUT = 1
+EXIT_TRUNCATED = 1
 
 
 @click.command()
@@ -20,21 +20,25 @@ EXIT_CUT = 1
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",
-    help="Write a rosbag2 bag: metadata.yaml and one MCAP file.",
+    help="Write the bag to this folder: metadata.yaml and one MCAP file.",
 )
-@click.option("--topics", multiple=True, metavar="GLOB", help="Only these topics (repeatable).")
-@click.option("--exclude", multiple=True, metavar="GLOB", help="Not these topics (repeatable).")
+@click.option(
+    "--topic", "topics", multiple=True, metavar="GLOB", help="Export only these topics. Repeatable."
+)
+@click.option(
+    "--exclude", multiple=True, metavar="GLOB", help="Leave out these topics. Repeatable."
+)
 @click.option("--force", is_flag=True, help="Replace an existing bag.")
 def export(
     trace: Path, bag: Path, topics: tuple[str, ...], exclude: tuple[str, ...], force: bool
 ) -> int:
-    """Write the messages of TRACE as a plain rosbag2 bag, without what rsltrace keeps of its own.
+    """Write the messages of TRACE to a plain rosbag2 bag.
 
-    Stamps are simulated time. The bag appears when it is complete, or not at all. Messages whose
-    payloads the job did not keep (record: in a job) are not in it.
+    Timestamps are simulated times. The bag appears only when it is complete. It lacks messages
+    whose payloads the job did not record (record: in the job).
 
-    The exit status is 0 if the bag is all there is, 1 if TRACE is cut (its run was killed): the bag
-    then ends where the trace does.
+    Exit status: 0 if the bag is complete, 1 if TRACE is truncated because its run was killed. The
+    bag then ends where the trace does.
     """
     from rsltrace.cli.output.search_progress import working
     from rsltrace.trace.reader import Trace
@@ -54,5 +58,8 @@ def export(
     tell(f"wrote {bag}: {count} messages")
     if whole:
         return 0
-    tell(f"rsltrace: note: {trace} is cut: the bag ends with it, after {events} events, at {end} s")
-    return EXIT_CUT
+    tell(
+        f"rsltrace: note: {trace} is truncated: the bag ends with it after {events} events, "
+        f"at {end} s"
+    )
+    return EXIT_TRUNCATED

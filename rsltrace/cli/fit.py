@@ -1,4 +1,4 @@
-"""``rsltrace fit``: the delays and execution times of a native run, as parts of a job."""
+"""``rsltrace fit``: fit the delays and execution times of a job to a native run."""
 
 from __future__ import annotations
 
@@ -35,37 +35,37 @@ if TYPE_CHECKING:
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Job to write: JOB with the measured times. It can be run as it is.",
+    help="Write JOB with the measured times to this file.",
 )
-@click.option("--force", is_flag=True, help="Replace the job, the picture and the trace.")
+@click.option("--force", is_flag=True, help="Replace existing output files.")
 @click.option(
     "--as",
     "how",
-    type=click.Choice(("tables", "families", "series")),
+    type=click.Choice(("tables", "distributions", "series")),
     default="tables",
     show_default=True,
-    help="Write tables of quantiles; or uniform, normal, lognormal and gamma distributions where "
-    "one is near enough; or all times in the course of the run, in files.",
+    help="Write times as tables of quantiles, as distributions (uniform, normal, lognormal or "
+    "gamma, where one fits), or as series: all measured times in order, in files.",
 )
 @click.option(
     "--plot",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Draw what was measured and what a simulation draws (.png, .svg, .pdf).",
+    help="Plot the measured and the fitted times (.png, .svg, .pdf).",
 )
 @click.option(
     "--check",
     "second",
     type=click.Path(path_type=Path),
     metavar="SECOND",
-    help="Run the fitted job and compare the latencies of its chains with those of SECOND, another "
-    "native run.",
+    help="Run the fitted job and compare the latencies of its chains with SECOND, another native "
+    "run.",
 )
 @click.option(
     "--simulated",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="With --check: keep the trace of that run.",
+    help="With --check: keep the trace of the simulated run.",
 )
 @click.option("--json", "as_values", is_flag=True, help="Print one JSON object.")
 def fit(
@@ -79,18 +79,18 @@ def fit(
     simulated: Path | None,
     as_values: bool,
 ) -> None:
-    """Measure the delays and execution times of TRACE, a native run, and write them as the delay:
-    and execution: of a job: so that a simulation has the robot's timing.
+    """Fit the delay: and execution: of JOB to the times of TRACE, a native run.
 
-    JOB is the job that was run; without it, the file of that name beside TRACE or here.
+    A simulation of the fitted job has the robot's timing. JOB is the job that was run. If you
+    leave it out, the file of that name beside TRACE or in the working directory is used.
 
-    A delay is the time from publishing to reception. An execution time is that for which a callback
-    keeps its executor: its own, and what rclpy needs to begin it when its input is there and the
-    executor is free.
+    A delay is the time from publishing to reception. An execution time is the time for which a
+    callback occupies its executor: the callback itself, and the time that rclpy needs to start it
+    when its input has arrived and the executor is free.
 
-    With --check nothing is taken on trust: quantiles of end-to-end latencies of the second run and
-    of the simulated one, their ratio with its 95 % interval, and a two-sample test; beside them the
-    same of the first run, since the robot is not like itself every time.
+    With --check, compare the end-to-end latencies of the simulated run and of a second native run:
+    quantiles, their ratio with a 95 % confidence interval, and a two-sample test. The same
+    comparison of the two native runs shows how much the robot itself varies.
     """
     from rsltrace.native.fit.comparison import check
     from rsltrace.native.fit.measured import measured
@@ -98,14 +98,12 @@ def fit(
     from rsltrace.native.fit.parts import notes
 
     if simulated is not None and second is None:
-        raise click.UsageError("--simulated goes with --check")
+        raise click.UsageError("--simulated needs --check")
     if second is not None and output is None:
-        raise click.UsageError(
-            "--check runs the fitted job: say where to write it (-o fitted.yaml)"
-        )
+        raise click.UsageError("--check runs the fitted job: name its file with -o fitted.yaml")
     for path in (output, plot, simulated):
         if path is not None and path.exists() and not force:
-            raise OutputError(f"{path} exists; --force replaces it")
+            raise OutputError(f"{path} exists; use --force to replace it")
     if plot is not None:
         check_picture(plot)
     with ExitStack() as stack:
@@ -154,8 +152,8 @@ def _job_file(trace: Trace, given: Path | None) -> Path:
         if name and name != "<python>" and (folder / name).is_file():
             return folder / name
     raise TraceError(
-        f"the job of {trace.name} ({name or 'without a file'}) is neither beside it nor here; name "
-        f"it: rsltrace fit {shlex.quote(trace.name)} job.yaml"
+        f"the job of {trace.name} ({name or 'without a file'}) is neither beside it nor in the "
+        f"working directory; name it: rsltrace fit {shlex.quote(trace.name)} job.yaml"
     )
 
 
@@ -166,8 +164,9 @@ def _load(path: Path) -> Job:
 
 
 def _settings(trace: Trace, job_file: Path) -> tuple[dict[str, Any], list[str]]:
-    """Return what the command line said of the run, as a job file says it, and notes on that. What
-    might run code is not taken over: a trace may come from anybody."""
+    """Return the command-line settings of the recorded run as keys of a job, and notes on them.
+
+    Settings that might run code are left out: a trace may come from anybody."""
     from rsltrace.diff.causes.record_command import is_harmless, options_of
     from rsltrace.job import load_job
     from rsltrace.job.reading.override import as_overlay
@@ -178,11 +177,11 @@ def _settings(trace: Trace, job_file: Path) -> tuple[dict[str, Any], list[str]]:
     left += [" ".join(option) for option in options if option not in harmless]
     if left:
         left = [
-            f"the run was recorded with {', '.join(left)}, which the fitted job does not have: "
-            "record it with the same"
+            f"the run was recorded with {', '.join(left)}, which the fitted job lacks: add this "
+            "when you record it"
         ]
     elif load_job(job_file, overrides=harmless).source_text != trace.job_text:
-        left = [f"{job_file} is another job than that of the run, or has changed since"]
+        left = [f"{job_file} is not the job of the run, or has changed since"]
     return settings, left
 
 
@@ -194,11 +193,11 @@ def _write(
     first: Trace,
     settings: Mapping[str, Any],
 ) -> None:
-    """Write the fitted job, and see that it can be read."""
+    """Write the fitted job, and check that it loads."""
     from rsltrace.native.fit.parts import fitted_job, with_files
 
     if output.exists() and job_file.exists() and output.samefile(job_file):
-        raise OutputError(f"{output} is the job itself, which the fitted one extends: name another")
+        raise OutputError(f"{output} is the job that the fitted one extends: name another file")
     base = os.path.relpath(job_file.absolute(), output.absolute().parent).replace(os.sep, "/")
     head = (
         f"The job {job_file.name} with the times of {Path(first.name).name}, a native run of "
@@ -211,7 +210,7 @@ def _write(
         try:
             (output.parent / f"{output.stem}.series").mkdir(exist_ok=True)
         except OSError as error:
-            raise OutputError(f"{error.filename} cannot be made: {error.strerror}") from error
+            raise OutputError(f"{error.filename} cannot be created: {error.strerror}") from error
     for name, written in files.items():
         write_text(output.parent / name, written)
     before = output.read_bytes() if output.is_file() else None
@@ -228,9 +227,9 @@ def _write(
 
 @contextmanager
 def _simulated(job_file: Path, kept: Path | None, *, force: bool) -> Iterator[Trace]:
-    """Record a job in a process of its own; the trace is gone afterwards unless it is ``kept``.
+    """Record a job in a child process; delete the trace afterwards unless it is ``kept``.
 
-    :raises RunError: if that does not work.
+    :raises RunError: the run fails.
     """
     with tempfile.TemporaryDirectory(prefix="rsltrace-fit-") as folder:
         path = kept or Path(folder, "simulated.mcap")

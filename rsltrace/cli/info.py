@@ -1,4 +1,4 @@
-"""``rsltrace info``: what is in a trace, for people and (``--json``) for programs."""
+"""``rsltrace info``: a summary of a trace."""
 
 from __future__ import annotations
 
@@ -25,28 +25,32 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.finding import waits_of
 from rsltrace.trace.model.operation import is_built_in
-from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import (
+    NS_PER_S,
+    format_duration,
+    format_milliseconds,
+    format_seconds,
+    printable,
+)
 from rsltrace.trace.native import Spread, busy_threads, callback_figures, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.phrases import table
 
-# What ``rsltrace info`` says of a native run: how it was run, and its times.
-
-NO_DIGEST = "none: a native run is observed, and no other run has the same times"
+NO_DIGEST = "none: no two native runs have the same times"
 _CLOCKS = ("wall_ns", "steady_ns", "mode", "ignored")
 
 
 def real_time(trace: Trace) -> str:
-    """Return when a native run was, and how long."""
+    """Return when a native run started, and how long it took."""
     begun = datetime.fromtimestamp(trace.start_ns // NS_PER_S, timezone.utc)
     length = format_duration(max(trace.end_ns - trace.start_ns, 0))
-    return f"real time, from {begun:%Y-%m-%d %H:%M:%S} UTC on  ({length})"
+    return f"real time, from {begun:%Y-%m-%d %H:%M:%S} UTC  ({length})"
 
 
 def native_lines(trace: Trace) -> list[str]:
-    """Return how the run was made, and a table of its callbacks' times."""
+    """Return the settings of a native run, and a table of its callbacks' times."""
     described = trace.metadata(METADATA_NATIVE)
     rows = [
         (f"  {printable(key)}", printable(value))
@@ -54,15 +58,15 @@ def native_lines(trace: Trace) -> list[str]:
         if key not in _CLOCKS
     ]
     if described.get("ignored"):
-        rows.append(("  of the job without effect", printable(described["ignored"])))
+        rows.append(("  ignored keys of the job", printable(described["ignored"])))
     if levels := trace.result.get("thread_priorities"):
         rows.append(("  real-time priorities", printable(levels)))
     observer, pen = (trace.result.get(key, "") for key in ("observer_ns", "pen_ns"))
     if observer.isdigit() and pen.isdigit():
         text = f"{format_duration(int(observer))} per callback in its thread (median), and "
-        rows.append(("  observer", f"{text}{format_duration(int(pen))} beside it"))
+        rows.append(("  overhead", f"{text}{format_duration(int(pen))} in the writing thread"))
     if (spent := trace.result.get("callback_ns", "")).isdigit():
-        whole = "of processor time per callback: all of the nodes, rclpy and the middleware"
+        whole = "of CPU time per callback, with rclpy and the middleware"
         rows.append(("  callbacks", f"{format_duration(int(spent))} {whole}"))
     busy = ", ".join(f"{part:.1%}" for part in busy_threads(trace).values())
     if busy:
@@ -93,7 +97,7 @@ def native_lines(trace: Trace) -> list[str]:
 
 
 def native_json(trace: Trace) -> dict[str, Any]:
-    """Return the same for programs; durations in nanoseconds."""
+    """Return the same as JSON values; durations in nanoseconds."""
     return {
         **trace.metadata(METADATA_NATIVE),
         "threads_busy": busy_threads(trace),
@@ -115,11 +119,9 @@ def native_json(trace: Trace) -> dict[str, Any]:
 def _text(found: Spread | None) -> str:
     if found is None:
         return "-"
-    return " ".join(_ms(value) for value in (found.median_ns, found.p95_ns, found.max_ns))
-
-
-def _ms(duration_ns: int) -> str:
-    return f"{duration_ns / 1e6:.3g}" if abs(duration_ns) < 10**9 else f"{duration_ns / 1e6:.0f}"
+    return " ".join(
+        format_milliseconds(value) for value in (found.median_ns, found.p95_ns, found.max_ns)
+    )
 
 
 _Kinds: TypeAlias = type[EventKind] | type[OutputKind]
@@ -129,18 +131,20 @@ _VALUE_MAX = 100
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
-@click.option("--all", "show_all", is_flag=True, help="List every entity (--json always does).")
+@click.option(
+    "--all", "show_all", is_flag=True, help="List every entity (--json always lists all)."
+)
 @click.option(
     "--check",
     is_flag=True,
-    help="First read the whole file; check all checksums, hashes and messages.",
+    help="First verify all checksums, hashes and messages of the file.",
 )
 def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
-    """Show what is in TRACE: its digest, counts, nodes and entities with their rates.
+    """Summarize TRACE: its digest, counts, nodes, and entities with their rates.
 
-    Two traces with the same digest hold the same run. A rate is that of an entity's events (of
-    what it sent, for publishers) from the first to the last, in simulated time. A trace whose run
-    was killed is shown as far as it goes. A native run has no digest; its times are told instead.
+    Traces with the same digest are of identical runs. Rates count an entity's events (for
+    publishers: messages) in simulated time, from the first to the last. If the run was killed, the
+    summary covers what was written. A native run has no digest; its callback times are listed.
     """
     with Trace.open(trace) as opened:
         if check:
@@ -168,7 +172,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
         (
             ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
             ("state", _state(trace)),
-            *(() if trace.complete or native else (("next", _CUT_OFF),)),
+            *(() if trace.complete or native else (("next", _TRUNCATED),)),
             *(("waiting", text) for text in _waits(trace)),
             ("digest", NO_DIGEST if native else trace.digest),
             time,
@@ -183,7 +187,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
     if native:
         lines += native_lines(trace)
     if edits := edits_of(trace):
-        lines += ["", "edits, as a branch of another run", *(f"  {printable(e)}" for e in edits)]
+        lines += ["", "edits of this branch", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
     lines += _drop_lines(trace)
     lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
@@ -191,26 +195,26 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
 
 
 def _short(value: str) -> str:
-    """Return a value of metadata as it fits on a line; whole job files stand there, too."""
+    """Return a value of metadata if it fits on a line, else its length."""
     text = printable(value)
     return text if len(text) <= _VALUE_MAX else f"{len(text)} characters; --json shows them"
 
 
-_CUT_OFF = (
-    "record the job again with --set record.segment_events=1, since its last events (up to "
-    f"{EVENTS_PER_SEGMENT - 1}) are missing here; a run that crashes prints at which line"
+_TRUNCATED = (
+    f"the last events (up to {EVENTS_PER_SEGMENT - 1}) are missing; to get them, record the job "
+    "again with --set record.segment_events=1"
 )
 
 
 def _state(trace: Trace) -> str:
     if not trace.complete:
-        return "cut off: the file has no end (the run was killed or crashed, or is still going on)"
+        return "truncated: the run was killed, crashed, or is still running"
     reason = printable(trace.result.get("stop_reason", "no reason given"))
     return f"complete: {reason}, exit code {printable(trace.result.get('exit_code', 'unknown'))}"
 
 
 def _waits(trace: Trace) -> list[str]:
-    """Say which calls still waited at the end, without anything that would have ended them."""
+    """Return the calls that were still waiting at the end."""
     return [f"since {format_seconds(w.since_ns)} s: {w.text}" for w in waits_of(trace.result)]
 
 
@@ -227,7 +231,7 @@ def _node_lines(trace: Trace, counts: Counts) -> list[str]:
 
 
 def _guard_lines(trace: Trace) -> list[str]:
-    """What the guard met, most worrying first; nothing for runs without such calls."""
+    """Return the calls that the guard handled, the most serious first."""
     left_out = printable(trace.metadata(METADATA_GUARD).get("left_out", ""))
     lines = ["", f"state hashes leave out: {_short(left_out)}"] if left_out else []
     if not trace.guarded:
@@ -237,18 +241,18 @@ def _guard_lines(trace: Trace) -> list[str]:
         row = (f"  {met.source.value}", met.mode.value, printable(met.node) or "-")
         rows.append((*row, printable(met.call), str(met.count)))
     findings = sum(met.count for met in trace.guarded if met.is_finding)
-    title = f"guard findings: {findings}" if findings else "guard: nothing that could differ"
+    title = f"guard findings: {findings}" if findings else "guard: no findings"
     return [*lines, "", title, *table(rows, right=frozenset((4,)))]
 
 
 def _drop_lines(trace: Trace) -> list[str]:
-    """What full queues dropped; nothing for runs in which none did."""
+    """Return the messages that full queues dropped."""
     rows = [("  dropped", "depth", "node", "kind", "name", "queue")]
     for drop in drops_of(trace.result):
         entity = trace.entities.get(drop.entity)
         if entity is None:
             continue
-        whose = "a publisher's, in an outage" if drop.in_outage else "its own"
+        whose = "the publisher's, in an outage" if drop.in_outage else "its own"
         row = (f"  {drop.count}", str(drop.depth), _owner(trace, entity), entity.kind.label)
         rows.append((*row, printable(entity.name) or "-", whose))
     return ["", "full queues", *table(rows, right=frozenset((0, 1)))] if rows[1:] else []
@@ -262,7 +266,7 @@ def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
         return [title]
     if len(shown) < len(entities):
         left_out = len(entities) - len(shown)
-        title += f"  ({left_out} built-in ones that did nothing are left out; --all shows them)"
+        title += f"  ({left_out} unused built-in ones are hidden; --all shows them)"
     rows = [("  id", "node", "kind", "name", "type", "events", "outputs", "Hz", "code")]
     for entity in shown:
         rate = counts.rate_hz(entity.id) if entity.id else None
@@ -346,7 +350,7 @@ def _nodes(trace: Trace) -> list[Entity]:
 
 
 def _entities(trace: Trace, counts: Counts) -> list[Entity]:
-    """All entities; the run itself only where it did something (constructing nodes, say)."""
+    """Return all entities; the run itself only if it had events."""
     return [
         entity
         for entity in sorted(trace.entities.values(), key=lambda e: e.id)
@@ -355,7 +359,7 @@ def _entities(trace: Trace, counts: Counts) -> list[Entity]:
 
 
 def _idle_built_in(entity: Entity, counts: Counts) -> bool:
-    """Whether rclpy made ``entity`` for every node and nobody used it: eight of ten of them."""
+    """Whether ``entity`` is one that rclpy creates in every node, and was not used."""
     if _count(counts.events, entity.id) or _count(counts.outputs, entity.id):
         return False
     return is_built_in(entity)

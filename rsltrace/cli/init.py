@@ -1,4 +1,4 @@
-"""``rsltrace init``: a first job, written from what there is: bags, nodes, or nothing."""
+"""``rsltrace init``: write a first job file from bags and nodes."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from rsltrace.terminal import tell
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.job.reading.node_source import Found
+    from rsltrace.job.reading.node_source import NodeSource
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
-# A job of rsltrace; with the schema beside it editors complete and check it.
-# `rsltrace check {name}` shows what it means, `rsltrace record {name}` runs it.
+# A job of rsltrace. Editors use the schema beside it to complete and check it.
+# `rsltrace check {name}` checks it, `rsltrace record {name}` runs it.
 # Every key is explained in docs/jobs.md.
 """
 _SCHEMA = "job.schema.json"
 _PLACES = (".", "src", "scripts", "..")
 _TOPICS_MAX = 3
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
-"""Recorded with everything else, and hardly ever meant: the nodes of the run have their own."""
+"""Topics of every node. The nodes of a run publish their own, so a bag should not play them."""
 
 
 @click.command()
@@ -40,14 +40,14 @@ _OF_EVERY_NODE = ("/rosout", "/parameter_events")
     "sources",
     multiple=True,
     metavar="BAG|MODULE:CLASS|FILE.py:CLASS",
-    help="A bag to play, or a node to run; may be given several times.",
+    help="A bag to play, or a node to run. Repeatable.",
 )
 def init(job: Path, sources: tuple[str, ...]) -> None:
-    """Write a commented first job to JOB (job.yaml), from bags and nodes.
+    """Write a first job file with comments to JOB (default job.yaml), from bags and nodes.
 
-    Of a bag it lists the topics, their types and how long it is, of a node its name and the
-    parameters that its source declares. Nothing is imported or run. A file that exists is left
-    alone. The job's schema goes beside it, for editors (job.schema.json).
+    The file lists the topics, types and duration of each bag, and the name and declared parameters
+    of each node. Nothing is imported or run, and an existing file is never replaced. The JSON
+    Schema for editors is written beside it (job.schema.json).
     """
     if ":" in job.name and job.suffix not in (".yaml", ".yml"):
         raise click.UsageError(
@@ -73,7 +73,7 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     from rsltrace.job import load_job
 
     if sources:
-        load_job(job)  # what was written must be a job
+        load_job(job)
     if path:
         why = "the nodes are there" if nodes else "there is Python code"
         tell(f"search_path: [{', '.join(path)}], relative to {job}: {why}")
@@ -85,16 +85,16 @@ def _is_python(source: str) -> bool:
     return source.partition(":")[0].endswith(".py")
 
 
-def _look(target: str, folder: Path) -> Found:
-    from rsltrace.job.reading.node_source import look_up, look_up_file
+def _look(target: str, folder: Path) -> NodeSource:
+    from rsltrace.job.reading.node_source import inspect_file, inspect_target
 
     if _is_python(target):
-        return look_up_file(target)
+        return inspect_file(target)
     places = [folder / place for place in _PLACES]
-    return look_up(target, [place for place in places if place.is_dir()])
+    return inspect_target(target, [place for place in places if place.is_dir()])
 
 
-def _search_path(nodes: list[Found], folder: Path, *, guess: bool) -> list[str]:
+def _search_path(nodes: list[NodeSource], folder: Path, *, guess: bool) -> list[str]:
     """Return where modules are, if that is not only beside the job; ``guess`` without any node."""
     found = {os.path.relpath(n.folder, folder) for n in nodes if n.folder is not None}
     if guess:
@@ -111,7 +111,7 @@ def _holds_modules(folder: Path) -> bool:
 
 
 def _job_text(
-    job: Path, bags: list[str], nodes: list[Found], search_path: list[str]
+    job: Path, bags: list[str], nodes: list[NodeSource], search_path: list[str]
 ) -> Iterator[str]:
     yield _HEAD.format(name=job)
     # A key without a value is a mistake, so of a job of bags alone this is a comment.
@@ -143,7 +143,7 @@ def _job_text(
     yield "# record: {exclude: [/camera/*]}  # payloads to leave out; hashes are always kept\n"
 
 
-def _checks_text(nodes: list[Found]) -> Iterator[str]:
+def _checks_text(nodes: list[NodeSource]) -> Iterator[str]:
     """Offer checks that fit the nodes."""
     topics = list(dict.fromkeys(topic for node in nodes for topic in node.topics))
     yield "# checks:  # what has to be true of every run: docs/checks.md\n"
@@ -153,7 +153,7 @@ def _checks_text(nodes: list[Found]) -> Iterator[str]:
         yield f"#   - {{rate: {topic}, at_least: 1 Hz}}\n"
 
 
-def _node_text(node: Found) -> Iterator[str]:
+def _node_text(node: NodeSource) -> Iterator[str]:
     if node.is_main:
         yield f"  - main: {node.target}  # it runs as it is, and makes its nodes itself\n"
         return

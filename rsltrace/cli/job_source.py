@@ -1,4 +1,4 @@
-"""The job that a command line means: a job file, launch files, ``--set``, ``--ros-args``."""
+"""The job of a command line: a job file, a launch file, ``--set``, ``--ros-args``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.completion import complete_files
+from rsltrace.cli.options import set_option
 from rsltrace.job.values.mappings import split_ros_arguments
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ class RosArgsCommand(click.Command):
     """A command that takes ``--ros-args … [--]`` anywhere, as ROS programs do."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Set the ROS arguments aside before click sees them."""
+        """Remove the ROS arguments before click parses the others."""
         own, ctx.meta[_META] = split_ros_arguments(args)
         left = super().parse_args(ctx, own)
         if ctx.params.get("launch") is not None and not ctx.resilient_parsing:
@@ -34,17 +35,8 @@ class RosArgsCommand(click.Command):
         return left
 
 
-set_option = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.0.",
-)
-
-
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add what ``job_of`` needs to a command: ``words``, ``launch``, ``skip``, ``overrides``."""
+    """Add ``words``, ``launch``, ``skip`` and ``overrides`` (see ``job_of``) to a command."""
     for decorate in reversed(
         (
             click.argument(
@@ -56,22 +48,21 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
             click.option(
                 "--launch",
                 type=click.Path(path_type=Path),
-                help="Run the nodes of a launch file (of a package: --launch PACKAGE FILE); "
-                "NAME:=VALUE are its arguments.",
+                help="Run the nodes of a launch file (--launch FILE or --launch PACKAGE FILE), "
+                "with launch arguments NAME:=VALUE.",
             ),
             click.option(
                 "--skip-unsupported",
                 "skip",
                 is_flag=True,
-                help="Leave out what of the launch file cannot be simulated.",
+                help="Skip actions of the launch file that cannot be simulated.",
             ),
             set_option,
             click.option(
                 "--ros-args",
                 is_flag=True,
                 expose_value=False,
-                help="What follows, up to --, are ROS arguments for all nodes: -p, -r, "
-                "--params-file.",
+                help="Pass the arguments up to -- to all nodes: -p, -r, --params-file.",
             ),
         )
     ):
@@ -80,7 +71,7 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def ros_arguments_given() -> tuple[str, ...]:
-    """Return what the present command line has between ``--ros-args`` and ``--``, as it stands."""
+    """Return the arguments between ``--ros-args`` and ``--`` of this command line."""
     return tuple(click.get_current_context().meta.get(_META, ()))
 
 
@@ -92,8 +83,8 @@ def job_of(
 ) -> tuple[Job, Path]:
     """Return the job, and the path of the file that names it.
 
-    :raises click.UsageError: if the words do not fit together.
-    :raises JobError: if the job is wrong.
+    :raises click.UsageError: the arguments contradict each other.
+    :raises JobError: the job is wrong.
     """
     from rsltrace.job import job_from_text, load_job
 
@@ -109,22 +100,22 @@ def job_words(
     skip: bool,
     overrides: Sequence[str | tuple[str, str]],
 ) -> tuple[Path, list[str | tuple[str, str]], str | None]:
-    """Return the path of the file that names the job, all overrides, and the text that stands for
-    the file where there is none.
+    """Return the path of the job or launch file, all overrides, and the job's text if there is
+    no job file.
 
-    :raises click.UsageError: if the words do not fit together.
+    :raises click.UsageError: the arguments contradict each other.
     """
     files = [word for word in words if ":=" not in word]
     given = dict(word.split(":=", 1) for word in words if ":=" in word)
     if len(files) > 1:
-        raise click.UsageError(f"one JOB at a time, here are {' and '.join(files)}")
+        raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
     if not files and launch is None:
         raise click.UsageError("Missing argument 'JOB' (or --launch FILE).")
     if launch is None and (given or skip):
         what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
         raise click.UsageError(f"{what}: give the launch file with --launch FILE")
     if launch is not None and launch.suffix == ".mcap":
-        raise click.UsageError(f"{launch} is no launch file")
+        raise click.UsageError(f"{launch} is a trace, not a launch file")
     named = Path(files[0]) if files else launch
     assert named is not None
     changes = list(overrides)
@@ -141,7 +132,7 @@ def job_words(
 def all_overrides(
     overrides: Sequence[str], seed: int | None, until: str | None
 ) -> list[str | tuple[str, str]]:
-    """Return what the command line says of the job, the short options last."""
+    """Return the overrides of ``--set``, then those of ``--seed`` and ``--until``."""
     found: list[str | tuple[str, str]] = list(overrides)
     if seed is not None:
         found.append(("--seed", f"seed={seed}"))
@@ -154,7 +145,7 @@ def all_overrides(
 
 
 def _with_paths(words: Sequence[str], folder: Path) -> list[str]:
-    """Return ROS arguments with the paths in them as seen from a job's folder."""
+    """Return ROS arguments with their paths relative to the job's folder."""
     found = list(words)
     for index, word in enumerate(found[:-1]):
         if word == "--params-file":

@@ -1,4 +1,4 @@
-"""``rsltrace latency``: how long data takes from a topic to another, through nodes."""
+"""``rsltrace latency``: end-to-end latencies of chains."""
 
 from __future__ import annotations
 
@@ -31,21 +31,26 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.argument("other", type=click.Path(path_type=Path), required=False)
-@click.option("--from", "start", metavar="TOPIC", help="Only chains that begin with this topic.")
 @click.option(
-    "--to", "end", metavar="TOPIC", help="Only chains that end with this topic, or in this node."
+    "--from", "start", metavar="TOPIC", help="Show only chains that start with this topic."
+)
+@click.option(
+    "--to",
+    "end",
+    metavar="TOPIC",
+    help="Show only chains that end with this topic or in this node.",
 )
 @click.option(
     "--chain",
     metavar="TOPIC,TOPIC,…",
-    help="One chain, by all of its topics: /scan,/objects,/cmd_vel (a node may be the last).",
+    help="Show one chain, given by its topics: /scan,/objects,/cmd_vel. The last may be a node.",
 )
 @click.option(
     "--via",
     multiple=True,
     metavar="NODE",
-    help="A node (or a glob of nodes) that makes use of the last message that it received, as a "
-    "timer does that samples. Can be given several times.",
+    help="Treat this node (or glob) as one that samples: its outputs depend on the last message "
+    "that it received. Repeatable.",
 )
 @click.option(
     "--format",
@@ -53,7 +58,7 @@ if TYPE_CHECKING:
     type=click.Choice(("text", "json", "csv")),
     default="text",
     show_default=True,
-    help="What to print: tables, JSON, or a line for each output of each chain.",
+    help="Print tables, JSON, or CSV with a line per output of each chain.",
 )
 def latency(
     trace: Path,
@@ -64,28 +69,26 @@ def latency(
     via: tuple[str, ...],
     form: str,
 ) -> None:
-    """Print how long data takes through the chains of TRACE, from a sensor to an actuator; of two
-    traces side by side, with the difference.
+    """Measure the end-to-end latencies of the chains in TRACE, or compare those of two traces.
 
-    A chain is a row of topics: each message but the first was published because of the one before.
-    Without options all chains are found, from messages that nothing caused (timers, bags) to those
-    that caused nothing. Times are simulated: those of --chain and of --from to --to lie between two
-    messages leaving their publishers.
+    A chain is a sequence of topics in which each message was published because of the one before.
+    Without options, all chains are shown, from messages without a cause (timers, bags) to messages
+    without an effect. Times are simulated, and measured from publish to publish.
 
     \b
-    latency         from an input to the first output that came of it
-    data age        how old the input of an output is when that leaves
-    ... at most     the same, when the next output leaves
-    reaction        from an input to the first output that came of it, or of a later one
-    ... at worst    the same, from the input before: what happens right after it waits as long
+    latency         from an input to the first output that it caused
+    data age        from an input to the output that used it
+    ... at most     from an input to the next output after that
+    reaction        from an input to the first output that it or a later input caused
+    ... at worst    the same, from the input before: the worst case of an event between two inputs
 
     \b
-    link   a message is on its way          held   the node has taken it, and waits
-    queue  it waits for the callback        runs   the callback that publishes is running
+    link   the message is in transit         held   the node has received it and waits
+    queue  it waits for the callback         runs   the callback that publishes is running
     """
     topics = _topics(chain, start, end)
     if form == "csv" and other is not None:
-        raise click.UsageError("--format csv is for one trace")
+        raise click.UsageError("--format csv needs a single trace")
     with ExitStack() as stack:
         opened = [stack.enter_context(Trace.open(one)) for one in (trace, other) if one is not None]
         found = [
@@ -106,12 +109,12 @@ def _topics(chain: str | None, start: str | None, end: str | None) -> tuple[str,
         return ()
     if start is not None or end is not None:
         raise click.UsageError(
-            "--chain says where the chain begins and ends: leave --from and --to"
+            "--chain already sets the first and last topic: leave out --from and --to"
         )
     topics = tuple(topic.strip() for topic in chain.split(","))
     if len(topics) < 2 or not all(topics):
         raise click.BadParameter(
-            f"{chain!r} is no chain: give its topics, as in /scan,/objects,/cmd_vel",
+            f"{chain!r} is not a chain: give its topics, such as /scan,/objects,/cmd_vel",
             param_hint="--chain",
         )
     return topics
@@ -120,7 +123,7 @@ def _topics(chain: str | None, start: str | None, end: str | None) -> tuple[str,
 def _print(trace: Path, other: Path | None, found: Sequence[Latencies]) -> None:
     if not any(one.chains for one in found):
         notes = "".join(f"\n  {note}" for one in found for note in one.notes)
-        raise TraceError(f"{trace}: no message was caused by another one; there is no chain{notes}")
+        raise TraceError(f"{trace} has no chain: no message was caused by another one{notes}")
     lines = text(found[0]) if other is None else compared_text(*found)
     say("\n".join(map(printable, lines)))
     for note in dict.fromkeys(note for one in found for note in one.notes):

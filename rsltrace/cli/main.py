@@ -19,26 +19,26 @@ from rsltrace.cli.output.exit_status import open_standard_streams, status_of
 from rsltrace.guard.pin import pin_recording
 
 _COMMANDS = {
-    "record": "Run a job's nodes deterministically and record their trace.",
-    "replay": "Run the job of a trace again, and check every event on the way.",
-    "debug": "Stop in a run, look into its nodes, go back.",
-    "init": "Write a commented first job, from bags and nodes.",
-    "verify": "Record a job many times in unlike surroundings and compare.",
-    "explore": "Search the orders of a job for the run that fails.",
-    "bisect": "Find the commit that changed what a job does.",
-    "audit": "Look into nodes' sources for what could make runs differ.",
-    "check": "Check a job and show its graph, without running it.",
-    "schema": "Print the JSON Schema of a job file, for editors.",
-    "completion": "Print what bash, zsh or fish needs to complete commands.",
-    "info": "Show what is in a trace: digest, counts, nodes, rates.",
+    "record": "Run a job's nodes deterministically and record a trace.",
+    "replay": "Run the job of a trace again and verify every event.",
+    "debug": "Debug a run: set breakpoints, inspect nodes, step backwards.",
+    "init": "Write a first job file from bags and nodes.",
+    "verify": "Run a job many times under perturbed environments and compare.",
+    "explore": "Search the callback orders of a job for runs that fail.",
+    "bisect": "Find the commit that changed a job's behaviour.",
+    "audit": "Scan the sources of nodes for nondeterminism.",
+    "check": "Check a job and show its graph without running it.",
+    "schema": "Print the JSON Schema of job files, for editors.",
+    "completion": "Print the completion script for bash, zsh or fish.",
+    "info": "Summarize a trace: digest, counts, nodes, rates.",
     "cat": "Print the events of a trace, one per line.",
-    "latency": "Show how long data takes through chains of nodes.",
-    "fit": "Give a job the delays and execution times of a native run.",
-    "analyze": "Bound the response times of a job's chains, and compare with runs.",
-    "view": "Look at a trace in the terminal, or at two side by side.",
+    "latency": "Measure end-to-end latencies through chains of nodes.",
+    "fit": "Fit a job's delays and execution times to a native run.",
+    "analyze": "Compute worst-case response times of callback chains.",
+    "view": "View a trace, or two side by side, in the terminal.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
-    "export": "Write the messages of a trace as a plain rosbag2 bag.",
-    "diff": "Find where two runs (or recordings) first diverge, and why.",
+    "export": "Export the messages of a trace to a rosbag2 bag.",
+    "diff": "Show where two traces or recordings first diverge, and why.",
 }
 """Each is the function of its name in the module of its name, beside this one."""
 
@@ -87,23 +87,23 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="rsltrace", message="%(prog)s %(version)s")
 def cli() -> None:
-    """Record what ROS 2 nodes (rclpy) do in a deterministic simulation, and look into it.
+    """Record and debug deterministic simulations of ROS 2 nodes (rclpy and C++).
 
-    Two runs of one job do the same, down to the last bit: their traces have the same digest.
+    Two runs of one job are bit-identical: their traces have the same digest.
 
     \b
     Start with a job.yaml that names your nodes:
-      rsltrace init --from FILE.py:CLASS      write a first one, from nodes and bags
-      rsltrace check job.yaml                 see what it means and who talks to whom
-      rsltrace record job.yaml -o run.mcap    run it and write the trace
-      rsltrace info run.mcap                  see what is in it
-      rsltrace cat run.mcap | less            read every callback
-      rsltrace view run.mcap                  step through it
-      rsltrace diff run1.mcap run2.mcap       see where two runs diverge, and why
-      rsltrace replay run.mcap                run it again, stop where it diverges
-      rsltrace debug run.mcap                 stop anywhere, look into nodes, go back
+      rsltrace init --from FILE.py:CLASS      write a first job file
+      rsltrace check job.yaml                 check it and show the graph of nodes and topics
+      rsltrace record job.yaml -o run.mcap    run it and write a trace
+      rsltrace info run.mcap                  summarize the trace
+      rsltrace cat run.mcap | less            list every callback
+      rsltrace view run.mcap                  step through the trace
+      rsltrace diff run1.mcap run2.mcap       show where two runs diverge, and why
+      rsltrace replay run.mcap                run it again and stop where it diverges
+      rsltrace debug run.mcap                 set breakpoints, inspect nodes, step backwards
 
-    "rsltrace COMMAND --help" explains a command.
+    Run "rsltrace COMMAND --help" for the options of a command.
     """
 
 

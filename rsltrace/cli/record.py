@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, all_overrides, job_of, job_options
+from rsltrace.cli.options import json_option, no_pin_option, seed_option, until_option
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
@@ -24,7 +25,7 @@ from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.logs import silent_topics, without_server
 
 if TYPE_CHECKING:
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
     from rsltrace.run import RunResult
     from rsltrace.simulation.loop.stop import Stop
@@ -36,66 +37,63 @@ if TYPE_CHECKING:
     "-o",
     "--output",
     type=click.Path(path_type=Path),
-    help="Trace to write (default: the job file's folder name or name, with .mcap, here).",
+    help="Write the trace to this file (default: the name of the job file or its folder, with "
+    ".mcap).",
 )
 @click.option(
     "--bag",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Write the messages as a plain rosbag2 bag, too.",
+    help="Also write the messages to a rosbag2 bag.",
 )
 @click.option(
     "--force",
     is_flag=True,
-    help="Replace an existing trace (never one it reads), and bag, once the new one is whole.",
+    help="Replace an existing trace and bag once the new ones are complete (never a trace that "
+    "is read).",
 )
-@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option(
-    "--until",
-    metavar="T",
-    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
-)
+@seed_option
+@until_option
 @click.option(
     "--replay",
     type=click.Path(path_type=Path),
     metavar="TRACE",
-    help="Give the nodes what TRACE recorded from outside (guard: mode record).",
+    help="Give the nodes the external values that TRACE recorded (guard: mode record).",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-@click.option("--print-job", is_flag=True, help="Print the job as YAML instead of running it.")
-@click.option(
-    "--no-pin",
-    is_flag=True,
-    help="Keep hash seed, addresses, time zone, locale and numerical threads as they are here.",
-)
+@json_option
+@click.option("--print-job", is_flag=True, help="Print the job as YAML and do not run it.")
+@no_pin_option
 @click.option(
     "--native",
     is_flag=True,
-    help="Observe the nodes on rclpy's own executors over DDS, in real time; simulate nothing.",
+    help="Run the nodes on rclpy's own executors over DDS in real time, and only observe them.",
 )
 @click.option(
     "--executor",
     type=click.Choice(("single", "multi")),
-    help="With --native: each entry's executor, single-threaded (default) or multi-threaded.",
+    help="With --native: use single-threaded (default) or multi-threaded executors.",
 )
 @click.option(
     "--processes",
     is_flag=True,
-    help="With --native: a process for each entry (default: only if one is a program).",
+    help="With --native: run each node in a process of its own (default: only if one is an "
+    "executable).",
 )
 @click.option(
     "--domain",
     type=click.IntRange(0, 232),
     metavar="ID",
-    help="With --native: take part in this DDS domain (default: alone in a free one).",
+    help="With --native: join this DDS domain (default: an unused one).",
 )
 @click.option(
     "--policy",
     type=click.Choice(("rate_monotonic", "priority")),
-    help="With --native: executors take what is most urgent first, and their threads are in the "
-    "real-time class where permitted: by rate, or by the rules of the job's policy.",
+    help="With --native: run the most urgent callback first, by rate or by the priorities of the "
+    "job's policy. Threads get real-time priorities where permitted.",
 )
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
+@click.option(
+    "-q", "--quiet", is_flag=True, help="Show no progress and no log records of the nodes."
+)
 @click.option("--sample-states", is_flag=True, hidden=True)  # as the runs of ``verify`` do
 def record(
     words: tuple[str, ...],
@@ -119,20 +117,20 @@ def record(
     quiet: bool,
     sample_states: bool,
 ) -> None:
-    """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
+    """Run JOB (a job.yaml) or the nodes of a launch file deterministically and record a trace.
 
     \b
       rsltrace record job.yaml -o run.mcap --ros-args -p ekf:rate:=20
       rsltrace record --launch robot.launch.xml world:=lab --until 60
 
-    With --native the same nodes run as they do without rsltrace, and what they do is written down
-    in the same format, with its real times. Such a run has no digest (see docs/native.md).
+    With --native, the nodes run as they do without rsltrace, in real time, and are only observed.
+    The trace has the same format but no digest (see docs/native.md).
 
-    The nodes' log records go to stderr. The last line on stdout is
-    "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
-    The exit status is the job's (0 unless its stop condition says otherwise), 1 if one of its
-    checks (checks:) fails, 3 if a node raised, 130, 143 or 129 if interrupted (Ctrl-C, SIGTERM,
-    SIGHUP).
+    Log records of the nodes go to stderr. The last line on stdout is
+    "digest <16 hex>  events <n>  sim <seconds>". Runs with the same digest are identical.
+
+    Exit status: that of the job's stop condition (default 0); 1 if a check of the job fails; 3 if a
+    node raised an exception; 130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
     from rsltrace.run.process import end_with_run
 
@@ -201,22 +199,19 @@ def _check_options(
 ) -> None:
     """Raise a usage error for options that make no sense together."""
     if native and (replay is not None or seed is not None):
-        raise click.UsageError("--native steers nothing: --replay and --seed are of no use with it")
+        raise click.UsageError("--replay and --seed have no effect on a native run: leave them out")
     if not native and (executor is not None or domain is not None or processes):
-        raise click.UsageError(
-            "--executor, --processes and --domain are for native runs: add --native"
-        )
+        raise click.UsageError("--executor, --processes and --domain need --native")
     if not native and policy is not None:
         raise click.UsageError(
-            "--policy is for native runs: add --native, or say what a simulation goes by with "
-            "--set policy=rate_monotonic"
+            "--policy needs --native; for a simulation use --set policy=rate_monotonic"
         )
     if policy is not None and executor == "multi":
-        raise click.UsageError("--policy is for single-threaded executors: leave --executor out")
+        raise click.UsageError("--policy needs single-threaded executors: leave --executor out")
 
 
 def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
-    """Raise what would be wrong after the run: a bag that is there already, a check's text."""
+    """Report before the run what would fail after it: an existing bag, a wrong check."""
     if bag is not None:
         from rsltrace.trace.recordings.export import check_bag_folder
 
@@ -319,9 +314,9 @@ def _say_if_it_has_no_end(job: Job) -> None:
     if job.stop.model_fields_set or job.bags:
         return
     if job.launch:
-        _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
+        _note("a launch file has no end: stop the run with --until T or Ctrl-C")
     elif any(spec.node is not None for spec in job.nodes):  # mains end by themselves
-        _note("the job does not say when the run ends: 'stop:' in it does, --until T, and Ctrl-C")
+        _note("the job has no end: stop the run with 'stop:' in the job, --until T or Ctrl-C")
 
 
 def _print_job(job: Job) -> None:
@@ -346,7 +341,7 @@ def _note(text: str) -> None:
 
 
 def _silent_topics(result: RunResult) -> list[str]:
-    """Return who listens to what nobody publishes, and who is a client of what nobody serves."""
+    """Return notes on topics without a publisher and services without a server."""
     if result.path is None or result.error is not None or not result.path.is_file():
         return []
     from rsltrace.trace.reader import Trace
@@ -356,25 +351,27 @@ def _silent_topics(result: RunResult) -> list[str]:
             entities = trace.entities.values()
             found = [silent_topics(entities), without_server(entities)]
     except RsltraceError:
-        return []  # somebody took it away meanwhile
-    return [f"{text}; rsltrace check tells who talks to whom" for text in found if text]
+        return []  # the trace is gone
+    return [f"{text}; rsltrace check shows the graph" for text in found if text]
 
 
-def _checked(job: Job, path: Path | None) -> tuple[Checked | None, int]:
-    """Hold the job's checks against what was recorded; return what came of it, and a status."""
+def _checked(job: Job, path: Path | None) -> tuple[CheckReport | None, int]:
+    """Evaluate the job's checks on the trace; return the results and an exit status."""
     if not (job.checks or job.metrics) or path is None:
         return None, 0
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
 
     try:
-        checked = Checked(job, path)
-    except RsltraceError as error:  # the trace is there all the same
+        checked = CheckReport(job, path)
+    except RsltraceError as error:  # the trace itself is complete
         tell(f"rsltrace: error: {error}")
         return None, EXIT_USAGE
     return checked, 1 if checked.violated else 0
 
 
-def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_json: bool) -> None:
+def _report(
+    result: RunResult, told: list[str], checked: CheckReport | None, *, as_json: bool
+) -> None:
     error = result.error
     silent = _silent_topics(result)
     for note in (*result.notes, *silent):
@@ -412,7 +409,7 @@ def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_j
 
 
 def _warn(result: RunResult) -> None:
-    """Say what could make another run differ; the trace has every single call."""
+    """Print the calls that could make another run differ."""
     found = [met for met in result.guarded if met.is_finding]
     if not found:
         return
@@ -420,17 +417,17 @@ def _warn(result: RunResult) -> None:
     copied = {met.node for met in found if met.call == _ENVIRONMENT}
     for met in found:
         what, _, library = met.call.partition(READ_BY)
-        if library:  # what it is configured by, as a rule
+        if library:  # usually the library's configuration
             what = f"environment variables{READ_BY}{library}"
         elif met.node in copied and what.startswith(f"{_ENVIRONMENT}["):
-            continue  # who asks for all of it, to copy it, is told once
+            continue  # reads of the whole environment are reported once
         calls[met.source.value, f"{what} in {met.node or 'the run'}"] += met.count
     tell("guard: these calls can make runs differ (see docs/guard.md):")
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
         times = f", {count} times" if count > 1 else ""
         tell(f"  {source}: {printable(call)}{times}")
     if any(met.source is Source.ADDRESS for met in found) and not has_fixed_addresses():
-        tell("  addresses of objects are others in every process here")
+        tell("  memory addresses differ in every process on this machine")
     if len(calls) > _SHOWN_MAX:
         tell(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}")
 

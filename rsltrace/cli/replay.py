@@ -1,4 +1,4 @@
-"""``rsltrace replay``: run the job of a trace again, and check every event on the way."""
+"""``rsltrace replay``: run the job of a trace again and verify every event."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.diff import Tolerance, print_diffs
+from rsltrace.cli.options import job_folder_option, json_option, no_pin_option, trust_option
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.cli.replay_node import (
-    NodeWays,
+    NodeReplayOptions,
     replay_from_job,
     replay_one,
     tell_of_run,
@@ -39,50 +40,51 @@ _SHOWN_MAX = 12
 @click.option(
     "--until",
     metavar="INDEX|TIME",
-    help="Stop after this event (812) or time of the run (60s, 2.5; @60s: simulated time 60 s), "
-    "with success.",
+    help="Stop with success after this event (812) or time of the run (60s, 2.5). @60s is a "
+    "simulated time.",
 )
 @click.option(
     "--from",
     "first",
     metavar="INDEX|TIME",
-    help="Verify what comes before quietly: progress and the nodes' log records begin here.",
+    help="Show progress and the nodes' log records only from here on. Events before are "
+    "verified, too.",
 )
 @click.option(
     "--edit",
     "edits",
     multiple=True,
     metavar="EDIT",
-    help="Go on otherwise from there: '812: message.data = 3.0' (docs/what-if.md).",
+    help="Branch the run at this event: '812: message.data = 3.0'. See docs/what-if.md. "
+    "Repeatable.",
 )
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Keep the replay's own trace there."
-)
-@click.option("--force", is_flag=True, help="Replace an existing trace (never TRACE itself).")
-@click.option(
-    "--job-folder",
+    "-o",
+    "--output",
     type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="The folder of the job file (default: that of the trace, or the present one).",
+    help="Write the trace of the replay to this file.",
 )
-@click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
-@click.option("--node", metavar="NAME", help="Run this node alone, fed with what it got.")
+@click.option("--force", is_flag=True, help="Replace an existing output file (never TRACE itself).")
+@job_folder_option
+@trust_option
+@click.option("--node", metavar="NAME", help="Run this node alone, with its recorded input.")
 @click.option(
     "--bag",
     "bags",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="With --node: feed it from this rosbag2 recording; TRACE may be a job, then.",
+    help="With --node: take the input from this rosbag2 recording. TRACE may then be a job. "
+    "Repeatable.",
 )
 @click.option(
-    "--until-diverged", is_flag=True, help="With --node: end at the first output that differs."
+    "--until-diverged", is_flag=True, help="With --node: stop at the first output that differs."
 )
-@click.option("--all", "everything", is_flag=True, help="With --node: show all that differs.")
+@click.option("--all", "everything", is_flag=True, help="With --node: show all differences.")
 @click.option(
     "--ignore",
     multiple=True,
     metavar="FIELD",
-    help="With --node: do not compare such fields (header.stamp, /odom:twist).",
+    help="With --node: do not compare these fields (header.stamp, /odom:twist). Repeatable.",
 )
 @click.option(
     "--abs",
@@ -90,11 +92,13 @@ _SHOWN_MAX = 12
     multiple=True,
     type=Tolerance(),
     metavar="FIELD=TOL",
-    help="With --node: tolerate |a-b| <= TOL in such fields (times: in seconds).",
+    help="With --node: tolerate |a-b| <= TOL in these fields (times in seconds). Repeatable.",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-@click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
-@click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
+@json_option
+@no_pin_option
+@click.option(
+    "-q", "--quiet", is_flag=True, help="Show no progress and no log records of the nodes."
+)
 def replay(
     trace: Path,
     until: str | None,
@@ -114,33 +118,32 @@ def replay(
     no_pin: bool,
     quiet: bool,
 ) -> int:
-    """Run the job in TRACE again and compare every event with TRACE as it ends.
+    """Run the job in TRACE again and compare every event with the recorded one.
 
-    Job, launch arguments, parameters, seeds, order and recorded values from outside are those in
-    TRACE; its nodes, bags and files are those that are here now. The first event that is not as
-    recorded ends the run, and is reported as by "rsltrace diff".
+    The job, launch arguments, parameters, seeds, order and recorded external values come from
+    TRACE. Nodes, bags and files are the ones on this machine now. The replay stops at the first
+    event that diverges and explains it as "rsltrace diff" does.
 
-    This runs code: what, from where, and what of it has changed since, is told before it begins.
-    Unless the job file in the present folder (or in --job-folder) names the same code, it takes a
-    yes on the terminal, or --trust.
+    A replay runs code. It first prints which code, from where, and what has changed since the
+    recording. It asks for confirmation (or --trust) unless a job file in the working directory or
+    --job-folder names the same code.
 
-    With --node, only that node runs. It gets the messages, requests and responses of the recording
-    at their recorded times and in their recorded order, and its outputs are compared: all of them
-    are the same as long as its code is, and after a change of its code one sees what changes. With
-    --bag it gets what a recording of the robot has on the topics that it subscribes to.
+    With --node, run only that node. It receives its recorded messages, requests and responses at
+    the recorded times and in the recorded order, and its outputs are compared. Unchanged code
+    gives the same outputs; after a change, you see its effects. With --bag, the node receives
+    the messages that a recording of the robot has on its topics.
 
-    With --edit, what comes before the first edit is verified; the run then goes on as a branch of
-    its own (-o), whose trace holds the edits, and is compared with TRACE.
+    With --edit, verify the events before the first edit, then branch: the run continues with the
+    edits and is compared with TRACE. -o keeps the trace of the branch.
 
-    The exit status is 0 if every event was as recorded (of a run that failed: the failure, too), 1
-    if the replay diverged or the edits changed something, 2 for trouble, 130, 143 or 129 if it was
-    interrupted.
+    Exit status: 0 if every event was as recorded (including a recorded failure); 1 if the replay
+    diverged or the edits changed something; 2 for an error; 130, 143 or 129 if interrupted.
     """
     from rsltrace.replay.edits import check_edits, parse_edit
     from rsltrace.replay.one_node.ways import is_job
     from rsltrace.replay.preparation import count_to, prepared
 
-    ways = NodeWays(
+    ways = NodeReplayOptions(
         node=node or "",
         bags=bags,
         until_diverged=until_diverged,
@@ -183,9 +186,9 @@ def replay(
 
 
 def agree(plan: Preparation, *, trust: bool) -> None:
-    """Have somebody agree to run what a trace names, where that is not plain.
+    """Ask the user to run the code that a trace names, unless it is trusted.
 
-    :raises ReplayError: if nobody does.
+    :raises ReplayError: the user does not agree.
     """
     if not plan.distrust or trust:
         return
@@ -193,8 +196,8 @@ def agree(plan: Preparation, *, trust: bool) -> None:
     why = printable(plan.distrust)
     if sys.stdin is None or not (sys.stdin.isatty() and sys.stderr.isatty()):
         raise ReplayError(
-            f"{name} would run code, and {why}: nothing was run; --trust runs it, if you know "
-            "where the trace comes from"
+            f"{name} would run code, and {why}: nothing was run; use --trust if you know where "
+            "the trace comes from"
         )
     tell(f"{name} would run this code, and {why}.")
     if not click.confirm("Run it?", default=False, err=True):
@@ -231,7 +234,7 @@ _Show = Callable[[int, int | None, int], None]
 
 
 def _from(first: int, show: _Show | None) -> _Show | None:
-    """Return what shows progress from an event on."""
+    """Return a progress function that shows nothing before an event."""
     if show is None or not first:
         return show
 
@@ -242,11 +245,11 @@ def _from(first: int, show: _Show | None) -> _Show | None:
     return later
 
 
-# -- what is told --------------------------------------------------------------------------------
+# -- output --------------------------------------------------------------------------------------
 
 
 def code_lines(plan: Preparation, doing: str, node: str | None = None) -> Iterator[str]:
-    """Yield what will run (all of it, or one node), from where, and what is not as it was."""
+    """Yield which code will run, from where, and what has changed since the recording."""
     trace = plan.trace
     job = trace.job.get("name", "") or "a job"
     what = f"{trace.name}: {trace.event_count} events of {job} in {plan.folder}"
@@ -267,11 +270,11 @@ def code_lines(plan: Preparation, doing: str, node: str | None = None) -> Iterat
         yield printable(f"and the bags {', '.join(bag.path for bag in plan.job.bags)}")
     if plan.changes:
         changes = (f"{c.name} {c.recorded or '-'} -> {c.present or '-'}" for c in plan.changes)
-        yield printable(f"not as it was recorded: {', '.join(changes)}")
+        yield printable(f"changed since the recording: {', '.join(changes)}")
 
 
 def _near(file: Path) -> Path:
-    """Return a file as seen from here, if it is below the present folder."""
+    """Return a path relative to the working directory, if it is below that."""
     return file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
 
 

@@ -1,4 +1,4 @@
-"""``rsltrace replay --node``: one node alone, fed from a trace or from a bag."""
+"""``rsltrace replay --node``: one node alone, with its input from a trace or a bag."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class NodeWays:
-    """What the command line says of replaying a node; ``node`` is empty for the whole job."""
+class NodeReplayOptions:
+    """The options of a replay of one node; ``node`` is empty for the whole job."""
 
     node: str
     bags: tuple[Path, ...]
@@ -38,27 +38,25 @@ class NodeWays:
     as_json: bool
 
     def check(self, until: str | None, first: str | None, edits: tuple[str, ...]) -> None:
-        """Refuse options that have nothing to do.
+        """Refuse options that have no effect together.
 
-        :raises click.UsageError: naming them.
+        :raises click.UsageError: there are some.
         """
         of_node = (self.bags, self.until_diverged, self.everything, self.options)
         if not self.node and any(of_node):
-            raise click.UsageError(
-                "--bag, --until-diverged, --all, --ignore and --abs go with --node"
-            )
+            raise click.UsageError("--bag, --until-diverged, --all, --ignore and --abs need --node")
         if self.node and (until is not None or first is not None):
-            raise click.UsageError("--from and --until go without --node; it has --until-diverged")
-        if self.node and edits:
             raise click.UsageError(
-                "--edit goes without --node: the other nodes are to see the change"
+                "--from and --until have no effect with --node; use --until-diverged"
             )
+        if self.node and edits:
+            raise click.UsageError("--edit needs the whole run: leave out --node")
         if self.bags and self.until_diverged:
-            raise click.UsageError("--until-diverged goes without --bag")
+            raise click.UsageError("--until-diverged has no effect with --bag")
 
 
-def replay_one(plan: Preparation, ways: NodeWays) -> int:
-    """Replay one node of a trace, and print what it did."""
+def replay_one(plan: Preparation, ways: NodeReplayOptions) -> int:
+    """Replay one node of a trace, and print the result."""
     from rsltrace.replay.one_node.from_bag import replay_from_bag
     from rsltrace.replay.one_node.replaying import replay_node
 
@@ -88,8 +86,8 @@ def replay_one(plan: Preparation, ways: NodeWays) -> int:
     return _shown(go, ways)
 
 
-def replay_from_job(path: Path, ways: NodeWays, *, no_pin: bool) -> int:
-    """Run one node of a job file with what bags have for it, and print what it did."""
+def replay_from_job(path: Path, ways: NodeReplayOptions, *, no_pin: bool) -> int:
+    """Run one node of a job file with input from bags, and print the result."""
     from rsltrace.replay.one_node.from_bag import replay_from_bag
     from rsltrace.replay.one_node.ways import load_without_bags
 
@@ -112,7 +110,7 @@ def replay_from_job(path: Path, ways: NodeWays, *, no_pin: bool) -> int:
     return _shown(go, ways)
 
 
-def _shown(go: Callable[[bool, Observer], NodeReplayResult], ways: NodeWays) -> int:
+def _shown(go: Callable[[bool, Observer], NodeReplayResult], ways: NodeReplayOptions) -> int:
     from rsltrace.replay.one_node import report
     from rsltrace.run import Observer
 
@@ -135,7 +133,7 @@ def _shown(go: Callable[[bool, Observer], NodeReplayResult], ways: NodeWays) -> 
 def tell_of_run(
     error: RunError | None, diverged: bool, notes: tuple[str, ...], path: Path | None
 ) -> None:
-    """Tell how a run went, whose events have been compared."""
+    """Print the failure, notes and output file of a replay."""
     if error is not None:
         if diverged and isinstance(error, NodeError) and error.traceback_text:
             tell(error.traceback_text.rstrip())

@@ -1,4 +1,4 @@
-"""``rsltrace rerun``: a trace, or two side by side, in Rerun's viewer."""
+"""``rsltrace rerun``: a trace, or two side by side, in Rerun."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from rsltrace.terminal import say, tell
     "--output",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="Write a Rerun recording (.rrd), to open with `rerun FILE`.",
+    help="Write a Rerun recording (.rrd). Open it with `rerun FILE`.",
 )
-@click.option("--spawn", is_flag=True, help="Open it in Rerun's viewer (default with a display).")
-@click.option("--web", is_flag=True, help="Open it in a browser; served to this machine only.")
-@click.option("--by-event", is_flag=True, help="Begin on the timeline of events, not of time.")
+@click.option("--spawn", is_flag=True, help="Open Rerun's viewer (default if there is a display).")
+@click.option("--web", is_flag=True, help="Open Rerun in a browser, served to this machine only.")
+@click.option("--by-event", is_flag=True, help="Start on the timeline of events instead of time.")
 @click.option("--force", is_flag=True, help="Replace the output file if it exists.")
-@click.option("-q", "--quiet", is_flag=True, help="Do not say what was written.")
+@click.option("-q", "--quiet", is_flag=True, help="Print nothing about the written file.")
 def rerun(
     trace: Path,
     other: Path | None,
@@ -34,11 +34,11 @@ def rerun(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Show TRACE on Rerun's timelines, or TRACE and OTHER and where they diverge.
+    """Show TRACE in Rerun, or TRACE and OTHER side by side.
 
-    The timelines are simulated time and the number of the event: stepping along the events steps
-    through the callbacks. Messages are drawn and plotted, logs and events are listed, and of two
-    runs the first divergence is explained and marked.
+    The timelines are simulated time and event number: stepping along the events steps through the
+    callbacks. Messages are drawn and plotted; logs and events are listed. For two traces, the first
+    divergence is marked and explained.
 
     \b
     Needs Rerun: pip install 'rsltrace[rerun]'

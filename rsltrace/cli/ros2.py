@@ -15,15 +15,15 @@ from rsltrace.cli.main import main
 
 
 class RsltraceCommand(CommandExtension):  # type: ignore[misc]
-    """Record, compare and step through what rclpy nodes do, deterministically."""
+    """Record, compare and debug deterministic runs of ROS 2 nodes."""
 
     def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
-        """Leave all words to rsltrace: ``ros2 rsltrace record --help`` is its own help."""
+        """Pass all arguments to rsltrace, ``--help`` included."""
         parser.add_argument(
             "words",
             nargs=argparse.REMAINDER,
             metavar="COMMAND ...",
-            help=f"what would follow 'rsltrace'; see '{cli_name} record --help' and so on",
+            help=f"the arguments of 'rsltrace'; see '{cli_name} record --help' and so on",
         )
 
     def main(self, *, parser: Any, args: Any) -> int:

@@ -1,4 +1,4 @@
-"""``rsltrace schema``: what editors need to complete and check a job file."""
+"""``rsltrace schema``: the JSON Schema of job files, for editors."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from rsltrace.terminal import say
 
 @click.command()
 def schema() -> None:
-    """Print the JSON Schema (draft 2020-12) of a job file.
+    """Print the JSON Schema (draft 2020-12) of job files.
 
     \b
-    Completion and checks in VS Code (with the YAML extension by Red Hat) and other editors:
+    For completion and checks in VS Code (with Red Hat's YAML extension) and other editors, run
       rsltrace schema > job.schema.json
-    and as the first line of the job file:
+    and put this line at the top of the job file:
       # yaml-language-server: $schema=job.schema.json
     """
     say(schema_text())

@@ -1,4 +1,4 @@
-"""Where the command begins: to record, it starts once more, pinned, before anything is loaded."""
+"""The entry point of the command. To record, it restarts itself pinned before loading anything."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import sys
 from typing import NoReturn
 
 _ALLOCATIONS = 200_000
-"""How many new objects Python looks at together for garbage: with its own 700, a sixth of what a
-short command takes went into looking at modules that were being loaded."""
+"""Allocations between garbage collections. With Python's 700, a short command spent a sixth of its
+time collecting while it imported modules."""
 
 
 def main() -> NoReturn:
     """Run the command line and exit."""
-    # Until there is something to close, Ctrl-C ends Python where it is, without a traceback.
+    # While modules load, Ctrl-C ends the process without a traceback.
     is_pythons = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_pythons:
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""``rsltrace verify``: is a job deterministic? Tried, not believed."""
+"""``rsltrace verify``: test whether a job is deterministic."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
+from rsltrace.cli.options import json_option, seed_option, timeout_option, until_option
 from rsltrace.errors import EXIT_USAGE, RsltraceError
 from rsltrace.search.perturb import KINDS
 from rsltrace.terminal import say, tell
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Given:
-    """What the command line says of the job, to be said again to ``record`` and ``verify``."""
+class JobArguments:
+    """The options of a command line that choose the job, for its child processes."""
 
     words: tuple[str, ...]
     launch: Path | None
@@ -40,7 +41,7 @@ class Given:
     ros: tuple[str, ...]
 
     def arguments(self, path: Callable[[str], object] = str) -> list[str]:
-        """Return the words; ``path`` makes of a path what it is where they are used."""
+        """Return the arguments; ``path`` converts each path for the process that uses them."""
         found = [word if ":=" in word else str(path(word)) for word in self.words]
         if self.launch is not None:
             found += ["--launch", str(path(str(self.launch)))]
@@ -69,7 +70,7 @@ class Given:
     default=10,
     show_default=True,
     metavar="N",
-    help="How many runs; the first is not perturbed.",
+    help="Run the job N times. The first run is not perturbed.",
 )
 @click.option(
     "--jobs",
@@ -77,47 +78,38 @@ class Given:
     default=1,
     show_default=True,
     metavar="W",
-    help="How many runs at a time.",
+    help="Run W runs in parallel.",
 )
-@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option(
-    "--until",
-    metavar="T",
-    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
-)
-@click.option("--no-pin", is_flag=True, help="Show what pinning the process hides.")
+@seed_option
+@until_option
+@click.option("--no-pin", is_flag=True, help="Do not pin the process, to show what pinning hides.")
 @click.option(
     "--perturbations",
     type=click.IntRange(min=0),
     default=0,
     metavar="SEED",
-    help="Choose other perturbations.",
+    help="Choose other perturbations with this seed.",
 )
-@click.option(
-    "--timeout",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="S",
-    help="Kill a run after so many seconds (default: 30 times what the first took, at least 120).",
-)
+@timeout_option
 @click.option(
     "--keep",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Keep the traces of all runs there.",
+    help="Keep the traces of all runs in this folder.",
 )
 @click.option(
-    "--run", "number", type=click.IntRange(min=0), help="Make only this run, to repeat it."
+    "--run", "number", type=click.IntRange(min=0), help="Repeat only the run of this number."
 )
 @click.option(
-    "--only", type=click.Choice(KINDS), help="With --run: only this one of its perturbations."
+    "--only", type=click.Choice(KINDS), help="With --run: apply only this one of its perturbations."
 )
 @click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="With --run: the trace to write (default: run-N.mcap, here).",
+    help="With --run: write the trace to this file (default: run-N.mcap).",
 )
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@json_option
 def verify(
     words: tuple[str, ...],
     launch: Path | None,
@@ -136,21 +128,21 @@ def verify(
     output: Path | None,
     as_json: bool,
 ) -> int:
-    """Record JOB several times in separate processes and compare the digests.
+    """Run JOB several times under perturbed environments and compare the digests.
 
-    Each run but the first has another hash seed, working directory, locale, time zone, heap,
-    address space, CPU load, thread counts and BLAS core type, as far as these can be chosen here.
-    At the first disagreement, the two runs are compared as by "rsltrace diff"; a line for each of
-    them repeats it, and each perturbation is tried alone.
+    Each run after the first has a different hash seed, working directory, locale, time zone, heap,
+    address space, CPU load, thread counts and BLAS core type, as far as this machine permits. When
+    a run differs, the two runs are compared as "rsltrace diff" does, commands to repeat both are
+    printed, and each perturbation is tried alone.
 
-    The exit status is 0 if all runs are the same, 1 if not, 2 for trouble: the job is wrong, or a
-    run fails, crashes or takes too long.
+    Exit status: 0 if all runs are the same, 1 if not, 2 for an error: the job is wrong, or a run
+    fails, crashes or times out.
     """
     if (only or output) and number is None:
-        raise click.UsageError("--only and --output go with --run N")
-    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
-    job_of(words, launch, skip, overrides)  # what is wrong with it is said once, and here
-    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, terminated():
+        raise click.UsageError("--only and --output need --run N")
+    given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    job_of(words, launch, skip, overrides)  # report a broken job once, before the runs
+    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, handling_signals():
         folder = Path(name)
         if number is not None:
             return _one_run(given, folder, number, perturbations, only, output)
@@ -158,7 +150,7 @@ def verify(
 
 
 def _verify(
-    given: Given,
+    given: JobArguments,
     folder: Path,
     runs: int,
     jobs: int,
@@ -207,7 +199,7 @@ def _two(result: Verified) -> list[Recorded]:
     return [result.first] if second is None or second is result.first else [result.first, second]
 
 
-def _again(given: Given, perturbations: int, around: Surroundings) -> str:
+def _again(given: JobArguments, perturbations: int, around: Surroundings) -> str:
     """Return the command that repeats one run."""
     words = ["rsltrace", "verify", *given.arguments()]
     if perturbations:
@@ -216,7 +208,7 @@ def _again(given: Given, perturbations: int, around: Surroundings) -> str:
 
 
 def _one_run(
-    given: Given,
+    given: JobArguments,
     folder: Path,
     number: int,
     perturbations: int,
@@ -241,8 +233,8 @@ def _one_run(
 
 
 @contextmanager
-def terminated() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end the runs, too, instead of leaving them behind."""
+def handling_signals() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end the child processes, too."""
 
     def end(number: int, frame: object) -> None:
         sys.exit(128 + number)

@@ -1,4 +1,4 @@
-"""``rsltrace view``: look at a trace, or at two, in the terminal."""
+"""``rsltrace view``: view a trace, or two side by side, in the terminal."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.options import job_folder_option, trust_option
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.file_kind import is_recording
 from rsltrace.errors import OutputError, SetupError, TraceError
@@ -38,31 +39,41 @@ _PORT = 8321
 @click.option(
     "--at",
     metavar="EVENT|TIME",
-    help="Start at an event (1200) or a time of the run (1.5s; @1.5s: simulated time).",
+    help="Start at an event (1200) or a time of the run (1.5s). @1.5s is a simulated time.",
 )
-@click.option("--filter", "filter_text", default="", metavar="TEXT", help="Show only some events.")
-@click.option("--light", is_flag=True, help="Dark on light.")
+@click.option(
+    "--filter",
+    "filter_text",
+    default="",
+    metavar="TEXT",
+    help="Show only matching events (docs/view.md).",
+)
+@click.option("--light", is_flag=True, help="Use a light theme.")
 @click.option("--follow", is_flag=True, help="Follow a trace that is still being recorded.")
 @click.option(
-    "--live", is_flag=True, help="Execute TRACE's job again: stepping runs it, forwards and back."
+    "--live", is_flag=True, help="Run the job of TRACE again as you step, forwards and backwards."
 )
+@job_folder_option
+@trust_option
 @click.option(
-    "--job-folder",
-    type=click.Path(path_type=Path),
-    metavar="DIR",
-    help="With --live: the folder of the job file (default: that of the trace, or this one).",
+    "--rerun", is_flag=True, help="Also open Rerun's viewer, which follows the selection."
 )
-@click.option("--trust", is_flag=True, help="With --live: run the code that TRACE names unasked.")
-@click.option("--rerun", is_flag=True, help="Open Rerun's viewer, too: it follows the selection.")
 @click.option(
     "--export",
     type=click.Path(path_type=Path, dir_okay=False),
-    help="Write one screen to a file (.svg or .txt) instead; needs no terminal.",
+    help="Write one screen to a file (.svg or .txt). This needs no terminal.",
 )
-@click.option("--size", default="120x36", show_default=True, help="With --export: columns x rows.")
-@click.option("--keys", default="", help="With --export: keys to press first, as in 'n down z'.")
-@click.option("--serve", is_flag=True, help="Open it in a browser on this machine instead.")
-@click.option("--port", default=_PORT, show_default=True, help="With --serve: the port.")
+@click.option(
+    "--size",
+    default="120x36",
+    show_default=True,
+    help="With --export: size of the screen, columns x rows.",
+)
+@click.option(
+    "--keys", default="", help="With --export: press these keys first, such as 'n down z'."
+)
+@click.option("--serve", is_flag=True, help="Open the viewer in a browser on this machine.")
+@click.option("--port", default=_PORT, show_default=True, help="With --serve: port of the server.")
 def view(
     traces: tuple[Path, ...],
     at: str | None,
@@ -79,27 +90,28 @@ def view(
     serve: bool,
     port: int,
 ) -> None:
-    """Look at TRACE, or compare two: step through events, follow causes, read messages.
+    """View TRACE, or compare two traces: step through events, follow causes, read messages.
 
-    Bags and native recordings open, too (a folder, .mcap or .db3): topics, rates, messages, plots.
+    Bags and native recordings (a folder, .mcap or .db3) also open, with their topics, rates,
+    messages and plots.
 
-    With --live, the job in TRACE runs again as one steps: each event is verified, and shown with
-    what it changed in its node and with the source of its callback. This runs code, under the
-    conditions of "rsltrace replay".
+    With --live, the job in TRACE runs again as you step. Each event is verified, and shown with its
+    changes to the node and with the source of its callback. This runs code
+    and asks first as "rsltrace replay" does. --job-folder and --trust need --live.
 
-    Without a TRACE, offers those of this folder, and its bags. One trace opens with an overview
-    (Esc leaves it for the events; so do --at and --filter), two where they diverge. Inside, ?
-    shows all keys and q quits.
+    Without TRACE, choose among the traces and bags in the working directory. One trace opens with
+    an overview (press Esc for the events), two open where they diverge. Press ? for all keys and q
+    to quit.
     """
     _check_installed("textual")
     if len(traces) > 2:
         raise click.UsageError("view shows one trace or compares two; `rsltrace diff` takes more")
     if follow and len(traces) > 1:
-        raise click.UsageError("--follow works with one trace")
+        raise click.UsageError("--follow needs one trace")
     if live and (len(traces) != 1 or follow):
-        raise click.UsageError("--live works with one trace, whole or cut, and without --follow")
+        raise click.UsageError("--live needs one trace and no --follow")
     if not live and (trust or job_folder is not None):
-        raise click.UsageError("--trust and --job-folder are for --live")
+        raise click.UsageError("--trust and --job-folder need --live")
     if rerun:
         _check_rerun(follow=follow, exporting=export is not None)
     if serve:
@@ -110,7 +122,7 @@ def view(
         return
     if any(is_recording(path) for path in chosen):
         if follow or live or rerun:
-            raise click.UsageError("--follow, --live and --rerun need traces; these are recordings")
+            raise click.UsageError("--follow, --live and --rerun need traces, not recordings")
         _show(_recordings(chosen, at, filter_text, light=light), export, size, keys)
         return
     with ExitStack() as stack:
@@ -164,7 +176,7 @@ def _opened(
     job_folder: Path | None,
     trust: bool,
 ) -> tuple[Session, Callable[..., ViewerApp]]:
-    """Open what is to be shown; return it, and what makes the app for it."""
+    """Open the traces; return the session and the constructor of its app."""
     from rsltrace_viewer.terminal.app import ViewerApp, open_session
 
     if not live:
@@ -190,15 +202,13 @@ def _opened(
 
 
 def _check_rerun(*, follow: bool, exporting: bool) -> None:
-    """Refuse what no viewer of Rerun's can follow, before anything is opened."""
+    """Check that Rerun's viewer can be used, before anything is opened."""
     if follow or exporting:
-        raise click.UsageError(
-            "--rerun shows whole traces beside the terminal: not with --follow or --export"
-        )
+        raise click.UsageError("--rerun cannot be combined with --follow or --export")
     from rsltrace_viewer.rerun_export import sdk, show
 
     sdk.require_control()
-    show.check_display("leave --rerun out, or set DISPLAY")
+    show.check_display("leave out --rerun, or set DISPLAY")
 
 
 def _follower(stack: ExitStack, traces: tuple[Path, ...]) -> RerunFollower:
@@ -225,12 +235,12 @@ def _choose(*, exporting: bool, light: bool) -> tuple[Path, ...]:
     found = found_in(Path())
     if not found:
         raise TraceError(
-            "there is no trace and no bag in this folder; name one, or make a trace with "
+            "the working directory has no trace and no bag; name one, or record a trace with "
             "`rsltrace record`"
         )
     if exporting or not _has_terminal():
         names = ", ".join(entry.name for entry in found[:8])
-        raise TraceError(f"name a trace or a bag; this folder has {names}")
+        raise TraceError(f"name a trace or a bag; the working directory has {names}")
     chosen = ChooseApp(found, light=light).run()
     return tuple(chosen or ())
 
@@ -266,7 +276,7 @@ def _parse_size(text: str) -> tuple[int, int]:
     found = _SIZE.fullmatch(text)
     if found is None or not (20 <= int(found[1]) <= 500 and 5 <= int(found[2]) <= 300):
         raise click.BadParameter(
-            f"{text!r} is no size from 20x5 to 500x300, like 120x36", param_hint="--size"
+            f"{text!r} is not a size from 20x5 to 500x300, such as 120x36", param_hint="--size"
         )
     return int(found[1]), int(found[2])
 
@@ -281,14 +291,15 @@ def _export(app: Shown, path: Path, size: tuple[int, int], keys: list[str]) -> N
 
 
 def _has_terminal() -> bool:
-    """Return whether the viewer can draw: into a terminal, or into the browser that started it."""
+    """Whether the viewer has a terminal, or a browser that started it."""
     return "TEXTUAL_DRIVER" in os.environ or (sys.stdin.isatty() and sys.stdout.isatty())
 
 
 def _run(app: Shown) -> None:
     if not _has_terminal():
         raise SetupError(
-            "the viewer needs a terminal; --export writes a screen to a file, `rsltrace cat` prints"
+            "the viewer needs a terminal; use --export to write a screen to a file, or `rsltrace "
+            "cat`"
         )
     if sys.stdout.isatty():
         for name in ("COLUMNS", "LINES"):
@@ -303,7 +314,7 @@ def _run(app: Shown) -> None:
 
 
 def _serve(port: int) -> None:
-    """Serve this very command, without --serve, in a browser. Only this machine can reach it."""
+    """Serve this command, without --serve, to a browser on this machine."""
     _check_installed("textual_serve")
     from rsltrace_viewer.terminal.serve import LocalServer
 

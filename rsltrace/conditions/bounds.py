@@ -25,14 +25,14 @@ class LimitError(ValueError):
     """An expression computes more than it may."""
 
 
-class Budget:
+class StepBudget:
     """The steps that an expression has left. ``reading`` is for what stands outside of loops."""
 
     __slots__ = ("left", "reading")
 
     def __init__(self) -> None:
         self.left = STEPS_MAX
-        self.reading: Budget = _ReadingBudget(self)
+        self.reading: StepBudget = _ReadingStepBudget(self)
 
     def spend(self, steps: int) -> None:
         """Take some away.
@@ -54,12 +54,12 @@ class Budget:
         self.spend(1 + (size >> 3 if text else size))
 
 
-class _ReadingBudget(Budget):
+class _ReadingStepBudget(StepBudget):
     """Outside of loops, what goes through data once costs nothing; what is made costs always."""
 
     __slots__ = ("_paying",)
 
-    def __init__(self, paying: Budget) -> None:
+    def __init__(self, paying: StepBudget) -> None:
         self._paying = paying
 
     def spend(self, steps: int) -> None:
@@ -70,7 +70,7 @@ class _ReadingBudget(Budget):
         self._paying.make(size, text=text)
 
 
-def checked(value: Any) -> Any:
+def within_limits(value: Any) -> Any:
     """Return a value that an operator or a function has made.
 
     :raises LimitError: it is a number of too many bits, or a complex one.
@@ -82,7 +82,7 @@ def checked(value: Any) -> Any:
     return value
 
 
-def weight(value: Any, budget: Budget) -> None:
+def spend_for(value: Any, budget: StepBudget) -> None:
     """Pay for what a value holds, nested sequences included.
 
     :raises LimitError: it holds too much.
@@ -97,7 +97,7 @@ def weight(value: Any, budget: Budget) -> None:
                 if type(item) is list or type(item) is tuple:
                     left.append(item)
                 elif type(item) not in _NUMBERS:
-                    weight(item, budget)
+                    spend_for(item, budget)
     elif kind is str or kind is bytes:
         budget.spend((len(value) >> 3) + 1)
     elif kind.__module__ == "numpy" and value.ndim:

@@ -6,7 +6,7 @@ from typing import Any
 
 from rsltrace.conditions.condition import Armed, error_text, shown
 from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, Moment
+from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_seconds
@@ -14,10 +14,10 @@ from rsltrace.trace.model.texts import format_seconds
 _NOT_THERE = "(not there)"
 
 
-class AtTime(Armed):
+class TimeCondition(Armed):
     """Before the first event at a time of the run or after it."""
 
-    def __init__(self, time: TimeInRun, moment: Moment) -> None:
+    def __init__(self, time: TimeInRun, moment: PausedRun) -> None:
         self._time_ns = time.stamp_ns(moment.start_ns)
         self._is_past = moment.stamp_ns >= self._time_ns
 
@@ -29,13 +29,13 @@ class AtTime(Armed):
         return f"{format_seconds(view.stamp_ns)} s"
 
 
-class Watch(Armed):
+class WatchCondition(Armed):
     """After an event in which the value of an expression has changed.
 
     A value is known by its hash: two equal lists are the same, however they were made.
     """
 
-    def __init__(self, expression: Expression, moment: Moment) -> None:
+    def __init__(self, expression: Expression, moment: PausedRun) -> None:
         from rsltrace.guard.state.hashing import StateHasher  # which loads numpy
 
         self._expression = expression
@@ -50,7 +50,7 @@ class Watch(Armed):
             return ""
         return f"{self._expression.text}: {before} -> {self._shown}"
 
-    def _now(self, moment: Moment) -> tuple[int, str]:
+    def _now(self, moment: PausedRun) -> tuple[int, str]:
         try:
             value = self._expression.value(moment)
         except Exception as error:
@@ -65,10 +65,10 @@ class Watch(Armed):
         return found, shown(value)
 
 
-class When(Armed):
+class WhenCondition(Armed):
     """After the event with which an expression becomes true."""
 
-    def __init__(self, expression: Expression, moment: Moment) -> None:
+    def __init__(self, expression: Expression, moment: PausedRun) -> None:
         self._expression = expression
         self._is_true = self._now(moment)
 
@@ -77,7 +77,7 @@ class When(Armed):
         was_true, self._is_true = self._is_true, self._now(view)
         return f"{self._expression.text} is true now" if self._is_true and not was_true else ""
 
-    def _now(self, moment: Moment) -> bool:
+    def _now(self, moment: PausedRun) -> bool:
         try:
             value: Any = self._expression.value(moment)
             found = bool(value)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from rsltrace.conditions.bounds import LimitError
 from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, Moment
+from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, RsltraceError
 
 _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
@@ -51,7 +52,7 @@ class Condition:
     before: bool
     after: bool
     reads: frozenset[str]
-    arm: Callable[[Moment], Armed] = field(repr=False)
+    arm: Callable[[PausedRun], Armed] = field(repr=False)
 
 
 def is_true(
@@ -76,7 +77,9 @@ def is_true(
 
 
 def error_text(error: BaseException) -> str:
-    """Return an error as the last line of a traceback has it."""
+    """Return the message of an error, with its type unless that is the language's own."""
+    if isinstance(error, LimitError):
+        return str(error)
     return shown_text(f"{type(error).__name__}: {error}")
 
 

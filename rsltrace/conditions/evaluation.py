@@ -31,10 +31,10 @@ from rsltrace.conditions.bounds import (
     DEPTH_MAX,
     STEPS_EACH,
     TEXT_MAX,
-    Budget,
     LimitError,
-    checked,
-    weight,
+    StepBudget,
+    spend_for,
+    within_limits,
 )
 from rsltrace.conditions.functions import (
     CONSTANTS,
@@ -55,13 +55,13 @@ LANGUAGE = (
 """What an expression may have, in the words of its errors."""
 
 
-class Scope:
+class ExpressionContext:
     """What an expression is evaluated for. ``message`` is the one whose fields it names,
     ``moment`` what its other names are looked up in."""
 
     __slots__ = ("budget", "message", "moment", "own", "reading")
 
-    def __init__(self, moment: Any, message: Any, budget: Budget) -> None:
+    def __init__(self, moment: Any, message: Any, budget: StepBudget) -> None:
         self.moment = moment
         self.message = message
         self.budget = budget
@@ -69,7 +69,7 @@ class Scope:
         self.own: dict[str, Any] = {}
 
 
-Evaluate = Callable[[Scope], Any]
+Evaluate = Callable[[ExpressionContext], Any]
 """A part of an expression, ready to be evaluated."""
 
 
@@ -155,19 +155,19 @@ def evaluation(tree: ast.expr, vocabulary: Vocabulary) -> Evaluate:
 
     :raises Refused: a part of it is not of the language.
     """
-    return _Compiler(vocabulary).part(tree, {}, 0)
+    return _ExpressionCompiler(vocabulary).part(tree, {}, 0)
 
 
-def value_of(evaluate: Evaluate, moment: Any, message: Any, budget: Budget) -> Any:
+def value_of(evaluate: Evaluate, moment: Any, message: Any, budget: StepBudget) -> Any:
     """Return what an expression is worth. Raises whatever its parts raise."""
     budget.left += STEPS_EACH
-    found = evaluate(Scope(moment, message, budget))
+    found = evaluate(ExpressionContext(moment, message, budget))
     if type(found) is GeneratorType:
         raise TypeError("a comprehension has no value of its own: say any(...) or all(...)")
     return found
 
 
-class _Compiler:
+class _ExpressionCompiler:
     """Makes functions of the parts of a tree. ``own`` are the names of comprehensions around a
     part, with where their values are kept; ``depth`` counts these comprehensions."""
 
@@ -191,7 +191,7 @@ class _Compiler:
             ast.ListComp: self._comprehension,
         }
         self._count = 0
-        self._budget = Budget()
+        self._budget = StepBudget()
 
     def part(self, node: ast.AST, own: Mapping[str, str], depth: int) -> Evaluate:
         make = self._parts.get(type(node))
@@ -205,7 +205,7 @@ class _Compiler:
         if not isinstance(value, (int, float, str, bytes, type(None))):
             raise Refused(node, f"{ast.unparse(node)} has no place in an expression")
         try:
-            checked(value)
+            within_limits(value)
         except LimitError as error:
             raise Refused(node, str(error)) from None
         return _Constant(value)
@@ -264,9 +264,9 @@ class _Compiler:
     def _list(self, node: ast.List, own: Mapping[str, str], depth: int) -> Evaluate:
         parts = [self.part(one, own, depth) for one in node.elts]
 
-        def made(scope: Scope) -> list[Any]:
+        def made(scope: ExpressionContext) -> list[Any]:
             found = [part(scope) for part in parts]
-            weight(found, scope.budget)
+            spend_for(found, scope.budget)
             return found
 
         return made
@@ -276,9 +276,9 @@ class _Compiler:
         if all(isinstance(part, _Constant) for part in parts):
             return _Constant(tuple(part.value for part in parts))  # type: ignore[attr-defined]
 
-        def made(scope: Scope) -> tuple[Any, ...]:
+        def made(scope: ExpressionContext) -> tuple[Any, ...]:
             found = tuple([part(scope) for part in parts])
-            weight(found, scope.budget)
+            spend_for(found, scope.budget)
             return found
 
         return made
@@ -296,7 +296,7 @@ class _Compiler:
             if not depth:
                 return lambda scope: compare(left(scope), constant)
 
-            def compared_with(scope: Scope) -> Any:
+            def compared_with(scope: ExpressionContext) -> Any:
                 a = left(scope)
                 if type(a) in _SMALL:
                     return compare(a, constant)
@@ -304,7 +304,7 @@ class _Compiler:
 
             return compared_with
 
-        def compared(scope: Scope) -> Any:
+        def compared(scope: ExpressionContext) -> Any:
             a, b = left(scope), right(scope)
             if type(a) in _SMALL and type(b) in _SMALL:
                 return compare(a, b)
@@ -316,7 +316,7 @@ class _Compiler:
         *firsts, last = (self.part(one, own, depth) for one in node.values)
         is_or = isinstance(node.op, ast.Or)
 
-        def logic(scope: Scope) -> Any:
+        def logic(scope: ExpressionContext) -> Any:
             for part in firsts:
                 found = part(scope)
                 if bool(found) is is_or:
@@ -343,7 +343,7 @@ class _Compiler:
                 scope.budget if depth else scope.reading, left(scope), right(scope)
             )
 
-        def computed(scope: Scope) -> Any:
+        def computed(scope: ExpressionContext) -> Any:
             a, b = left(scope), right(scope)
             if type(a) is float and type(b) in _REALS:
                 return usual(a, b)
@@ -359,7 +359,7 @@ class _Compiler:
                 return _Constant(operate(inner.value))
             except TypeError:
                 pass  # it is said where it is evaluated
-        return lambda scope: checked(operate(inner(scope)))
+        return lambda scope: within_limits(operate(inner(scope)))
 
     def _choice(self, node: ast.IfExp, own: Mapping[str, str], depth: int) -> Evaluate:
         test, then, other = (self.part(p, own, depth) for p in (node.test, node.body, node.orelse))
@@ -388,10 +388,10 @@ class _Compiler:
             raise Refused(node, f"{ast.unparse(node.func)}: {error}") from None
         if options:
 
-            def called_with(scope: Scope) -> Any:
+            def called_with(scope: ExpressionContext) -> Any:
                 budget = scope.budget if depth else scope.reading
                 made = {name: part(scope) for name, part in options.items()}
-                return checked(function(budget, *[value(scope) for value in values], **made))
+                return within_limits(function(budget, *[value(scope) for value in values], **made))
 
             return called_with
         if len(values) == 1:
@@ -399,20 +399,20 @@ class _Compiler:
             usual = OF_FLOATS.get(function)
             if usual is not None:
 
-                def called_often(scope: Scope) -> Any:
+                def called_often(scope: ExpressionContext) -> Any:
                     value = only(scope)
                     if type(value) is float:
                         return usual(value)
-                    return checked(function(scope.budget if depth else scope.reading, value))
+                    return within_limits(function(scope.budget if depth else scope.reading, value))
 
                 return called_often
             if depth:
-                return lambda scope: checked(function(scope.budget, only(scope)))
-            return lambda scope: checked(function(scope.reading, only(scope)))
+                return lambda scope: within_limits(function(scope.budget, only(scope)))
+            return lambda scope: within_limits(function(scope.reading, only(scope)))
 
-        def called(scope: Scope) -> Any:
+        def called(scope: ExpressionContext) -> Any:
             budget = scope.budget if depth else scope.reading
-            return checked(function(budget, *[value(scope) for value in values]))
+            return within_limits(function(budget, *[value(scope) for value in values]))
 
         return called
 
@@ -462,7 +462,7 @@ class _Compiler:
         result = self.part(node.elt, keys, depth + len(loops))
         cost = 1 + sum(1 for _ in ast.walk(node.elt)) // 4
 
-        def run(scope: Scope, at: int) -> Iterator[Any]:
+        def run(scope: ExpressionContext, at: int) -> Iterator[Any]:
             among, targets, unpacks, tests, is_free = loops[at]
             own_values, budget = scope.own, scope.budget
             is_last = at == len(loops) - 1
@@ -483,7 +483,7 @@ class _Compiler:
                     if is_last:
                         found = result(scope)
                         if type(found) not in _SMALL:
-                            weight(found, budget)
+                            spend_for(found, budget)
                         yield found
                     else:
                         yield from run(scope, at + 1)
@@ -492,7 +492,7 @@ class _Compiler:
         if len(loops) > 1 or tests or len(targets) != 1 + unpacks:
             return lambda scope: run(scope, 0)
 
-        def simple(scope: Scope) -> Iterator[Any]:  # the usual loop
+        def simple(scope: ExpressionContext) -> Iterator[Any]:  # the usual loop
             own_values, budget = scope.own, scope.budget
             first, second = targets[0], targets[-1]
             for item in items(scope.reading if is_free else budget, among(scope)):
@@ -504,7 +504,7 @@ class _Compiler:
                     own_values[first], own_values[second] = item
                 found = result(scope)
                 if type(found) not in _SMALL:
-                    weight(found, budget)
+                    spend_for(found, budget)
                 yield found
 
         return simple
@@ -542,7 +542,7 @@ def _chain(
 ) -> Evaluate:
     """Return how ``0.1 < x < 3`` is evaluated: each part once."""
 
-    def chained(scope: Scope) -> Any:
+    def chained(scope: ExpressionContext) -> Any:
         a, b = left(scope), right(scope)
         small = type(a) in _SMALL and type(b) in _SMALL
         found = compare(a, b) if small else _compared(scope, compare, a, b)
@@ -558,7 +558,7 @@ def _chain(
         low, below, high = left.value, rest[0][0], rest[0][1].value
         if type(low) in _SMALL and type(high) in _SMALL:
 
-            def between(scope: Scope) -> Any:
+            def between(scope: ExpressionContext) -> Any:
                 value = right(scope)
                 if type(value) in _SMALL:
                     return compare(low, value) and below(value, high)
@@ -568,10 +568,10 @@ def _chain(
     return chained
 
 
-def _compared(scope: Scope, compare: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+def _compared(scope: ExpressionContext, compare: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
     """Compare two values of which one may be large, and pay for it inside of loops."""
     if type(b) in _NESTED:
-        weight(b, scope.budget)
+        spend_for(b, scope.budget)
     elif scope.own and hasattr(b, "__len__"):
         scope.budget.spend(len(b) >> 6)
     if scope.own and hasattr(a, "__len__"):
@@ -587,7 +587,7 @@ class _Constant:
     def __init__(self, value: Any) -> None:
         self.value = value
 
-    def __call__(self, scope: Scope) -> Any:
+    def __call__(self, scope: ExpressionContext) -> Any:
         return self.value
 
 

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.conditions.bounds import Budget
+from rsltrace.conditions.bounds import StepBudget
 from rsltrace.conditions.evaluation import (
     NO_FIELD,
     Evaluate,
+    ExpressionContext,
     Places,
     Refused,
-    Scope,
     evaluation,
     field_names,
     message_field,
@@ -26,7 +26,7 @@ from rsltrace.conditions.evaluation import (
 from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
 from rsltrace.conditions.message_fields import wrong_field
 from rsltrace.conditions.names import Names, near_name, nodes_called, short_name
-from rsltrace.conditions.view import EventView, Moment
+from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 
 FROM_THE_RUN = ("node", "event", "now", "msg")
@@ -38,10 +38,10 @@ class Expression:
 
     text: str
     evaluate: Evaluate
-    budget: Budget
+    budget: StepBudget
     begin: int = 0
 
-    def value(self, moment: Moment | EventView, *, message: object = None) -> Any:
+    def value(self, moment: PausedRun | EventView, *, message: object = None) -> Any:
         """Return what it is worth now.
 
         Names are looked for in ``message`` (its fields), then among the run's own
@@ -92,11 +92,11 @@ def parse_expression(
     place = Places(text)
     try:
         check_names(tree, names or Names(), interface=interface, has_own=has_own)
-        evaluate = evaluation(tree, _OfEvents())
+        evaluate = evaluation(tree, _EventVocabulary())
     except Refused as error:
         start, end = place.of(error.node)
         raise ConditionError(error.message, whole, begin + start, begin + end) from None
-    return Expression(text, evaluate, Budget(), begin)
+    return Expression(text, evaluate, StepBudget(), begin)
 
 
 def check_names(
@@ -109,7 +109,7 @@ def check_names(
     """
     free = set(free_names(tree))
     fields = names.fields(interface) if interface else None
-    checks = _Checks(names, fields, has_own, others)
+    checks = _NameChecker(names, fields, has_own, others)
     for node in ast.walk(tree):
         what = checks.wrong(node, free)
         if what:
@@ -131,7 +131,7 @@ def free_names(tree: ast.expr) -> Iterator[str]:
     )
 
 
-class _Checks:
+class _NameChecker:
     """Says what is wrong with names. ``anything_goes``: fields or attributes nobody knows."""
 
     def __init__(
@@ -196,14 +196,14 @@ def _asked_node(node: ast.AST) -> str | None:
 # -- evaluation ------------------------------------------------------------------------------------
 
 
-class _OfEvents:
+class _EventVocabulary:
     """The names that expressions about events have."""
 
     def name(self, name: str) -> Evaluate:
         """Return how a name is looked up: any may be that of a field, or of a node."""
         other = _other_name(name)
 
-        def look_up(scope: Scope) -> Any:
+        def look_up(scope: ExpressionContext) -> Any:
             message = scope.message
             if message is not None:
                 found = message_field(message, name)
@@ -241,7 +241,7 @@ def _other_name(name: str) -> Evaluate:
     if name in CONSTANTS:
         return lambda scope: CONSTANTS[name]
 
-    def node(scope: Scope) -> Any:
+    def node(scope: ExpressionContext) -> Any:
         nodes = scope.moment.nodes()
         called = nodes_called(name, nodes)
         if len(called) == 1:
@@ -262,7 +262,7 @@ def no_such_field(message: object, name: str) -> AttributeError:
     return AttributeError(f"{type(message).__name__} has no field {name!r}; {hint}")
 
 
-def node_named(moment: Moment, name: str) -> object:
+def node_named(moment: PausedRun, name: str) -> object:
     """Return a node by its full or short name.
 
     :raises NameError: there is none, or several.
@@ -277,7 +277,7 @@ def node_named(moment: Moment, name: str) -> object:
     raise NameError(f"there is no node {name!r}" + (f"; did you mean {near!r}?" if near else ""))
 
 
-def message_of(moment: Moment | EventView, message: object) -> object:
+def message_of(moment: PausedRun | EventView, message: object) -> object:
     """Return the message that an expression is about, or that its event has received.
 
     :raises NameError: there is none.
@@ -291,11 +291,11 @@ def message_of(moment: Moment | EventView, message: object) -> object:
     return found[1]
 
 
-def _node_alone(scope: Scope) -> Any:
+def _node_alone(scope: ExpressionContext) -> Any:
     raise NameError('node: say which, node("name")')
 
 
-_RUN: Mapping[str, Callable[[Scope], Any]] = {
+_RUN: Mapping[str, Callable[[ExpressionContext], Any]] = {
     "node": _node_alone,
     "event": lambda scope: EventFields.of_event(scope.moment),
     "now": lambda scope: scope.moment.stamp_ns / 1e9,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from types import GeneratorType
 from typing import Any
 
-from rsltrace.conditions.bounds import INT_BITS_MAX, Budget, LimitError, checked
+from rsltrace.conditions.bounds import INT_BITS_MAX, LimitError, StepBudget, within_limits
 from rsltrace.conditions.operators import BINARY, fits, is_array, numeric, plain
 
 Function = Callable[..., Any]
@@ -29,7 +29,7 @@ CONSTANTS: Mapping[str, float] = {
 # -- sequences -------------------------------------------------------------------------------------
 
 
-def items(budget: Budget, value: Any) -> Any:
+def items(budget: StepBudget, value: Any) -> Any:
     """Return a value to be gone through, and pay for it. Items of an array are plain numbers.
 
     :raises TypeError: it is no sequence.
@@ -44,7 +44,7 @@ def items(budget: Budget, value: Any) -> Any:
     return value
 
 
-def _listed(budget: Budget, value: Any) -> list[Any]:
+def _listed(budget: StepBudget, value: Any) -> list[Any]:
     if type(value) is GeneratorType:
         return list(value)  # each step of it has paid
     budget.spend(len(value))
@@ -54,7 +54,7 @@ def _listed(budget: Budget, value: Any) -> list[Any]:
 def _extreme(name: str) -> Function:
     builtin = getattr(builtins, name)
 
-    def extreme(budget: Budget, *values: Any, **options: Any) -> Any:
+    def extreme(budget: StepBudget, *values: Any, **options: Any) -> Any:
         if set(options) - {"default"}:
             raise TypeError(f"{name} takes default= at most")
         if len(values) == 1:
@@ -75,7 +75,7 @@ def _extreme(name: str) -> Function:
 def _truth(name: str) -> Function:
     builtin = getattr(builtins, name)
 
-    def truth(budget: Budget, value: Any) -> Any:
+    def truth(budget: StepBudget, value: Any) -> Any:
         if is_array(value):
             budget.spend(value.size >> 8)
             return bool(getattr(value, name)())
@@ -84,53 +84,53 @@ def _truth(name: str) -> Function:
     return truth
 
 
-def _sum(budget: Budget, value: Any, start: Any = 0) -> Any:
+def _sum(budget: StepBudget, value: Any, start: Any = 0) -> Any:
     value = items(budget, value)
     add = BINARY[ast.Add]
     if type(value) is list and (not value or type(value[0]) in (int, float, bool)):
-        return checked(sum(value, start))
+        return within_limits(sum(value, start))
     for one in value:
         start = add(budget, start, one)
     return start
 
 
-def _len(budget: Budget, value: Any) -> int:
+def _len(budget: StepBudget, value: Any) -> int:
     return len(value)
 
 
-def _sorted(budget: Budget, value: Any, *, reverse: bool = False) -> list[Any]:
+def _sorted(budget: StepBudget, value: Any, *, reverse: bool = False) -> list[Any]:
     return sorted(_listed(budget, value), reverse=reverse)
 
 
-def _reversed(budget: Budget, value: Any) -> list[Any]:
+def _reversed(budget: StepBudget, value: Any) -> list[Any]:
     return _listed(budget, value)[::-1]
 
 
-def _list(budget: Budget, value: Any = ()) -> list[Any]:
+def _list(budget: StepBudget, value: Any = ()) -> list[Any]:
     return _listed(budget, value)
 
 
-def _tuple(budget: Budget, value: Any = ()) -> tuple[Any, ...]:
+def _tuple(budget: StepBudget, value: Any = ()) -> tuple[Any, ...]:
     return tuple(_listed(budget, value))
 
 
-def _set(budget: Budget, value: Any = ()) -> frozenset[Any]:
+def _set(budget: StepBudget, value: Any = ()) -> frozenset[Any]:
     return frozenset(_listed(budget, value))
 
 
-def _bytes(budget: Budget, value: Any = ()) -> bytes:
+def _bytes(budget: StepBudget, value: Any = ()) -> bytes:
     return bytes(_listed(budget, value))
 
 
-def _enumerate(budget: Budget, value: Any, start: int = 0) -> list[tuple[int, Any]]:
+def _enumerate(budget: StepBudget, value: Any, start: int = 0) -> list[tuple[int, Any]]:
     return list(enumerate(_listed(budget, value), start))
 
 
-def _zip(budget: Budget, *values: Any) -> list[tuple[Any, ...]]:
+def _zip(budget: StepBudget, *values: Any) -> list[tuple[Any, ...]]:
     return list(zip(*(_listed(budget, value) for value in values), strict=False))
 
 
-def _range(budget: Budget, *bounds: int) -> range:
+def _range(budget: StepBudget, *bounds: int) -> range:
     found = range(*bounds)
     try:
         size = len(found)
@@ -140,7 +140,7 @@ def _range(budget: Budget, *bounds: int) -> range:
     return found
 
 
-def _tolist(budget: Budget, value: Any) -> list[Any]:
+def _tolist(budget: StepBudget, value: Any) -> list[Any]:
     if is_array(value):
         budget.spend(value.size)
         found: list[Any] = value.tolist()
@@ -151,13 +151,13 @@ def _tolist(budget: Budget, value: Any) -> list[Any]:
 # -- numbers ---------------------------------------------------------------------------------------
 
 
-def _round(budget: Budget, value: Any, ndigits: int | None = None) -> Any:
+def _round(budget: StepBudget, value: Any, ndigits: int | None = None) -> Any:
     if ndigits is not None and abs(ndigits) > INT_BITS_MAX:
         raise LimitError(f"it rounds to {ndigits} digits (at most {INT_BITS_MAX})")
     return round(value) if ndigits is None else round(value, ndigits)
 
 
-def _int(budget: Budget, value: Any = 0, base: int = 10) -> int:
+def _int(budget: StepBudget, value: Any = 0, base: int = 10) -> int:
     if isinstance(value, str):
         if len(value) > INT_BITS_MAX:
             raise LimitError(f"it makes a number of more than {INT_BITS_MAX} bits")
@@ -165,15 +165,15 @@ def _int(budget: Budget, value: Any = 0, base: int = 10) -> int:
     return int(value)
 
 
-def _float(budget: Budget, value: Any = 0.0) -> float:
+def _float(budget: StepBudget, value: Any = 0.0) -> float:
     return float(value)
 
 
-def _bool(budget: Budget, value: Any = False) -> bool:
+def _bool(budget: StepBudget, value: Any = False) -> bool:
     return bool(value)
 
 
-def _str(budget: Budget, value: Any = "") -> str:
+def _str(budget: StepBudget, value: Any = "") -> str:
     if isinstance(value, str):
         return value
     if isinstance(value, (int, float, bool, type(None))) or (is_array(value) and not value.ndim):
@@ -181,34 +181,34 @@ def _str(budget: Budget, value: Any = "") -> str:
     raise TypeError(f"str is for numbers here, not for {type(value).__name__}")
 
 
-def _pow(budget: Budget, a: Any, b: Any) -> Any:
+def _pow(budget: StepBudget, a: Any, b: Any) -> Any:
     return BINARY[ast.Pow](budget, a, b)
 
 
-def _divmod(budget: Budget, a: Any, b: Any) -> tuple[Any, Any]:
+def _divmod(budget: StepBudget, a: Any, b: Any) -> tuple[Any, Any]:
     return BINARY[ast.FloorDiv](budget, a, b), BINARY[ast.Mod](budget, a, b)
 
 
-def _prod(budget: Budget, value: Any, start: Any = 1) -> Any:
+def _prod(budget: StepBudget, value: Any, start: Any = 1) -> Any:
     multiply = BINARY[ast.Mult]
     for one in items(budget, value):
         start = multiply(budget, start, one)
     return start
 
 
-def _abs(budget: Budget, value: Any) -> Any:
+def _abs(budget: StepBudget, value: Any) -> Any:
     return abs(value)
 
 
-def _chr(budget: Budget, value: int) -> str:
+def _chr(budget: StepBudget, value: int) -> str:
     return chr(value)
 
 
-def _ord(budget: Budget, value: Any) -> int:
+def _ord(budget: StepBudget, value: Any) -> int:
     return ord(value)
 
 
-def _hex(budget: Budget, value: int) -> str:
+def _hex(budget: StepBudget, value: int) -> str:
     return hex(value)
 
 
@@ -216,7 +216,7 @@ def _hex(budget: Budget, value: int) -> str:
 
 
 def _text(name: str) -> Function:
-    def of_text(budget: Budget, value: Any, *words: Any) -> Any:
+    def of_text(budget: StepBudget, value: Any, *words: Any) -> Any:
         if type(value) is not str or not all(type(word) in (str, tuple) for word in words):
             raise TypeError(f"{name} is for texts")
         return getattr(str, name)(value, *words)
@@ -230,8 +230,8 @@ def _text(name: str) -> Function:
 def _of_math(name: str) -> Function:
     function = getattr(math, name)
 
-    def compute(budget: Budget, *values: Any) -> Any:
-        return checked(function(*values))
+    def compute(budget: StepBudget, *values: Any) -> Any:
+        return within_limits(function(*values))
 
     return compute
 
@@ -240,7 +240,7 @@ def _of_many(name: str) -> Function:
     """A function of math that takes a sequence."""
     function = getattr(math, name)
 
-    def compute(budget: Budget, *values: Any) -> Any:
+    def compute(budget: StepBudget, *values: Any) -> Any:
         return function(*(items(budget, value) for value in values))
 
     return compute
@@ -250,7 +250,7 @@ def _of_numpy(name: str, takes: int = 1) -> Function:
     """A function of numpy whose result is not larger than what it is given: ``takes`` so many
     numbers and arrays at most, so that none of them is where it writes to."""
 
-    def compute(budget: Budget, *values: Any, axis: int | None = None) -> Any:
+    def compute(budget: StepBudget, *values: Any, axis: int | None = None) -> Any:
         import numpy
 
         if len(values) > takes:
@@ -272,7 +272,7 @@ def _of_numpy(name: str, takes: int = 1) -> Function:
     return compute
 
 
-def _diff(budget: Budget, value: Any, n: int = 1) -> Any:
+def _diff(budget: StepBudget, value: Any, n: int = 1) -> Any:
     if n > _DIFFERENCES_MAX:
         raise LimitError(f"it takes {n} differences (at most {_DIFFERENCES_MAX})")
     for _ in range(n):
@@ -288,7 +288,7 @@ def _of_either(name: str) -> Function:
     of_number = getattr(math, name)
     of_array = _of_numpy(_NAMED_IN_NUMPY.get(name, name), 2 if name in _OF_TWO else 1)
 
-    def compute(budget: Budget, *values: Any) -> Any:
+    def compute(budget: StepBudget, *values: Any) -> Any:
         for value in values:
             if type(value) is not float and is_array(value) and value.ndim:
                 return of_array(budget, *values)

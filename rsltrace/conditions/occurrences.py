@@ -22,7 +22,7 @@ _SENDS = {
 
 
 @dataclass
-class AtIndex(Armed):
+class IndexCondition(Armed):
     """Before the event of a number."""
 
     index: int
@@ -33,7 +33,7 @@ class AtIndex(Armed):
 
 
 @dataclass
-class OfNode(Armed):
+class NodeCondition(Armed):
     """Before an event of a node."""
 
     pattern: str
@@ -44,7 +44,7 @@ class OfNode(Armed):
 
 
 @dataclass
-class OfEntity(Armed):
+class EntityCondition(Armed):
     """Before an event of an entity, which goes by its name or (``#27``) its number."""
 
     pattern: str
@@ -58,7 +58,7 @@ class OfEntity(Armed):
 
 
 @dataclass
-class OnTopic(Armed):
+class TopicCondition(Armed):
     """Before an event that receives a message on a topic, and after one that sends one.
 
     With an ``expression``, one of whose fields it is true.
@@ -98,7 +98,7 @@ class OnTopic(Armed):
         return f"{what}, and {self.expression.text}" if found else ""
 
 
-class _AfterOutputs(Armed, ABC):
+class _OutputCondition(Armed, ABC):
     """After an event with an output for which ``_matches`` says something."""
 
     def after(self, view: EventView) -> str:
@@ -111,7 +111,7 @@ class _AfterOutputs(Armed, ABC):
 
 
 @dataclass
-class WithHash(_AfterOutputs):
+class HashCondition(_OutputCondition):
     """After an event whose outputs (all together, or one of them) have a hash that begins so."""
 
     digits: str
@@ -128,7 +128,7 @@ class WithHash(_AfterOutputs):
 
 
 @dataclass
-class Raised(_AfterOutputs):
+class ExceptionCondition(_OutputCondition):
     """After an event that raised an exception: of any type, or of one or its subclasses."""
 
     type: str = ""
@@ -150,7 +150,7 @@ class Raised(_AfterOutputs):
 
 
 @dataclass
-class Logged(_AfterOutputs):
+class LogCondition(_OutputCondition):
     """After an event with a log record of a level or worse that says something."""
 
     level: int
@@ -163,7 +163,7 @@ class Logged(_AfterOutputs):
 
 
 @dataclass
-class Found(Armed):
+class FindingCondition(Armed):
     """After an event in which the guard found something."""
 
     source: str = ""
@@ -177,7 +177,7 @@ class Found(Armed):
 
 
 @dataclass
-class If(Armed):
+class FilteredCondition(Armed):
     """Another condition, where an expression is true as well."""
 
     inner: Armed

@@ -10,12 +10,12 @@ from typing import Any
 from rsltrace.conditions.bounds import (
     INT_BITS_MAX,
     SIZE_MAX,
-    Budget,
     LimitError,
-    checked,
+    StepBudget,
+    within_limits,
 )
 
-Operate = Callable[[Budget, Any, Any], Any]
+Operate = Callable[[StepBudget, Any, Any], Any]
 _REALS = frozenset((int, float, bool))
 _TEXTS = (str, bytes, bytearray)
 _SEQUENCES = (list, tuple, range)
@@ -28,18 +28,18 @@ def is_array(value: object) -> bool:
 
 
 def _binary(sign: str, apply: Callable[[Any, Any], Any], guard: Any = None) -> Operate:
-    def operate(budget: Budget, a: Any, b: Any) -> Any:
+    def operate(budget: StepBudget, a: Any, b: Any) -> Any:
         if type(a) in _REALS and type(b) in _REALS:
             if guard is not None:
                 guard(a, b)
             found = apply(a, b)
-            return found if type(found) is float else checked(found)
-        return checked(_other(budget, sign, apply, a, b))
+            return found if type(found) is float else within_limits(found)
+        return within_limits(_other(budget, sign, apply, a, b))
 
     return operate
 
 
-def _other(budget: Budget, sign: str, apply: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+def _other(budget: StepBudget, sign: str, apply: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
     """Return what an operator makes of two values that are not both plain numbers."""
     if is_array(a) or is_array(b):
         a, b = numeric(a, sign), numeric(b, sign)
@@ -54,7 +54,7 @@ def _other(budget: Budget, sign: str, apply: Callable[[Any, Any], Any], a: Any, 
     return apply(a, b)  # of objects that a node holds: what their class says
 
 
-def _of_sequences(budget: Budget, sign: str, a: Any, b: Any) -> Any:
+def _of_sequences(budget: StepBudget, sign: str, a: Any, b: Any) -> Any:
     if sign == "+" and type(a) is type(b) and type(a) in (str, bytes, list, tuple):
         budget.make(len(a) + len(b), text=isinstance(a, _TEXTS))
         return a + b
@@ -164,7 +164,7 @@ COMPARE: Mapping[type[ast.cmpop], Callable[[Any, Any], Any]] = {
 }
 
 
-def element(budget: Budget, value: Any, index: Any) -> Any:
+def element(budget: StepBudget, value: Any, index: Any) -> Any:
     """Return ``value[index]``.
 
     :raises LimitError: it makes too much.

@@ -6,12 +6,12 @@ import ast
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rsltrace.conditions.bounds import Budget
+from rsltrace.conditions.bounds import StepBudget
 from rsltrace.conditions.evaluation import (
     Evaluate,
+    ExpressionContext,
     Places,
     Refused,
-    Scope,
     evaluation,
     parsed,
     value_of,
@@ -39,7 +39,7 @@ class RunExpression:
         self.text = text.strip()
         tree = parsed(self.text, self._first_line, 0)
         try:
-            self._evaluate = evaluation(tree, _OfRuns())
+            self._evaluate = evaluation(tree, _RunVocabulary())
         except Refused as error:
             raise ConditionError(
                 error.message, self._first_line, *Places(self.text).of(error.node)
@@ -51,7 +51,7 @@ class RunExpression:
         :raises ConditionError: it has no value there: no message on a topic, no such field, …
         """
         try:
-            return value_of(self._evaluate, trace, None, Budget())
+            return value_of(self._evaluate, trace, None, StepBudget())
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             what = str(error.args[0]) if error.args else type(error).__name__
             raise ConditionError(f"it has no value there: {what}", self._first_line) from None
@@ -61,7 +61,7 @@ class RunExpression:
         return next(iter(self.text.splitlines()), "")
 
 
-class _OfRuns:
+class _RunVocabulary:
     """The names that expressions about runs have."""
 
     def name(self, name: str) -> Evaluate | None:
@@ -85,7 +85,7 @@ class _OfRuns:
         named = topic.value
         key = f"{name}({named})"
 
-        def once(scope: Scope) -> Any:
+        def once(scope: ExpressionContext) -> Any:
             """A topic is gone through once for an expression, however often that names it."""
             if key not in scope.own:
                 scope.own[key] = function(scope, named)
@@ -106,30 +106,30 @@ def _channels(trace: Trace, topic: str) -> frozenset[int]:
     return found
 
 
-def _count(scope: Scope, topic: str) -> int:
+def _count(scope: ExpressionContext, topic: str) -> int:
     trace: Trace = scope.moment
     wanted = {one.id for one in trace.channels.values() if one.topic == topic}
     return sum(trace.message_counts.get(channel, 0) for channel in wanted)
 
 
-def _each(scope: Scope, topic: str) -> Iterator[Any]:
+def _each(scope: ExpressionContext, topic: str) -> Iterator[Any]:
     trace: Trace = scope.moment
     for channel, _, _, data in trace.messages_of(_channels(trace, topic)):
         scope.budget.left += len(data) >> 3  # what goes through each message once is well paid
         yield trace.decode(channel, data)
 
 
-def _messages(scope: Scope, topic: str) -> list[Any]:
+def _messages(scope: ExpressionContext, topic: str) -> list[Any]:
     return list(_each(scope, topic))
 
 
-def _first(scope: Scope, topic: str) -> Any:
+def _first(scope: ExpressionContext, topic: str) -> Any:
     for message in _each(scope, topic):
         return message
     raise LookupError(f"there is no message on {topic}")
 
 
-def _last(scope: Scope, topic: str) -> Any:
+def _last(scope: ExpressionContext, topic: str) -> Any:
     trace: Trace = scope.moment
     latest = None
     for channel, _, _, data in trace.messages_of(_channels(trace, topic)):
@@ -139,13 +139,13 @@ def _last(scope: Scope, topic: str) -> Any:
     return trace.decode(*latest)
 
 
-def _times(scope: Scope, topic: str) -> list[float]:
+def _times(scope: ExpressionContext, topic: str) -> list[float]:
     trace: Trace = scope.moment
     stamps = (stamp_ns for _, stamp_ns, *_ in trace.messages_of(_channels(trace, topic)))
     return [(stamp_ns - trace.start_ns) / 1e9 for stamp_ns in stamps]
 
 
-_OF_TOPICS: dict[str, Callable[[Scope, str], Any]] = {
+_OF_TOPICS: dict[str, Callable[[ExpressionContext, str], Any]] = {
     "count": _count,
     "first": _first,
     "last": _last,

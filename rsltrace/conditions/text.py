@@ -24,25 +24,25 @@ import re
 from collections.abc import Callable
 from functools import partial
 
-from rsltrace.conditions.changes import AtTime, Watch, When
+from rsltrace.conditions.changes import TimeCondition, WatchCondition, WhenCondition
 from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.names import Names
 from rsltrace.conditions.occurrences import (
-    AtIndex,
-    Found,
-    If,
-    Logged,
-    OfEntity,
-    OfNode,
-    OnTopic,
-    Raised,
-    WithHash,
+    EntityCondition,
+    ExceptionCondition,
+    FilteredCondition,
+    FindingCondition,
+    HashCondition,
+    IndexCondition,
+    LogCondition,
+    NodeCondition,
+    TopicCondition,
     says_pattern,
     says_words,
 )
 from rsltrace.conditions.topic_fields import plain, topic_of
-from rsltrace.conditions.view import Moment
+from rsltrace.conditions.view import PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.model.finding import Source
@@ -65,7 +65,7 @@ _WORDS = {
 }
 """Other words for the same."""
 
-_Arm = Callable[[Moment], Armed]
+_Arm = Callable[[PausedRun], Armed]
 
 
 def parse_condition(text: str, names: Names | None = None) -> Condition:
@@ -73,10 +73,10 @@ def parse_condition(text: str, names: Names | None = None) -> Condition:
 
     :raises ConditionError: naming the place in the text, and what was probably meant.
     """
-    return _Reader(text, names or Names()).read()
+    return _ConditionParser(text, names or Names()).read()
 
 
-class _Reader:
+class _ConditionParser:
     def __init__(self, text: str, names: Names) -> None:
         self._text = text
         self._names = names
@@ -99,7 +99,7 @@ class _Reader:
             return self._message(message)
         rewritten = plain(text)
         if rewritten != text.strip() and topic_of(rewritten) is not None and "." in text:
-            return _Reader(rewritten, self._names).read()
+            return _ConditionParser(rewritten, self._names).read()
         return self._bare()
 
     # -- by their first word -----------------------------------------------------------------------
@@ -113,7 +113,7 @@ class _Reader:
             raise self._wrong("no run has so many events", len(digits))
         self._at += len(digits)
         index = int(digits)
-        return self._end(lambda moment: AtIndex(index), before=True)
+        return self._end(lambda moment: IndexCondition(index), before=True)
 
     def _time(self) -> Condition:
         value = self._value("a time")
@@ -125,17 +125,17 @@ class _Reader:
         except ValueError as error:
             raise self._wrong(str(error), len(value)) from None
         self._at += len(value)
-        return self._end(partial(AtTime, time), before=True)
+        return self._end(partial(TimeCondition, time), before=True)
 
     def _node(self) -> Condition:
         name = self._name(self._names.nodes, "node")
-        return self._end(lambda moment: OfNode(name), before=True)
+        return self._end(lambda moment: NodeCondition(name), before=True)
 
     def _entity(self) -> Condition:
         value = self._value("a name")
         is_number = value.startswith("#") and value[1:].isdecimal()
         name = self._name(self._names.entities, "entity", check=not is_number)
-        return self._end(lambda moment: OfEntity(name), before=True)
+        return self._end(lambda moment: EntityCondition(name), before=True)
 
     def _topic(self) -> Condition:
         text = self._text
@@ -146,7 +146,7 @@ class _Reader:
         if (found := _IF.match(text, self._at)) is not None:
             return self._of_messages(name, found.end())
         reads = frozenset({"received", "sent"})
-        return self._end(lambda moment: OnTopic(text, name), reads, before=True, after=True)
+        return self._end(lambda moment: TopicCondition(text, name), reads, before=True, after=True)
 
     def _message(self, head: re.Match[str]) -> Condition:
         self._name(self._names.topics, "topic or service", head[1])
@@ -169,7 +169,7 @@ class _Reader:
             before=True,
             after=True,
             reads=frozenset({"received", "sent", "nodes"}),
-            arm=lambda moment: OnTopic(text, name, expression),
+            arm=lambda moment: TopicCondition(text, name, expression),
         )
 
     def _output(self) -> Condition:
@@ -179,13 +179,13 @@ class _Reader:
             raise self._wrong("a hash has 1 to 16 digits of 0-9 and a-f", len(value))
         self._at += len(value)
         digits = found[1].lower()
-        return self._end(lambda moment: WithHash(digits), frozenset({"sent"}), after=True)
+        return self._end(lambda moment: HashCondition(digits), frozenset({"sent"}), after=True)
 
     def _exception(self) -> Condition:
         found = _TYPE.match(self._text, self._at)
         name = "" if found is None or found[0] == "if" else found[0]
         self._at += len(name)
-        return self._end(lambda moment: Raised(name), frozenset({"sent"}), after=True)
+        return self._end(lambda moment: ExceptionCondition(name), frozenset({"sent"}), after=True)
 
     def _log(self) -> Condition:
         level = 0
@@ -195,7 +195,7 @@ class _Reader:
             self._at = found.end()
             self._skip_blanks()
         says = self._log_text()
-        return self._end(lambda moment: Logged(level, says), frozenset({"sent"}), after=True)
+        return self._end(lambda moment: LogCondition(level, says), frozenset({"sent"}), after=True)
 
     def _finding(self) -> Condition:
         sources = [source.value for source in Source]
@@ -205,15 +205,15 @@ class _Reader:
             hint = did_you_mean(name, sources, f"there are {', '.join(sources)}")
             raise self._wrong(f"the guard has no kind {name!r}; {hint}", len(name))
         self._at += len(name)
-        return self._end(lambda moment: Found(name), frozenset({"findings"}), after=True)
+        return self._end(lambda moment: FindingCondition(name), frozenset({"findings"}), after=True)
 
     def _watch(self) -> Condition:
-        return self._of_nodes(Watch)
+        return self._of_nodes(WatchCondition)
 
     def _when(self) -> Condition:
-        return self._of_nodes(When)
+        return self._of_nodes(WhenCondition)
 
-    def _of_nodes(self, kind: type[Watch] | type[When]) -> Condition:
+    def _of_nodes(self, kind: type[WatchCondition] | type[WhenCondition]) -> Condition:
         rest = self._text[self._at :]
         expression = parse_expression(rest, self._names, whole=self._text, begin=self._at)
         return Condition(
@@ -309,8 +309,8 @@ class _Reader:
             )
             inner = arm
 
-            def arm(moment: Moment) -> Armed:
-                return If(inner(moment), expression, text)
+            def arm(moment: PausedRun) -> Armed:
+                return FilteredCondition(inner(moment), expression, text)
 
             reads |= {"received", "nodes"}
         return Condition(text.strip(), before, after, reads, arm)
@@ -329,18 +329,18 @@ def _closing(text: str, at: int) -> int:
     return ends[0] if ends else -1
 
 
-_READERS: dict[str, Callable[[_Reader], Condition]] = {
-    "index": _Reader._index,
-    "time": _Reader._time,
-    "node": _Reader._node,
-    "entity": _Reader._entity,
-    "topic": _Reader._topic,
-    "output": _Reader._output,
-    "exception": _Reader._exception,
-    "log": _Reader._log,
-    "finding": _Reader._finding,
-    "watch": _Reader._watch,
-    "when": _Reader._when,
+_READERS: dict[str, Callable[[_ConditionParser], Condition]] = {
+    "index": _ConditionParser._index,
+    "time": _ConditionParser._time,
+    "node": _ConditionParser._node,
+    "entity": _ConditionParser._entity,
+    "topic": _ConditionParser._topic,
+    "output": _ConditionParser._output,
+    "exception": _ConditionParser._exception,
+    "log": _ConditionParser._log,
+    "finding": _ConditionParser._finding,
+    "watch": _ConditionParser._watch,
+    "when": _ConditionParser._when,
 }
 _KNOWN = (
     "say an event (812), t=2.5s, node, entity, topic, /topic: EXPRESSION, output, exception, log, "

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.changes import AtTime, Watch, When
+from rsltrace.conditions.changes import TimeCondition, WatchCondition, WhenCondition
 from rsltrace.conditions.names import names_of
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.topic_fields import plain, topic_of
@@ -132,7 +132,7 @@ class TraceCondition:
         read = parse_condition(text, names)
         self._armed = read.arm(StartOfTrace(trace.start_ns))
         inner = getattr(self._armed, "inner", self._armed)
-        if isinstance(inner, (AtTime, Watch, When)):
+        if isinstance(inner, (TimeCondition, WatchCondition, WhenCondition)):
             raise ConditionError(
                 "an event of a trace has messages, log records, exceptions and findings: say "
                 "/topic: EXPRESSION, log, exception or finding",

@@ -24,7 +24,7 @@ class Sent:
     message: Callable[[], object] | None = None
 
 
-class Moment(Protocol):
+class PausedRun(Protocol):
     """A run that stands still. ``stamp_ns`` is simulated time, ``start_ns`` that at which the run
     started."""
 
@@ -40,7 +40,7 @@ class Moment(Protocol):
         """Return the nodes there are, by their full names."""
 
 
-class EventView(Moment, Protocol):
+class EventView(PausedRun, Protocol):
     """An event that is about to run, or has just ended."""
 
     @property

@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.guard import resolved_guard
 from rsltrace.job.parts.node import NodeSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.target import target_text
 from rsltrace.job.values.times import format_time
 
@@ -62,12 +62,12 @@ def _relative(job: JobFields, path: str) -> str:
     return os.path.relpath(job.resolve(path), job.base_dir).replace(os.sep, "/")
 
 
-def plain_part(part: Part) -> dict[str, Any]:
+def plain_part(part: JobPart) -> dict[str, Any]:
     """Return a part of a job as a job file has it: every key that differs from its default."""
     return _explicit(part)
 
 
-def _explicit(part: Part) -> dict[str, Any]:
+def _explicit(part: JobPart) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, field in type(part).model_fields.items():
         value = getattr(part, name)
@@ -85,7 +85,7 @@ def _times(value: Any) -> Any:
     return f"-{format_time(-value)}" if value < 0 else format_time(value)
 
 
-def _complete(part: Part) -> dict[str, Any]:
+def _complete(part: JobPart) -> dict[str, Any]:
     values: dict[str, Any] = {}
     absent = part.absent if isinstance(part, NodeSpec) else ()
     for name, field in type(part).model_fields.items():
@@ -95,7 +95,7 @@ def _complete(part: Part) -> dict[str, Any]:
 
 
 def _plain(value: Any, part_values: Any) -> Any:
-    if isinstance(value, Part):
+    if isinstance(value, JobPart):
         return part_values(value)
     if isinstance(value, dict):
         return {str(key): _plain(item, part_values) for key, item in value.items()}

@@ -18,7 +18,7 @@ from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.launch import LaunchSpec
 from rsltrace.job.parts.node import NodeSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.parts.record import HooksSpec, RecordSpec
 from rsltrace.job.parts.scheduling import (
     ExecutionSpec,
@@ -44,7 +44,7 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.problem import Loc, Problem, describe
+from rsltrace.job.values.problem import JobProblem, Loc, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 
 SEED_MAX = 2**64 - 1
@@ -57,14 +57,14 @@ def _folder(value: object) -> Path:
 
 def _word(value: object) -> str:
     if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise Problem(f"expected a word of a command line, got {describe(value)}")
+        raise JobProblem(f"expected a word of a command line, got {describe(value)}")
     return str(getattr(value, "text", value))
 
 
 attach(_word, schema={"type": ["string", "number"]})
 
 
-class JobFields(Part):
+class JobFields(JobPart):
     """The keys of a job, each by itself; ``Job`` adds what must hold between them."""
 
     TIMES: ClassVar[dict[str, str]] = {
@@ -80,130 +80,121 @@ class JobFields(Part):
     )
     launch: Annotated[tuple[LaunchSpec, ...], parts("file")] = Field(
         default=(),
-        description="Launch files whose nodes are part of the job, after those of `nodes`; a path "
-        "stands for `{file: ...}`.",
+        description="Launch files whose nodes join those of `nodes`.",
         examples=[["bringup.launch.xml", {"file": "nav.launch.yaml", "arguments": {"map": "lab"}}]],
     )
     ros_arguments: Annotated[tuple[str, ...], check(items(_word))] = Field(
         default=(),
-        description="ROS arguments for all nodes, which have the last word: what would follow "
-        "`--ros-args` on a command line.",
+        description="ROS arguments for all nodes, as after `--ros-args`. They override "
+        "everything else.",
         examples=[["-p", "ekf:rate:=50", "-r", "scan:=/front/scan"]],
     )
     search_path: Annotated[tuple[str, ...], check(items(check_path))] = Field(
         default=(".",),
-        description="Folders in which the nodes' modules are, before Python's own path.",
+        description="Folders to search for modules before Python's own path.",
         examples=[[".", "../src"]],
     )
     start_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="start",
-        description="Simulated time at which the run starts. Without it, the time of the first "
-        "message of the bags, else 0.",
+        description="Simulated start time. Default: the first message of the bags, else 0.",
         examples=["10s"],
     )
     construct_time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="construct_time",
-        description="Simulated time at which the nodes are constructed; the clock then jumps to "
-        "the start. Without it, the start.",
+        description="Simulated time at which nodes are constructed. Default: the start.",
         examples=["0s"],
     )
     stop: StopSpec = Field(
         default=StopSpec(),
-        description="What ends the run; the first condition that holds does. Without any, the end "
-        "of the bags, or that nothing is left to do.",
+        description="What ends the run: the first condition that holds. Default: the end of the "
+        "bags, or no work left.",
         examples=[{"duration": "60s"}],
     )
     seed: Annotated[int, check(whole(0, SEED_MAX))] = Field(
         default=0,
-        description="Seed of everything that is random in a run, each in a stream of its own.",
+        description="Seed of all random choices.",
         examples=[7],
     )
     timer_ties: Annotated[Literal["creation", "heap"], check(one_of("creation", "heap"))] = Field(
         default="creation",
-        description="Which of the timers due at one instant comes first: in the order of "
-        "`creation`, or as in the `heap` of RSLCPP's C++ library.",
+        description="Order of timers due at one instant: by `creation`, or as in the `heap` of "
+        "RSLCPP.",
         examples=["heap"],
     )
     livelock_limit: Annotated[int, check(whole(1))] = Field(
         default=LIVELOCK_LIMIT,
-        description="How many events may follow each other without simulated time moving on "
-        "before the run ends with an error that names them.",
+        description="Maximum number of events without progress of simulated time.",
         examples=[1000000],
     )
     bags: Annotated[tuple[BagSpec, ...], parts("path")] = Field(
         default=(),
-        description="rosbag2 recordings (MCAP or sqlite3) to play in; a path stands for "
-        "`{path: ...}`. Messages of equal time play in the order of this list, those of one bag "
-        "in the order of the recording. Of a bag that was cut off, or has no index or no "
-        "metadata.yaml, what is there plays, and a note says what is not; recorded services and "
-        "actions never play, a note names them.",
+        description="rosbag2 recordings (MCAP or sqlite3) to play. Messages with equal times "
+        "play in the order of this list. Truncated bags play as far as they go; "
+        "recorded services and actions do not play.",
         examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
     )
     progress: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
         default=None,
-        description="Topic on which the bags' progress is published as `std_msgs/msg/Float32`, "
-        "from 0 to 1 in steps of a hundredth.",
+        description="Topic for the progress of the bags, a `std_msgs/msg/Float32` from 0 to 1.",
         examples=["/rslcpp/progress"],
     )
     hooks: HooksSpec = Field(
         default=HooksSpec(),
-        description="Functions that are called around the construction of the nodes.",
+        description="Functions called before and after the construction of the nodes.",
         examples=[{"after": "my_robot.setup:wire"}],
     )
     record: RecordSpec = Field(
         default=RecordSpec(),
-        description="Which payloads the trace keeps.",
+        description="Which messages the trace keeps.",
         examples=[{"exclude": ["/camera/*"]}],
     )
     guard: Annotated[GuardSpec, guard_part] = Field(
         default=GuardSpec(),
-        description="What is done about sources of nondeterminism outside of ROS; `false` leaves "
-        "them all as they are.",
+        description="How sources of nondeterminism outside ROS are handled; `false` allows them "
+        "all.",
         examples=[{"clock": "virtual", "thread": "warn"}, False],
     )
     delay: Annotated[DelaysSpec | None, given] = Field(
         default=None,
-        description="How long messages take, which are lost, and who is cut off when.",
+        description="Delay, loss and outages of messages.",
         examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
     )
 
     policy: Annotated[PolicySpec | None, policy_part] = Field(
         default=None,
-        description="Which of the callbacks that are ready runs next; without it, first come, "
-        "first served, and timers last.",
+        description="Which ready callback runs next. Default: first come, first served, timers "
+        "last.",
         examples=["rate_monotonic", {"recorded": "run1.mcap"}],
     )
     threads: Annotated[ThreadsSpec | None, part("switch")] = Field(
         default=None,
-        description="Where threads take turns: without it, where they block.",
+        description="Where threads take turns. Default: where they block.",
         examples=[{"switch": "every_line"}],
     )
     min_time_step_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="min_time_step",
-        description="Simulated time moves on by at least this much; what is due in between runs "
-        "late.",
+        description="Smallest step of simulated time. What is due within a step runs late.",
         examples=["1ms"],
     )
     executors: Annotated[tuple[ExecutorSpec, ...] | None, executors_part] = Field(
         default=None,
-        description="Simulated executors, whose workers a callback occupies while it runs or "
-        "waits. `single_threaded`: one with one worker for all nodes; `per_node`: one for each, "
-        "which nodes that are not listed have, too.",
+        description="Simulated executors: one for all nodes (`single_threaded`), one for each "
+        "(`per_node`), or a list. Nodes that are not listed have one each.",
         examples=["single_threaded", [{"nodes": ["/camera", "/detector"], "workers": 2}]],
     )
     execution: Annotated[ExecutionSpec | None, given] = Field(
         default=None,
-        description="How long callbacks take: their executor is busy for that long, and what "
-        "they send leaves when they end.",
+        description="Execution times of callbacks. The executor is busy meanwhile, and outputs "
+        "leave at the end.",
         examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
     )
     clocks: Annotated[tuple[ClockSpec, ...], clocks_part] = Field(
         default=(),
-        description="Clocks of nodes that do not show simulated time, as real ones do not; a "
-        "mapping alone is for all of them.",
+        description="Clocks that differ from simulated time. A single mapping applies to all "
+        "nodes.",
         examples=[
             [{"node": "/lidar", "offset": "-20ms", "drift": "50ppm"}],
             {"advances": True},
@@ -211,8 +202,8 @@ class JobFields(Part):
     )
     faults: Annotated[tuple[FaultSpec, ...], parts()] = Field(
         default=(),
-        description="What goes wrong, and exactly when: nodes that crash, hang or restart, single "
-        "messages that are lost, late or come twice, or that a bag plays otherwise than recorded.",
+        description="Faults at exact times: nodes that crash, hang or restart; messages that are "
+        "lost, late, duplicated or changed.",
         examples=[
             [
                 {"crash": "/planner", "at": "2s"},
@@ -224,8 +215,8 @@ class JobFields(Part):
     )
     checks: Annotated[tuple[CheckSpec, ...], parts()] = Field(
         default=(),
-        description="What has to be true of a run: `rsltrace record` says which checks fail, and "
-        "ends with status 1 then; `rsltrace check run.mcap` checks a trace.",
+        description="Properties of the run. `rsltrace record` and `rsltrace check` exit with 1 "
+        "if one fails.",
         examples=[
             [
                 {"always": "/odom.pose.pose.position.x < 10"},
@@ -239,7 +230,7 @@ class JobFields(Part):
         dict[str, MetricSpec], named_parts("expression", check_metric_name, what="metrics")
     ] = Field(
         default_factory=dict,
-        description="Numbers that say how a run went, by name: `rsltrace record` shows them.",
+        description="Numbers computed from the finished run, by name.",
         examples=[
             {
                 "distance": {"expression": 'last("/odom").pose.pose.position.x', "unit": "m"},
@@ -250,8 +241,7 @@ class JobFields(Part):
 
     vary: Annotated[VarySpec | None, given] = Field(
         default=None,
-        description="What differs from run to run when the job is explored (`rsltrace explore "
-        "--strategy vary`); other commands run the job as it is.",
+        description="Settings that `rsltrace explore --strategy vary` changes from run to run.",
         examples=[{"settings": {"nodes.ekf.parameters.rate": [10.0, 50.0]}, "method": "grid"}],
     )
 

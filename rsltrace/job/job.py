@@ -13,13 +13,13 @@ from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.stop import StopSpec
 from rsltrace.job.start_order import start_problems
 from rsltrace.job.values.mappings import near_path
-from rsltrace.job.values.problem import Problem, Problems
+from rsltrace.job.values.problem import JobProblem, JobProblems
 from rsltrace.job.values.times import format_time
 
 # What must hold between the parts of a job: names, times, paths and options that go together.
 
 
-def contradictions(job: JobFields) -> Iterator[Problem]:
+def contradictions(job: JobFields) -> Iterator[JobProblem]:
     """Yield what is wrong with a job each of whose parts is right, with its place in the job."""
     yield from _something_to_run(job)
     yield from _times_in_order(job)
@@ -31,54 +31,56 @@ def contradictions(job: JobFields) -> Iterator[Problem]:
     yield from _ties_are_decided_once(job)
 
 
-def _bags_progress(job: JobFields) -> Iterator[Problem]:
+def _bags_progress(job: JobFields) -> Iterator[JobProblem]:
     if job.progress is None:
         return
     if not job.bags:
-        yield Problem("there are no bags (bags:) whose progress could be published", ("progress",))
+        yield JobProblem(
+            "there are no bags (bags:) whose progress could be published", ("progress",)
+        )
     elif any(bag.loop is True for bag in job.bags):
-        yield Problem("a bag that plays forever makes no progress", ("progress",))
+        yield JobProblem("a bag that plays forever makes no progress", ("progress",))
 
 
-def _bags_end(job: JobFields) -> Iterator[Problem]:
+def _bags_end(job: JobFields) -> Iterator[JobProblem]:
     if job.stop != StopSpec():
         return
     for index, bag in enumerate(job.bags):
         if bag.loop is True:
-            yield Problem(
+            yield JobProblem(
                 "plays forever, and nothing ends the run: give a 'stop:', or a number of times",
                 ("bags", index, "loop"),
             )
 
 
-def _something_to_run(job: JobFields) -> Iterator[Problem]:
+def _something_to_run(job: JobFields) -> Iterator[JobProblem]:
     if not job.nodes and not job.bags and not job.launch:
         place = ("nodes",) if "nodes" in job.model_fields_set else ()
-        yield Problem(
+        yield JobProblem(
             "a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)",
             place,
         )
 
 
-def _times_in_order(job: JobFields) -> Iterator[Problem]:
+def _times_in_order(job: JobFields) -> Iterator[JobProblem]:
     start_ns, construct_ns, stop_ns = job.start_ns, job.construct_time_ns, job.stop.time_ns
     if start_ns is None:
         return
     if construct_ns is not None and construct_ns > start_ns:
-        yield Problem(
+        yield JobProblem(
             f"{format_time(construct_ns)} is after the start "
             f"({format_time(start_ns)}): nodes are constructed before the run starts",
             ("construct_time",),
         )
     if stop_ns is not None and stop_ns < start_ns:
-        yield Problem(
+        yield JobProblem(
             f"{format_time(stop_ns)} is before the start ({format_time(start_ns)}): it is a "
             "simulated time; 'duration' counts from the start",
             ("stop", "time"),
         )
 
 
-def _distinct_names(job: JobFields) -> Iterator[Problem]:
+def _distinct_names(job: JobFields) -> Iterator[JobProblem]:
     first: dict[tuple[str, str], int] = {}
     for index, node in enumerate(job.nodes):
         if node.name is None:
@@ -86,7 +88,7 @@ def _distinct_names(job: JobFields) -> Iterator[Problem]:
         key = (node.namespace or "/", node.name)
         if key in first:
             full_name = f"{key[0].rstrip('/')}/{node.name}"
-            yield Problem(
+            yield JobProblem(
                 f"{full_name} is already the name of nodes[{first[key]}]: give one of them "
                 "another name or namespace",
                 ("nodes", index, "name"),
@@ -99,33 +101,33 @@ def _near(job: JobFields, path: str) -> str:
     return near_path(job.resolve(path), path)
 
 
-def _ties_are_decided_once(job: JobFields) -> Iterator[Problem]:
+def _ties_are_decided_once(job: JobFields) -> Iterator[JobProblem]:
     if job.timer_ties == "heap" and not (
         (job.policy is None or job.policy.order == "fifo")
         and job.executors is None
         and job.execution is None
     ):
-        yield Problem(
+        yield JobProblem(
             "heap is the order of RSLCPP's timers, which a policy, executors or execution "
             "times do not go with: leave it out",
             ("timer_ties",),
         )
 
 
-def _paths_exist(job: JobFields) -> Iterator[Problem]:
+def _paths_exist(job: JobFields) -> Iterator[JobProblem]:
     for index, folder in enumerate(job.search_path):
         path = job.resolve(folder)
         if not path.is_dir():
             what = "is not a folder" if path.exists() else "there is no such folder"
             near = _near(job, folder)
-            yield Problem(f"{folder!r}: {what}{near}", ("search_path", index))
+            yield JobProblem(f"{folder!r}: {what}{near}", ("search_path", index))
     for index, node in enumerate(job.nodes):
         for number, file in enumerate(node.parameter_files):
             path = job.resolve(file)
             if not path.is_file():
                 what = "is not a file" if path.exists() else "there is no such parameter file"
                 loc = ("nodes", index, "parameter_files", number)
-                yield Problem(f"{file!r}: {what}{_near(job, file)}", loc)
+                yield JobProblem(f"{file!r}: {what}{_near(job, file)}", loc)
     scripts = [
         (("nodes", index, node.kind), node.script or node.program or "")
         for index, node in enumerate(job.nodes)
@@ -141,17 +143,17 @@ def _paths_exist(job: JobFields) -> Iterator[Problem]:
         path = job.resolve(file)
         if not path.is_file():
             what = "is not a file" if path.exists() else "there is no such file"
-            yield Problem(f"{file!r}: {what}{_near(job, file)}", place)
+            yield JobProblem(f"{file!r}: {what}{_near(job, file)}", place)
     for index, launch in enumerate(job.launch):
         path = job.resolve(launch.file)
         if not path.is_file():
             what = "is not a file" if path.exists() else "there is no such launch file"
             place = ("launch", index, "file")
-            yield Problem(f"{launch.file!r}: {what}{_near(job, launch.file)}", place)
+            yield JobProblem(f"{launch.file!r}: {what}{_near(job, launch.file)}", place)
     for index, bag in enumerate(job.bags):
         if not job.resolve(bag.path).exists():
             message = f"{bag.path!r}: there is no such bag{_near(job, bag.path)}"
-            yield Problem(message, ("bags", index, "path"))
+            yield JobProblem(message, ("bags", index, "path"))
 
 
 class Job(JobFields):
@@ -208,5 +210,5 @@ class Job(JobFields):
     def _check_whole(self) -> Job:
         problems = list(contradictions(self))
         if problems:
-            raise Problems(problems)
+            raise JobProblems(problems)
         return self

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from rsltrace.errors import did_you_mean
 from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.node import NodeSpec
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 
 
 def entry_meant(nodes: Sequence[NodeSpec], reference: str | int) -> int:
@@ -18,19 +18,19 @@ def entry_meant(nodes: Sequence[NodeSpec], reference: str | int) -> int:
     if isinstance(reference, int):
         if reference < len(nodes):
             return reference
-        raise Problem(f"there are {len(nodes)} entries, counted from 0: there is no {reference}")
+        raise JobProblem(f"there are {len(nodes)} entries, counted from 0: there is no {reference}")
     found = [index for index, spec in enumerate(nodes) if reference in _names(spec)]
     if len(found) == 1:
         return found[0]
     if found:
         places = ", ".join(map(str, found))
-        raise Problem(
+        raise JobProblem(
             f"several entries are called {reference!r}: give one of them a name, or write its "
             f"number in the list ({places})"
         )
     names = [name for spec in nodes for name in _names(spec)]
     hint = did_you_mean(reference, names, f"there are {', '.join(names)}")
-    raise Problem(f"no entry of nodes is called {reference!r}: {hint}")
+    raise JobProblem(f"no entry of nodes is called {reference!r}: {hint}")
 
 
 def _names(spec: NodeSpec) -> list[str]:
@@ -40,7 +40,7 @@ def _names(spec: NodeSpec) -> list[str]:
     return [spec.target, spec.name, f"{(spec.namespace or '').rstrip('/')}/{spec.name}"]
 
 
-def start_problems(job: JobFields) -> Iterator[Problem]:
+def start_problems(job: JobFields) -> Iterator[JobProblem]:
     """Yield the starts that wait for what is not there, or never comes."""
     waits_for: dict[int, dict[str, int]] = {}
     for index, spec in enumerate(job.nodes):
@@ -51,13 +51,13 @@ def start_problems(job: JobFields) -> Iterator[Problem]:
             place = ("nodes", index, "start_after", key)
             try:
                 other = entry_meant(job.nodes, reference)
-            except Problem as problem:
+            except JobProblem as problem:
                 if not job.launch:  # else it may be an entry of a launch file
-                    yield Problem(problem.message, place)
+                    yield JobProblem(problem.message, place)
                 continue
             waits_for.setdefault(index, {})[key] = other
             if key == "ended" and job.nodes[other].node is not None:
-                yield Problem(
+                yield JobProblem(
                     f"{job.nodes[other].target} (nodes[{other}]) never ends: a 'node' lasts as "
                     "long as the run, only a main, executable, script or module ends",
                     place,
@@ -65,7 +65,7 @@ def start_problems(job: JobFields) -> Iterator[Problem]:
     yield from _circles(waits_for)
 
 
-def _circles(waits_for: dict[int, dict[str, int]]) -> Iterator[Problem]:
+def _circles(waits_for: dict[int, dict[str, int]]) -> Iterator[JobProblem]:
     told: set[int] = set()
     for first, after in waits_for.items():
         for key in after:
@@ -76,7 +76,7 @@ def _circles(waits_for: dict[int, dict[str, int]]) -> Iterator[Problem]:
             if at == first and not told & set(path):
                 told.update(path)
                 way = " → ".join(f"nodes[{index}]" for index in [*path, first])
-                yield Problem(
+                yield JobProblem(
                     f"it waits for itself, and never starts: {way}",
                     ("nodes", first, "start_after", key),
                 )

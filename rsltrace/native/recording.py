@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
 from rsltrace.errors import RsltraceError, RunError, SetupError
-from rsltrace.job import Job, locate
+from rsltrace.job import Job
 from rsltrace.native import support
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
-from rsltrace.run.plans.scheduling import end_ns_of, stop_conditions
 from rsltrace.run.process import Observer
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.run.stop_rules import (
+    StopInputs,
+    conditions_of,
+    end_ns_of,
+    stop_rules,
+    watch_messages,
+)
 from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.loop.stop import Progress, Stop
 from rsltrace.simulation.middleware.events.failure import text_of
@@ -99,7 +104,9 @@ class NativeRun:
 
     def prepare(self, output: Path) -> None:
         """Find what can be known to be wrong before anything is started."""
-        self.conditions = tuple(stop_conditions(self.job, self._start_ns))
+        inputs = StopInputs(self.job, self._start_ns, trace_size=lambda: self.writer.size)
+        self._stop_rules = stop_rules(inputs)
+        self._conditions = conditions_of(self._stop_rules)
         if self.policy is not None and (refused := real_time_class()):
             self.note(f"{refused}; executors go by priorities all the same")
         if without := support.ignored(self.job, self.policy):
@@ -147,22 +154,23 @@ class NativeRun:
         )
         self.span_writer = SpanWriter(spans, recorder, self.clocks, job.base_dir)
 
-    def watch_topic(self, on_message: dict[str, Any]) -> None:
-        """Let the topic of ``stop:`` end the run; ``on_message`` is told of bytes and class."""
-        spec = self.job.stop.topic
-        if spec is None:
-            return
-        stops = SimpleNamespace(stop_after_step=self.stop)
-        where = locate(self.job, ("stop", "topic", "exit_code"))
-        watch = watch_exit_code(stops, spec, where=where)  # type: ignore[arg-type]
+    def watch_stop_topics(self, on_message: dict[str, Any]) -> None:
+        """Let messages end the run: ``on_message`` gets a function of bytes and class by topic."""
 
-        def told(data: bytes, type: Any) -> None:
-            try:
-                watch(SimpleNamespace(msg_type=type), data)
-            except RsltraceError as error:
-                self.fail(RunError(str(error)))
+        def watch(topic: str, watcher: Callable[[Any, bytes], None]) -> None:
+            others = on_message.get(topic)
 
-        on_message[spec.name] = told
+            def received(data: bytes, type: Any) -> None:
+                if others is not None:
+                    others(data, type)
+                try:
+                    watcher(SimpleNamespace(msg_type=type), data)
+                except RsltraceError as error:
+                    self.fail(RunError(str(error)))
+
+            on_message[topic] = received
+
+        watch_messages(self._stop_rules, watch, self.stop)
 
     def wait(self) -> Iterator[None]:
         """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
@@ -175,14 +183,11 @@ class NativeRun:
         now_ns = time.monotonic_ns() - self.begun_ns + self._start_ns
         last_ns = max(activity_ns - self.begun_ns, 0) + self._start_ns
         progress = Progress(now_ns, None, self._start_ns, events, last_ns)
-        for condition in self.conditions:
+        for condition in self._conditions:
             stop = condition(progress)
             if stop is not None:
                 self.stop(stop)
                 return
-        size = self.job.stop.size
-        if size is not None and self.writer.size >= size:
-            self.stop(Stop(f"a trace of {size} bytes"))
         if self.observer.progress is not None:
             self.observer.progress(now_ns, end_ns_of(self.job, self._start_ns), events)
 

@@ -111,7 +111,7 @@ class SingleProcessRun(NativeRun):
             stack.enter_context(self.priorities.watched(boundary().real))
         stack.enter_context(self.nodes.watched())
         stack.enter_context(executors.watched())
-        self.watch_topic(self.message_observer.on_message)
+        self.watch_stop_topics(self.message_observer.on_message)
 
     def go_on(self) -> None:
         """Construct the nodes, one entry after the other, then spin all until the run ends."""

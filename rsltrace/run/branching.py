@@ -14,6 +14,7 @@ from rsltrace.job import Job
 from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.run.driver import next_step_ns
 from rsltrace.run.session import Session
+from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.loop.policy import Departures
 from rsltrace.trace.model.texts import format_seconds
 
@@ -40,9 +41,10 @@ def run_up_to(session: Session, time_ns: int) -> bool:
 
 
 def why_never(job: Job) -> str:
-    """Return why no other run can branch off one of this job, or ""."""
-    if job.stop.size is not None:
-        return "how large the trace is ends the run (stop.size)"
+    """Return why no other run can go on from one of a job, "" if others can."""
+    for _, _, rule in given_rules(job):
+        if rule.prevents_forks:
+            return rule.prevents_forks
     if any(fault.of_node for fault in job.faults):
         return "the job itself has faults of nodes"
     return ""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.adapters.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
-from rsltrace.job import Job, locate
+from rsltrace.job import Job
 from rsltrace.run.inputs import check_output, without_launch_files
 from rsltrace.run.plans.bags import (
     BagInput,
@@ -35,12 +35,9 @@ from rsltrace.run.plans.processes import make_process_adapter
 from rsltrace.run.plans.recorded_order import follow_recording, remember_choices, write_choices
 from rsltrace.run.plans.scheduling import (
     continued_policy,
-    end_ns_of,
     is_ordered,
     policy_of_job,
     scheduling_plan,
-    stop_at_size,
-    stop_conditions,
     stop_with,
     switches_at_lines,
     unmet_departures,
@@ -59,6 +56,14 @@ from rsltrace.run.provenance import (
     payload_filter,
     write_job,
     write_sources,
+)
+from rsltrace.run.stop_rules import (
+    StopInputs,
+    StopRule,
+    conditions_of,
+    end_ns_of,
+    stop_rules,
+    watch_messages,
 )
 from rsltrace.run.unused_rules import (
     drop_notes,
@@ -167,6 +172,7 @@ class Session:
         self._replay = replay
         self._recorded_by = writer
         self.stop: Stop | None = None
+        self._stop_rules: list[StopRule] = []
         self._output = output
         self._has_begun = False
         self._force = force
@@ -311,9 +317,15 @@ class Session:
     def _import_targets(self) -> None:
         """Import stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
-        self.loop.stop_conditions = tuple(
-            stop_conditions(job, self.start_ns, world.domain.dispatcher.outside_events)
+        self._stop_rules = stop_rules(
+            StopInputs(
+                job,
+                self.start_ns,
+                trace_size=lambda: 0 if self._writer is None else self._writer.size,
+                outside_events=world.domain.dispatcher.outside_events,
+            )
         )
+        self.loop.stop_conditions = conditions_of(self._stop_rules)
         with world.importing():
             self._entries = [
                 *hook_entries(job, "before", job.hooks.before, lambda: job),
@@ -356,8 +368,6 @@ class Session:
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
         remember_choices(self.loop)
-        if job.stop.size is not None:
-            self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
     def _payload_filter(self) -> Callable[[str], bool]:
         return payload_filter(self.job)
@@ -389,15 +399,7 @@ class Session:
 
     def begin(self) -> None:
         """Construct the nodes and jump to the start. Failures are in ``error``."""
-        if self.job.stop.topic is not None:
-            from rsltrace.adapters.rclpy.callback_errors import watch_exit_code
-
-            watch = watch_exit_code(
-                self.loop,
-                self.job.stop.topic,
-                where=locate(self.job, ("stop", "topic", "exit_code")),
-            )
-            self.world.domain.watch(self.job.stop.topic.name, watch)
+        watch_messages(self._stop_rules, self.world.domain.watch, self.loop.stop_after_step)
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
             if not self.whole_graph:

@@ -16,6 +16,7 @@ from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.run.plans.entries import entry_keys
+from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.event import Asker, NameRegistry
@@ -128,7 +129,8 @@ def _remapping_note(old: str, askers: list[Asker], census: NameRegistry) -> str:
 
 
 def has_rules(job: Job) -> bool:
-    parts = (job.delay, job.execution, job.executors, job.policy, job.stop.topic)
+    """Return whether a job has rules that might fit nothing."""
+    parts = (job.delay, job.execution, job.executors, job.policy, *_stop_topics(job))
     return bool(
         any(part is not None for part in parts)
         or job.clocks
@@ -269,8 +271,13 @@ def _single(
             yield ("faults", index, "to"), fault.to, nodes, "node"
     for index, clock in enumerate(job.clocks):
         yield ("clocks", index, "node"), clock.node, nodes, "node"
-    if job.stop.topic is not None:
-        yield ("stop", "topic", "name"), job.stop.topic.name, topics, "topic"
+    for key, topic in _stop_topics(job):
+        yield ("stop", key, "name"), topic, topics, "topic"
+
+
+def _stop_topics(job: Job) -> list[tuple[str, str]]:
+    given = ((key, rule.topic(value)) for key, value, rule in given_rules(job))
+    return [(key, topic) for key, topic in given if topic is not None]
 
 
 def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:

@@ -192,10 +192,10 @@ def test_the_commands(trace: Path, tmp_path: Path) -> None:
     assert (refused.returncode, (tmp_path / "u.mcap").exists()) == (2, False)
     assert "cannot write the bag bag: it exists" in refused.stderr
     assert call("record", "job.yaml", "-o", "t.mcap", "--bag", "bag", "--force").returncode == 0
-    assert call("export", "t.mcap", "--bag", "other", "--topics", "/chatter").returncode == 0
+    assert call("export", "t.mcap", "--bag", "other", "--topic", "/chatter").returncode == 0
     whole = (tmp_path / "t.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) - 300])
     cut = call("export", "cut.mcap", "--bag", "part")
     assert cut.returncode == 1
-    assert "note: cut.mcap is cut: the bag ends with it, after " in cut.stderr
+    assert "note: cut.mcap is truncated: the bag ends with it after " in cut.stderr
     assert "job.yaml is not a trace" in call("export", "job.yaml", "--bag", "third").stderr

@@ -239,7 +239,7 @@ def test_what_a_job_takes_from_outside_of_its_revisions(robot: Robot, tmp_path: 
     ("words", "said"),
     [
         (("--good", "main", "--bad", "main", "job.yaml"), "are one commit"),
-        (("--good", "main", "--bad", "main~1", "job.yaml"), "so --good is the older one"),
+        (("--good", "main", "--bad", "main~1", "job.yaml"), "exchange them"),
         (("--good", "v9", "--bad", "main", "job.yaml"), "has no revision 'v9'"),
         (("--good", "-x", "--bad", "main", "job.yaml"), "has no revision '-x'"),
         (("--good", "main~1", "--bad", "main", "job.yaml", "--check", "event > 1"), "'events'?"),

@@ -129,7 +129,7 @@ def test_without_the_pin_the_hash_seed_shows(
     done = rsltrace("verify", job(ORDER_OF_A_SET, AS_IT_IS), *options)
     assert done.returncode == 1, done.stderr
     assert "not deterministic" in done.stdout
-    assert "provoked by: hash seed (alone is enough)" in done.stdout
+    assert "caused by: hash seed alone" in done.stdout
     assert "environment: hash_seed  0" in done.stdout, "the diff is printed"
     lines = done.stdout.splitlines()
     for number in (0, 1):
@@ -140,7 +140,7 @@ def test_without_the_pin_the_hash_seed_shows(
         assert (tmp_path / f"run-{number}.mcap").read_bytes() == (
             tmp_path / f"kept/run-{number}.mcap"
         ).read_bytes()
-    narrow = lines[lines.index("provoked by: hash seed (alone is enough)") + 1]
+    narrow = lines[lines.index("caused by: hash seed alone") + 1]
     assert rsltrace(*shlex.split(narrow)[1:]).stdout.startswith(f"digest {digest} ")
 
 

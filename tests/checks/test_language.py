@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from rsltrace import Trace, evaluate_checks
 from rsltrace.checks.evaluate import job_of_checks
-from rsltrace.conditions.bounds import INT_BITS_MAX, STEPS_MAX, Budget, LimitError
+from rsltrace.conditions.bounds import INT_BITS_MAX, STEPS_MAX, LimitError, StepBudget
 from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.conditions.text import parse_condition
@@ -318,7 +318,7 @@ def test_numbers_stay_within_their_bits(signs: list[str], data: Any) -> None:
 
 
 def test_a_large_sequence_is_paid_for() -> None:
-    budget = Budget()
+    budget = StepBudget()
     budget.make(1000)
     assert budget.left == STEPS_MAX - 1001
     with pytest.raises(LimitError, match="1,000,001 items"):
@@ -356,4 +356,4 @@ def test_what_a_check_cannot_compute_is_said_with_its_place(tmp_path: Path) -> N
     assert said.startswith(
         f"the job of {tmp_path}/run.mcap:5:12: a check cannot be evaluated: event"
     )
-    assert "LimitError: it makes a number of more than 512 bits\n  /count: 2**data**2 < 1" in said
+    assert "it makes a number of more than 512 bits\n  /count: 2**data**2 < 1" in said

@@ -145,7 +145,7 @@ def test_info_leaves_out_what_every_node_has_and_nobody_used(tmp_path: Path) -> 
         assert "entities: 7" in text
         for name in ("set_parameters", "/n/my_service", "/rosout", "/silent"):
             assert f" {name}" in text or f"/n/{name}" in text
-    assert "2 built-in ones that did nothing are left out; --all shows them" in short
+    assert "2 unused built-in ones are hidden; --all shows them" in short
     assert "get_parameters" not in short
     assert "/parameter_events" not in short
     assert "get_parameters" in full

@@ -78,7 +78,7 @@ def test_record_tells_it(tmp_path: Path) -> None:
         check=True,
     )
     told = [line for line in done.stderr.splitlines() if "nobody" in line]
-    whom = "rsltrace check tells who talks to whom"
+    whom = "rsltrace check shows the graph"
     assert told == [
         f"note: nobody publishes /cmd_wel, which /base listens to; {whom}",
         f"note: nobody serves /dock, of which /base is a client; {whom}",

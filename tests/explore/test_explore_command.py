@@ -109,7 +109,7 @@ def test_a_search_that_is_killed_goes_on_where_it_was(
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["--budget", "0"], "nothing can be tried with a budget of 0"),
+        (["--budget", "0"], "the budget must be greater than 0"),
         (["--budget", "soon"], "expected a number of runs (1000) or a time (10min"),
         (["--resume"], "there is no search to resume"),
         (["--set", "checks.+={never: nothing}"], "never"),

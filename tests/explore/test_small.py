@@ -212,9 +212,9 @@ def test_the_command_searches_faults_and_makes_what_it_finds_small(
 ) -> None:
     folder = tmp_path / "found"
     words = ["explore", robot / "job.yaml", "--strategy", "faults", "--jobs", 1, "-o", folder]
-    done = command(*words, "--budget", 30, "--stop-at-first", "--small")
+    done = command(*words, "--budget", 30, "--stop-at-first", "--minimize")
     assert done.returncode == 1, done.stderr
-    readme = Path(done.stdout.partition("made small: two is last: ")[2].splitlines()[0])
+    readme = Path(done.stdout.partition("minimized: two is last: ")[2].splitlines()[0])
     assert readme.is_file()
     assert "- the fault {" in readme.read_text()
     assert "faults: " in done.stdout
@@ -234,4 +234,4 @@ def test_the_command_tries_each_combination_of_settings(
     assert done.returncode == 1, done.stderr
     assert "4 runs, 3 different digests, 2 failed of 1 cause" in done.stdout
     assert "settings (grid): 3 of 3 combinations of nodes.two.parameters.value" in done.stdout
-    assert "nothing is left to try" in done.stdout
+    assert "every run has been tried" in done.stdout

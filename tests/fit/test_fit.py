@@ -178,7 +178,7 @@ def test_what_was_drawn_is_what_is_measured(known: Known) -> None:
     assert sorted(one.nodes for one in found.executors) == [(name,) for name in nodes]
 
 
-@pytest.mark.parametrize("how", ["tables", pytest.param("families", marks=pytest.mark.long)])
+@pytest.mark.parametrize("how", ["tables", pytest.param("distributions", marks=pytest.mark.long)])
 def test_the_job_that_comes_out_has_the_distributions_that_went_in(
     known: Known, how: str, tmp_path: Path
 ) -> None:
@@ -209,7 +209,7 @@ def test_the_job_that_comes_out_has_the_distributions_that_went_in(
             draw = distribution_of(job, spec).sampler(Stream(1, "any"), 0)
             samples.append(np.array([draw(0) for _ in range(20_000)]))
         assert ks_distance(*samples) < 1.95 / np.sqrt(780) + 0.02, (given, found)
-        if how == "families":
+        if how == "distributions":
             assert found.kinds() == given.kinds()
 
 
@@ -421,7 +421,7 @@ def test_without_the_libraries_the_message_says_what_to_install(
     gone = ("scipy", "matplotlib")
     monkeypatch.setattr(util, "find_spec", lambda name: None if name in gone else real(name))
     native = [str(known.folder / "native.mcap"), str(known.folder / "job.yaml")]
-    for words in (["--as", "families"], ["--plot", str(known.folder / "none.png")]):
+    for words in (["--as", "distributions"], ["--plot", str(known.folder / "none.png")]):
         done = known.fit(*native, *words)
         assert done.exit_code == 2
         assert "pip install 'rsltrace[fit]'" in done.stderr

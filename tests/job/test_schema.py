@@ -19,7 +19,7 @@ from rsltrace.job.documents.reference import reference, undocumented
 from rsltrace.job.documents.schema import field_schema, job_schema
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import file_fields, models_in
-from rsltrace.job.reading.compose import Composition
+from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.checks import FROM_FILE
 
 ROOT = Path(__file__).parents[2]
@@ -87,7 +87,7 @@ def test_what_the_loader_refuses_does_not_fit(text: str) -> None:
 
 
 def fields() -> Iterator[tuple[str, FieldInfo]]:
-    models: list[type[BaseModel]] = [Job, Composition]
+    models: list[type[BaseModel]] = [Job, CompositionKeys]
     for model in models:
         for key, field in file_fields(model):
             yield f"{model.__name__}.{key}", field

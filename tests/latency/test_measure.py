@@ -14,7 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from rsltrace.checks.latency.instances import Parts, figures
+from rsltrace.checks.latency.instances import HopTimes, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, measure_latencies
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.checks.latency_checks import check_latency
@@ -213,10 +213,10 @@ def assert_measured(chain: ChainLatency, outputs: list[list[Sent]], inputs: list
             assert worst.output_ns >= worst.input_ns
     ordered = sorted(outputs, key=lambda hops: hops[-1].left_ns)
     assert chain.events().tolist() == [[one.cause[0] for one in hops] for hops in ordered]
-    whole = sum(getattr(one, part) for one in chain.parts for part in Parts.__slots__)
+    whole = sum(getattr(one, part) for one in chain.parts for part in HopTimes.__slots__)
     assert np.array_equal(whole, chain.found.ages_ns())
     for one in chain.parts:
-        assert all((getattr(one, part) >= 0).all() for part in Parts.__slots__)
+        assert all((getattr(one, part) >= 0).all() for part in HopTimes.__slots__)
 
 
 @pytest.mark.repeated

@@ -112,7 +112,7 @@ class Weary(Talker):
         assert self.count < 3
 """
     job_file("nodes: [{node: 'nodes_under_test:Weary'}]\n", code)
-    note = "note: the job does not say when the run ends: 'stop:' in it does, --until T, and Ctrl-C"
+    note = "note: the job has no end: stop the run with 'stop:' in the job, --until T or Ctrl-C"
     endless = command("record", "job.yaml", "-o", "run.mcap")
     assert (endless.returncode, note in endless.stderr) == (3, True)
     assert note not in command("record", "job.yaml", "--until", "1", "-o", "2.mcap").stderr

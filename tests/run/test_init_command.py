@@ -13,7 +13,7 @@ import pytest
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
 from rsltrace.job.documents.schema import job_schema
-from rsltrace.job.reading.node_source import look_up
+from rsltrace.job.reading.node_source import inspect_target
 
 NODE = """
 from rclpy.node import Node
@@ -183,11 +183,11 @@ def test_a_second_node_without_its_option_is_no_job_file(rsltrace: Any, folder: 
 
 @pytest.mark.long
 def test_a_module_on_pythons_own_path(folder: Path) -> None:
-    found = look_up("rclpy.node:Node", [folder])
+    found = inspect_target("rclpy.node:Node", [folder])
     assert found.folder is None
     (folder / "src" / "robot" / "nodes.py").write_text("class (")
     with pytest.raises(JobError, match=r"nodes\.py:1: not Python"):
-        look_up("robot.nodes:Hearer", [folder / "src"])
+        inspect_target("robot.nodes:Hearer", [folder / "src"])
 
 
 @pytest.mark.long
@@ -207,9 +207,11 @@ def test_a_node_named_by_its_file(rsltrace: Any, folder: Path, at: str, chosen: 
 
 
 def test_functions_are_mains_unless_they_return_a_node(folder: Path) -> None:
-    found = {name: look_up(f"robot.mains:{name}", [folder / "src"]) for name in ("main", "make")}
+    found = {
+        name: inspect_target(f"robot.mains:{name}", [folder / "src"]) for name in ("main", "make")
+    }
     assert [found[name].is_main for name in ("main", "make")] == [True, False]
-    assert not look_up("robot.mains:Two", [folder / "src"]).name, "it is told its name"
+    assert not inspect_target("robot.mains:Two", [folder / "src"]).name, "it is told its name"
 
 
 @pytest.mark.long

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,9 @@ import pytest
 
 from rsltrace import Trace
 from rsltrace.errors import JobError, LivelockError, NodeError, RunError
+from rsltrace.job import StopSpec
+from rsltrace.run.stop_rules import STOP_RULES, TopicRule
+from rsltrace.simulation.loop.stop import Stop
 
 pytestmark = pytest.mark.ros
 
@@ -408,3 +412,22 @@ def test_a_virtual_environment_in_the_search_path_is_not_the_users_code(
     with Trace.open(result.path) as trace:
         assert list(trace.metadata("rsltrace:sources")) == ["nodes_under_test"]
     del sys.modules["installed_library"]
+
+
+def test_every_key_of_stop_is_in_the_table() -> None:
+    assert set(STOP_RULES) == set(StopSpec.model_fields)
+
+
+def test_a_rule_that_counts_messages_takes_one_class(
+    record_job: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class CountRule(TopicRule):
+        seen = 0
+
+        def on_message(self, message: Callable[[], Any]) -> Stop | None:
+            self.seen += 1
+            return Stop(f"{message().data} is the third") if self.seen == 3 else None
+
+    monkeypatch.setitem(STOP_RULES, "topic", CountRule)  # type: ignore[arg-type]
+    result = record_job(f"{BOTH}stop: {{topic: /numbers}}\n")
+    assert result.stop_reason == "3 is the third"

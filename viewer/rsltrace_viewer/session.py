@@ -273,7 +273,7 @@ class Session:
             text = f"only in {'a' if row.b is None else 'b'}{text and ': '}{text}"
         delta = ""
         if a is not None and b is not None and (later_ns := self.b.stamp(b) - self.a.stamp(a)):
-            delta = _short_duration(later_ns)
+            delta = format_duration(later_ns, 3, signed=True)
         if row.elsewhere is not None:
             there = self.comparison.place_of(row.elsewhere, other=row.b is None)
             mark = (
@@ -664,11 +664,3 @@ class Session:
 
 def _numbers_width(runs: Iterable[Run]) -> int:
     return max(3, *(len(str(max(run.count - 1, 0))) for run in runs))
-
-
-def _short_duration(duration_ns: int) -> str:
-    """Return a duration in three digits, with its sign: ``+1.5 ms``."""
-    for unit, scale in (("s", NS_PER_S), ("ms", 1_000_000), ("us", 1_000)):
-        if abs(duration_ns) >= scale:
-            return f"{duration_ns / scale:+.3g} {unit}"
-    return f"{duration_ns:+d} ns"

@@ -247,7 +247,7 @@ def _as_changed_by(family: Family) -> Attack:
         words = [
             ("rerun", HOSTILE, "-o", "new.rrd"),
             ("rerun", ORIGINAL, HOSTILE, "-o", "old.rrd", "--force"),
-            ("export", HOSTILE, "-o", "bag", "--topics", topics),
+            ("export", HOSTILE, "-o", "bag", "--topic", topics),
         ]
         for each in rng.sample(words, 2):
             case.commands.append(oracle.reading(*each, cwd=folder, limits=limits))

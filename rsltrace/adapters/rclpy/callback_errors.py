@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from typing import Any, NoReturn, Protocol
+from typing import NoReturn
 
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.hints import hint_for
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, mailbox_of
 from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import class_of
-from rsltrace.errors import JobError, RsltraceError, RunError, nearest
-from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
+from rsltrace.errors import RsltraceError, RunError
+from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.failure import (
@@ -26,52 +24,10 @@ from rsltrace.simulation.middleware.events.failure import (
     text_of,
     user_traceback,
 )
-from rsltrace.simulation.middleware.publisher import Publisher, Watcher
 from rsltrace.terminal import tell
 from rsltrace.trace.model.event import EventKind
 
-
-class _TopicStop(Protocol):
-    @property
-    def name(self) -> str: ...
-    @property
-    def exit_code(self) -> str | None: ...
-
-
-def watch_exit_code(loop: EventLoop, spec: _TopicStop, *, where: str) -> Watcher:
-    """Return a watcher that ends the run after the first message (``stop: topic:`` of a job).
-
-    ``spec.exit_code`` is the dotted path of the message's field that holds the exit status;
-    ``where`` is its place in the job.
-    """
-
-    def watch(publisher: Publisher, data: bytes) -> None:
-        msg_type: Any = class_of(publisher)
-        code = 0
-        if spec.exit_code is not None:
-            value: Any = codec_for(msg_type).deserialize(data)
-            for name in spec.exit_code.split("."):
-                fields: dict[str, str] = getattr(value, "get_fields_and_field_types", dict)()
-                if name not in fields:
-                    near = nearest(name, fields)
-                    hint = f"did you mean {near!r}?" if near else f"there are {', '.join(fields)}"
-                    hint = hint if fields else "the part before it is not a message"
-                    raise JobError(
-                        f"stop.topic.exit_code: {spec.name} is a {msg_type.__qualname__} without "
-                        f"the field {spec.exit_code!r}: {hint}",
-                        where=where,
-                    )
-                value = getattr(value, name)
-            if not isinstance(value, int):
-                raise JobError(
-                    f"stop.topic.exit_code: {spec.exit_code!r} of {spec.name} is "
-                    f"{value!r}, not an integer",
-                    where=where,
-                )
-            code = int(value)
-        loop.stop_after_step(Stop(f"message on {spec.name}", code))
-
-    return watch
+# The exit status that an exception asks for, and how a forked process ends by one.
 
 
 def exit_status(error: SystemExit) -> int:

@@ -1,7 +1,7 @@
 """Which message came of which, and when: one pass over the events of a trace.
 
 Each event has one cause, so each message came on one path; on several where nodes are named of
-which a message is taken to come of all that they have received (``Wanted.via``).
+which a message is taken to come of all that they have received (``ChainSelection.via``).
 
 What happens in a node between taking a message and publishing the next one belongs to the node:
 waiting, tasks, calls of services. A callback that was suspended goes on with what it had received.
@@ -18,8 +18,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.checks.latency.observed import observed
-from rsltrace.checks.latency.paths import NO_PATH, Hop, Paths, Wanted, sink_hop
+from rsltrace.checks.latency.observed import native_times
+from rsltrace.checks.latency.paths import NO_PATH, ChainPaths, ChainSelection, Hop, sink_hop
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, encode_draw
@@ -42,7 +42,7 @@ _Selected = tuple[int, int, int, int]
 """An output: which of its event's, its kind, entity and hash."""
 
 
-class Table:
+class IntegerTable:
     """Rows of whole numbers, a column each; 8 bytes for a number."""
 
     def __init__(self, *columns: str) -> None:
@@ -69,7 +69,7 @@ class Table:
         return whole
 
 
-class Flow:
+class MessageFlow:
     """What came of what. Times are simulated ns, in a native run those of its clocks.
 
     ``messages``, a row for each message and path that it came on: ``key`` (of the message), its
@@ -81,17 +81,17 @@ class Flow:
     ``lost``: the first row of the ``message`` and the ``entity`` that did not get it.
     """
 
-    def __init__(self, trace: Trace, wanted: Wanted) -> None:
+    def __init__(self, trace: Trace, wanted: ChainSelection) -> None:
         self.trace = trace
-        self.paths = Paths(wanted)
-        self.messages = Table("key", "path", "parent", "taken", "began", "published")
-        self.taken = Table("message", "rows", "entity", "began", "delay")
-        self.lost = Table("message", "entity")
+        self.paths = ChainPaths(wanted)
+        self.messages = IntegerTable("key", "path", "parent", "taken", "began", "published")
+        self.taken = IntegerTable("message", "rows", "entity", "began", "delay")
+        self.lost = IntegerTable("message", "entity")
         self._wanted = wanted
         self._all = wanted.first is None
-        self._observed = observed(trace)
-        self._delays = Table("message", "entity", "delay")
-        self._of_events = Table("event", "taken")
+        self._observed = native_times(trace)
+        self._delays = IntegerTable("message", "entity", "delay")
+        self._of_events = IntegerTable("event", "taken")
         self._suspended: dict[int, deque[tuple[int, int]]] = {}
         self._last: dict[str, dict[str, int]] = {node: {} for node in wanted.via}
         self._hops: dict[int, int] = {}

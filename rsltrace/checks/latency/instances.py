@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.checks.latency.flow import Flow
+from rsltrace.checks.latency.flow import MessageFlow
 from rsltrace.checks.latency.paths import NO_PATH
 from rsltrace.trace.model.entity import EntityKind
 
@@ -66,11 +66,11 @@ Integers = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Instances:
+class ChainMessages:
     """The inputs and outputs of a chain, each in the order in which they left.
 
-    ``came`` has a row for each output and a column for each hop: the rows of ``Flow.messages`` that
-    it came through, shape (outputs, hops). ``source`` is the place of each output's input among
+    ``came`` has a row for each output and a column for each hop: the rows of its messages in
+    ``MessageFlow.messages``, shape (outputs, hops). ``source`` is the place of its input among
     the inputs. Times are in ns.
     """
 
@@ -115,7 +115,7 @@ class Instances:
         return self.output_ns[answers] - self.input_ns[: len(answers)]
 
 
-def instances(flow: Flow, path: int) -> Instances:
+def instances(flow: MessageFlow, path: int) -> ChainMessages:
     """Return what came through a path."""
     messages = flow.messages
     paths, parents, published = (messages.column(one) for one in ("path", "parent", "published"))
@@ -128,12 +128,12 @@ def instances(flow: Flow, path: int) -> Instances:
     inputs = inputs[np.argsort(published[inputs], kind="stable")]
     places = np.zeros(messages.count, dtype=np.int64)
     places[inputs] = np.arange(len(inputs))
-    return Instances(
+    return ChainMessages(
         inputs, published[inputs], np.stack(came, axis=1), published[last], places[came[0]]
     )
 
 
-def _rows(flow: Flow, paths: Integers, path: int, length: int, used: Integers) -> Integers:
+def _rows(flow: MessageFlow, paths: Integers, path: int, length: int, used: Integers) -> Integers:
     """Return the messages that have come through the first hops of a path. In a loop, which has no
     beginning, those are known that were ``used``."""
     begun = flow.paths.prefix(path, length)
@@ -142,7 +142,7 @@ def _rows(flow: Flow, paths: Integers, path: int, length: int, used: Integers) -
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class HopTimes:
     """Where the time of a hop goes, in ns, shape (outputs,) each: from one message leaving to the
     next one leaving these add up.
 
@@ -156,7 +156,7 @@ class Parts:
     runs: Integers
 
 
-def parts_of(flow: Flow, found: Instances) -> list[Parts]:
+def parts_of(flow: MessageFlow, found: ChainMessages) -> list[HopTimes]:
     """Return where the time goes, for each hop after the first."""
     messages, taken = flow.messages, flow.taken
     published, began, received = (messages.column(n) for n in ("published", "began", "taken"))
@@ -166,7 +166,7 @@ def parts_of(flow: Flow, found: Instances) -> list[Parts]:
         sent, start = published[before], starts[received[after]]
         arrived = np.minimum(sent + np.maximum(delays[received[after]], 0), start)
         parts.append(
-            Parts(
+            HopTimes(
                 arrived - sent,
                 start - arrived,
                 began[after] - start,
@@ -177,7 +177,7 @@ def parts_of(flow: Flow, found: Instances) -> list[Parts]:
 
 
 @dataclass(frozen=True, slots=True)
-class Passage:
+class HopMessages:
     """How many messages of a hop went on to the next one.
 
     ``sent`` leave while the next node has a subscription; of these ``received`` are taken by a
@@ -193,7 +193,7 @@ class Passage:
     used: int
 
 
-def passages(flow: Flow, path: int, found: Instances) -> list[Passage]:
+def passages(flow: MessageFlow, path: int, found: ChainMessages) -> list[HopMessages]:
     """Return what became of the messages of each hop but the last, on the way to the next one."""
     messages, taken = flow.messages, flow.taken
     keys, paths, published = (messages.column(one) for one in ("key", "path", "published"))
@@ -211,7 +211,7 @@ def passages(flow: Flow, path: int, found: Instances) -> list[Passage]:
         rest = np.flatnonzero(there & ~received & ~gone)
         last = np.flatnonzero(received)[-1] if received.any() else -1
         passed.append(
-            Passage(
+            HopMessages(
                 int(there.sum()),
                 int(received.sum()),
                 int(gone.sum()),
@@ -223,12 +223,12 @@ def passages(flow: Flow, path: int, found: Instances) -> list[Passage]:
     return passed
 
 
-def _to_node(flow: Flow, rows: Integers, entities: Integers, node: str) -> Integers:
+def _to_node(flow: MessageFlow, rows: Integers, entities: Integers, node: str) -> Integers:
     ids = [one for one in np.unique(entities).tolist() if flow.node_of(one) == node]
     return rows[np.isin(entities, ids)]
 
 
-def _created_ns(flow: Flow, node: str, topic: str) -> int:
+def _created_ns(flow: MessageFlow, node: str, topic: str) -> int:
     """Return when a node has made its first subscription of a topic."""
     return min(
         (

@@ -10,19 +10,19 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.checks.latency.flow import Flow
+from rsltrace.checks.latency.flow import MessageFlow
 from rsltrace.checks.latency.instances import (
+    ChainMessages,
     Durations,
     Figures,
-    Instances,
-    Parts,
-    Passage,
+    HopMessages,
+    HopTimes,
     figures,
     instances,
     parts_of,
     passages,
 )
-from rsltrace.checks.latency.paths import Hop, Wanted, sink_hop
+from rsltrace.checks.latency.paths import ChainSelection, Hop, sink_hop
 from rsltrace.errors import TraceError, nearest
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS
@@ -35,7 +35,7 @@ _Graph = dict[str, list[Hop]]
 """By topic: the nodes that receive it, with each topic that these publish."""
 
 
-def where_broken(flow: Flow, wanted: Wanted) -> str:
+def where_broken(flow: MessageFlow, wanted: ChainSelection) -> str:
     """Return why nothing came through the chain that is wanted, in a sentence."""
     first, last = wanted.first, wanted.last
     graph = _graph(flow)
@@ -60,7 +60,7 @@ def where_broken(flow: Flow, wanted: Wanted) -> str:
     return said
 
 
-def samplers(flow: Flow) -> list[tuple[str, str]]:
+def samplers(flow: MessageFlow) -> list[tuple[str, str]]:
     """Return the nodes that receive messages and begin chains of their own, and what to know."""
     begun: dict[str, set[str]] = {}
     for hops in flow.paths.hops:
@@ -83,7 +83,7 @@ def samplers(flow: Flow) -> list[tuple[str, str]]:
     ]
 
 
-def _of_topics(flow: Flow, wanted: Wanted, graph: _Graph) -> str:
+def _of_topics(flow: MessageFlow, wanted: ChainSelection, graph: _Graph) -> str:
     """Say at which of the topics of a chain it breaks off."""
     longest = max((len(hops) for hops in flow.paths.hops), default=0)
     if not longest:
@@ -114,12 +114,12 @@ def _break(before: str, hop: Hop) -> str:
     )
 
 
-def _stored(flow: Flow, graph: _Graph, topic: str) -> str:
+def _stored(flow: MessageFlow, graph: _Graph, topic: str) -> str:
     nodes = sorted({hop.node for hop in graph.get(topic, ())})
     return f"; {', '.join(nodes)} may make use of the last one: --via {nodes[0]}" if nodes else ""
 
 
-def _graph(flow: Flow) -> _Graph:
+def _graph(flow: MessageFlow) -> _Graph:
     received: dict[str, set[str]] = {}
     sent: dict[str, set[str]] = {}
     for entity in flow.trace.entities.values():
@@ -156,11 +156,11 @@ MEASURES = ("latency", "age", "last_age", "reaction", "worst_reaction")
 MOMENT_DTYPE = np.dtype(
     [(name, "<i8") for name in ("duration", "input_event", "input_ns", "output_event", "output_ns")]
 )
-"""Durations as in ``Moment``."""
+"""Durations as in ``ChainDuration``."""
 
 
 @dataclass(frozen=True, slots=True)
-class Moment:
+class ChainDuration:
     """A duration, and the events that published the input and the output that it lies between."""
 
     duration_ns: int
@@ -177,7 +177,7 @@ class ChainLatency:
     output is taken to come of the last message received. Durations are simulated ns.
     """
 
-    def __init__(self, flow: Flow, path: int) -> None:
+    def __init__(self, flow: MessageFlow, path: int) -> None:
         self._flow = flow
         self._path = path
         self.hops: tuple[Hop, ...] = flow.paths.named(path)
@@ -188,17 +188,17 @@ class ChainLatency:
         return " → ".join(hop.topic for hop in self.hops)
 
     @cached_property
-    def found(self) -> Instances:
+    def found(self) -> ChainMessages:
         """Its inputs and outputs."""
         return instances(self._flow, self._path)
 
     @cached_property
-    def parts(self) -> list[Parts]:
+    def parts(self) -> list[HopTimes]:
         """Where the time goes, for each hop after the first."""
         return parts_of(self._flow, self.found)
 
     @cached_property
-    def passages(self) -> list[Passage]:
+    def passages(self) -> list[HopMessages]:
         """How many messages of each hop but the last went on."""
         return passages(self._flow, self._path, self.found)
 
@@ -221,12 +221,12 @@ class ChainLatency:
         """Return the figures of one of ``MEASURES``; None if there is nothing to measure."""
         return figures(self.durations(measure))
 
-    def worst(self, measure: str) -> Moment | None:
+    def worst(self, measure: str) -> ChainDuration | None:
         """Return the first of the longest durations of one of ``MEASURES``."""
         moments = self.moments(measure)
         if not len(moments):
             return None
-        return Moment(*map(int, moments[moments["duration"].argmax()]))
+        return ChainDuration(*map(int, moments[moments["duration"].argmax()]))
 
     def moments(self, measure: str) -> npt.NDArray[np.void]:
         """Return the ``durations`` of a measure with their events: MOMENT_DTYPE."""
@@ -327,8 +327,8 @@ def measuring(
     if missing:
         yield Latencies((), missing=missing)
         return
-    wanted = Wanted(start, end, tuple(topics), chosen, sink)
-    flow = Flow(trace, wanted)
+    wanted = ChainSelection(start, end, tuple(topics), chosen, sink)
+    flow = MessageFlow(trace, wanted)
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         flow.read(events, outputs)
         yield None

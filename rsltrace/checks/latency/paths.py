@@ -16,7 +16,7 @@ class Hop(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ChainSelection:
     """Which chains: all that there are, those from and to a topic, or one, by its ``topics``.
 
     With ``sink``, a node, chains end when a callback of it is done that has taken the last message
@@ -46,10 +46,10 @@ def sink_hop(node: str) -> Hop:
     return Hop(node, f"({node})")
 
 
-class Paths:
+class ChainPaths:
     """The paths that messages came on, by number. ``hops`` has those of each, as numbers."""
 
-    def __init__(self, wanted: Wanted) -> None:
+    def __init__(self, wanted: ChainSelection) -> None:
         self.hops: list[tuple[int, ...]] = []
         self.known: list[Hop] = []
         self._wanted = wanted

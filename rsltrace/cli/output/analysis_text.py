@@ -1,4 +1,4 @@
-"""What ``rsltrace analyze`` prints: chains with bounds and the worst that was seen."""
+"""The report of ``rsltrace analyze``: chains with bounds and worst observed response times."""
 
 from __future__ import annotations
 
@@ -11,13 +11,11 @@ from rsltrace.native.timing.analysis import Analysis, ChainResult, Seen
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
 
-# The picture of ``rsltrace analyze``: for each chain its bound, what was seen, its deadline.
-
 _NS_PER_MS = 1e6
 
 
 def picture_of(found: Analysis) -> Any:
-    """Return the chains of an analysis, the first at the top, as a figure of matplotlib's."""
+    """Return a matplotlib figure of the chains: bound, observations and deadline of each."""
     from matplotlib.figure import Figure
 
     chains = list(reversed(found.chains))
@@ -46,9 +44,9 @@ def picture_of(found: Analysis) -> Any:
 
 
 _TIMES = {
-    "job": "as the job says, at most",
-    "max": "the longest measured",
-    "p99": "99 % quantile of those measured: bounds hold as often as that",
+    "job": "maximum of the job's execution:",
+    "max": "maximum measured",
+    "p99": "99 % quantile measured; bounds hold only as often",
 }
 
 
@@ -73,7 +71,7 @@ def text(found: Analysis, times: str, native: Sequence[str]) -> list[str]:
     lines = [f"execution times: {_TIMES[times]}", "", *table(rows, right=right), ""]
     loads = ", ".join(f"{name} {part:.1%}" for name, part in found.load.items())
     if loads:
-        lines.append(f"busy at most: {loads}")
+        lines.append(f"maximum load: {loads}")
     late = [one for one in found.chains if one.verdict in ("misses", "may miss")]
     if late:
         lines += [_why(one) for one in late]
@@ -94,7 +92,7 @@ def _why(one: ChainResult) -> str:
 
 
 def as_json(found: Analysis, times: str) -> dict[str, Any]:
-    """Return the same for programs; times in nanoseconds."""
+    """Return the analysis as JSON-compatible values; times in nanoseconds."""
     return {
         "times": times,
         "meets": found.all_meet,

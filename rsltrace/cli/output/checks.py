@@ -1,4 +1,4 @@
-"""What came of the checks and metrics of a job, for people and for programs."""
+"""The results of the checks and metrics of a job, as text and JSON."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from rsltrace.trace.words.code import code_place
 from rsltrace.trace.words.events import EventWords
 
 _SHOWN_MAX = 3
-_WORDS = {UNDECIDED: "not decided before the end of the run"}
+_WORDS = {UNDECIDED: "undecided at the end of the run"}
 
 
-class Checked:
-    """The checks of a job, held against the trace at ``path``, and its metrics. Functions among
-    them are called unless ``functions`` is False."""
+class CheckReport:
+    """The checks and metrics of a job on the trace at ``path``. Functions among them are called
+    unless ``functions`` is False."""
 
     def __init__(self, job: Job, path: Path, *, functions: bool = True) -> None:
         self._path = path
@@ -41,11 +41,11 @@ class Checked:
 
     @property
     def violated(self) -> list[CheckResult]:
-        """Those that failed."""
+        """The checks that failed."""
         return [one for one in self.results if one.verdict == VIOLATED]
 
     def lines(self) -> list[str]:
-        """Return a line for each metric and check, and under checks that failed where they did."""
+        """Return a line for each metric and check, and where each failed one failed."""
         lines = [
             printable(f"metric {one.name}: {one.text}{f' ({one.note})' if one.note else ''}")
             for one in self.metrics
@@ -70,7 +70,7 @@ class Checked:
         return lines
 
     def values(self) -> dict[str, Any]:
-        """Return what a program wants to know: the ``checks`` in order, the ``metrics`` by name."""
+        """Return JSON-compatible values: the ``checks`` in order, the ``metrics`` by name."""
         return {"checks": self._results(), "metrics": self._numbers()}
 
     def _results(self) -> list[dict[str, Any]]:

@@ -25,15 +25,15 @@ _WITH_PLACE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.LOG)
 
 
 class EventJson:
-    """Makes JSON objects of events; ``payloads`` adds decoded messages."""
+    """Converts events to JSON objects; ``payloads`` adds decoded messages."""
 
     def __init__(self, trace: Trace, *, payloads: bool) -> None:
         self._trace = trace
         self._payloads = payloads
 
     def object(self, event: Event, outputs: list[Output]) -> dict[str, Any]:
-        """Return an event as what ``json`` writes. Times are integers of nanoseconds; hashes are 16
-        hex digits, since JSON readers lose digits of 64-bit numbers; what is not there is null."""
+        """Return an event as JSON-compatible values. Hashes are 16 hex digits, since JSON readers
+        lose digits of 64-bit numbers."""
         caused = event.cause_event != NO_EVENT
         return {
             "index": event.index,
@@ -101,7 +101,7 @@ class EventJson:
                 from rsltrace.trace.decode import to_plain
 
                 channel = self._trace.channel_of(output)
-                assert channel is not None  # it was found a moment ago
+                assert channel is not None
                 result["topic"] = topic
                 result["type"] = channel.type
                 result["message"] = to_plain(self._trace.decode(channel, data))

@@ -1,7 +1,6 @@
-"""The exit status of the command, kept whatever becomes of the streams that it prints to.
+"""The exit status of the command, also when its output streams fail.
 
-What cannot be written to stdout is an error, since somebody wanted it; what cannot be said on
-stderr is not, since the status says it, too.
+A failed write to stdout is an error. A failed write to stderr is ignored: the exit status says it.
 """
 
 from __future__ import annotations
@@ -23,44 +22,44 @@ EXIT_BROKEN_PIPE = 141
 """128 + SIGPIPE, what a shell reports of any program whose reader went away."""
 
 
-class _Stream(io.FileIO):
-    """A standard stream that names itself in errors, or (``heedless``) has none."""
+class _StandardStream(io.FileIO):
+    """A standard stream whose errors name it, or are ignored (``ignores_errors``)."""
 
     reader_is_gone = False
 
-    def __init__(self, number: int, title: str, *, heedless: bool) -> None:
+    def __init__(self, number: int, title: str, *, ignores_errors: bool) -> None:
         super().__init__(number, "w", closefd=False)
         self._title = title
-        self._heedless = heedless
+        self._ignores_errors = ignores_errors
 
     def write(self, data: Any, /) -> int:
-        """Write bytes; see the class."""
+        """Write bytes."""
         try:
             return super().write(data) or 0
         except OSError as error:
-            if self._heedless:
+            if self._ignores_errors:
                 return len(data)
-            _Stream.reader_is_gone |= isinstance(error, BrokenPipeError)
+            _StandardStream.reader_is_gone |= isinstance(error, BrokenPipeError)
             raise OSError(error.errno, error.strerror, self._title) from None
 
 
 def open_standard_streams() -> None:
-    """Make stdout and stderr ones that any character, and any trouble, can be written to.
+    """Replace stdout and stderr by streams that can write any character.
 
-    Those that whoever started us has closed lead nowhere. (Python has None for them, and the next
-    file that is opened, the trace, would get their number, for all that writes below Python.)
+    Closed ones are opened on /dev/null: otherwise the trace would get their file descriptors, and
+    native code that writes to stdout would write into it.
     """
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
-            _lead_nowhere(number)
+            _open_devnull(number)
         elif not isinstance(stream, io.TextIOWrapper) or stream.fileno() != number:
-            continue  # somebody else's, who calls us
+            continue  # replaced by the program that calls us
         _open(number, name, stream)
 
 
 def reopen_standard_streams() -> None:
-    """Open those again that a node has closed; their descriptors are not."""
+    """Reopen streams that a node has closed (their file descriptors stay open)."""
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper) and stream.closed:
@@ -68,7 +67,7 @@ def reopen_standard_streams() -> None:
 
 
 def _open(number: int, name: str, stream: io.TextIOWrapper | None) -> None:
-    raw = _Stream(number, f"standard {name[3:]}put", heedless=name == "stderr")
+    raw = _StandardStream(number, f"standard {name[3:]}put", ignores_errors=name == "stderr")
     opened = io.TextIOWrapper(
         io.BufferedWriter(raw),
         encoding=getattr(stream, "encoding", "utf-8"),
@@ -79,7 +78,7 @@ def _open(number: int, name: str, stream: io.TextIOWrapper | None) -> None:
     setattr(sys, name, opened)
 
 
-def _lead_nowhere(number: int) -> None:
+def _open_devnull(number: int) -> None:
     devnull = os.open(os.devnull, os.O_WRONLY)
     if devnull != number:
         os.dup2(devnull, number)
@@ -87,13 +86,13 @@ def _lead_nowhere(number: int) -> None:
 
 
 def status_of(command: Callable[[], object]) -> int:
-    """Run a command and return its status; the one place where an error becomes a message."""
+    """Run a command, print its error and return its exit status."""
     try:
         status = command()
-        sys.stdout.flush()  # here, where a reader that went away is no traceback
+        sys.stdout.flush()  # inside the try: a closed pipe must not be a traceback
     except SystemExit as end:
         status = end.code
-        if status == 1 and _Stream.reader_is_gone:  # so click ends then
+        if status == 1 and _StandardStream.reader_is_gone:  # click's exit status then
             _forget_output()
             status = EXIT_BROKEN_PIPE
     except RsltraceError as error:
@@ -108,7 +107,7 @@ def status_of(command: Callable[[], object]) -> int:
     except OSError as error:
         status = status_without_output(error)
     except Exception:
-        # Python's own status for a bug would be 1, which says of some commands that runs differ.
+        # Python's own status would be 1, which means of some commands that runs differ.
         tell(traceback.format_exc(), end="")
         status = EXIT_USAGE
     status = status if isinstance(status, int) else EXIT_USAGE if status else 0
@@ -117,14 +116,14 @@ def status_of(command: Callable[[], object]) -> int:
     except OSError as error:
         status = status_without_output(error, status)
     except ValueError:
-        pass  # somebody has closed it
+        pass  # closed
     return status
 
 
 def status_without_output(error: OSError, status: int = 0) -> int:
-    """Say that a command could not write (or read) something, and return its status.
+    """Print that a command could not read or write, and return its exit status.
 
-    A ``status`` that says that it failed anyway is kept.
+    A ``status`` other than 0 is kept.
     """
     _forget_output()
     if isinstance(error, BrokenPipeError):
@@ -134,7 +133,7 @@ def status_without_output(error: OSError, status: int = 0) -> int:
 
 
 def _interrupted(end: BaseException) -> int:
-    """Return 128 + the signal, if whoever raised the interrupt has said which it was."""
+    """Return the exit status that the interrupt carries (128 + the signal), else 130."""
     cause = end.__cause__ if isinstance(end, click.Abort) else end
     told = cause.args[0] if cause is not None and cause.args else EXIT_INTERRUPTED
     return told if isinstance(told, int) else EXIT_INTERRUPTED
@@ -146,8 +145,8 @@ def _failed(message: str, status: int) -> int:
 
 
 def _forget_output() -> None:
-    """Send what is still buffered to nowhere, or Python would fail on it again at exit."""
+    """Discard buffered output, or Python would fail on it again at exit."""
     try:
-        _lead_nowhere(sys.stdout.fileno())
+        _open_devnull(sys.stdout.fileno())
     except (OSError, ValueError):
-        pass  # not a real file: nothing is flushed to it later either
+        pass  # not a file, so it is not flushed at exit

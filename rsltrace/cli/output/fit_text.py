@@ -1,4 +1,4 @@
-"""What was measured of a native run, and how well its simulation matches, as text and JSON."""
+"""The times of a native run, and the comparison with its simulation, as text and JSON."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ _NUMBERS = frozenset(range(1, 6))
 
 def text(fit: Fit) -> list[str]:
     """Return links and callbacks with their durations as lines."""
-    links: list[tuple[str, ...]] = [("delays", *_HEAD, "waits p50", "written", "D")]
+    links: list[tuple[str, ...]] = [("delays", *_HEAD, "waits p50", "fitted as", "D")]
     links += [
         (f"  {link}", *_row(link.delays), _row(link.waits)[1], *_written(model))
         for link, model in fit.links
     ]
-    executions: list[tuple[str, ...]] = [("execution", *_HEAD, "callback p50", "written", "D")]
+    executions: list[tuple[str, ...]] = [("execution", *_HEAD, "callback p50", "fitted as", "D")]
     executions += [
         (f"  {one.node}: {one.kind} {one.entity}", *_row(one.busy), _row(one.runs)[1], *_written(m))
         for one, m in fit.executions
@@ -44,11 +44,7 @@ def _row(durations: Durations) -> tuple[str, ...]:
     if not len(durations):
         return ("0", *("-" for _ in _HEAD[1:]))
     quantiles = [*np.percentile(durations, _PERCENT), durations.max()]
-    return str(len(durations)), *map(_short, quantiles)
-
-
-def _short(duration_ns: float) -> str:
-    return format_duration(round(float(f"{duration_ns:.4g}")))
+    return str(len(durations)), *(format_duration(one, 4) for one in quantiles)
 
 
 def _written(model: Model) -> tuple[str, str]:
@@ -73,7 +69,7 @@ def checked_text(checked: Checked) -> list[str]:
 
 def _chain(chain: CheckedChain) -> list[str]:
     if chain.simulated is None:
-        return ["  no such chain in the simulated run"]
+        return ["  the simulated run does not have this chain"]
     of = chain.simulated
     rows: list[tuple[str, ...]] = [
         ("  latency", "second run", "simulated", "ratio", "95 % interval", "first run", "interval")
@@ -86,8 +82,8 @@ def _chain(chain: CheckedChain) -> list[str]:
         rows.append(
             (
                 f"  p{one.percent:g}",
-                _short(one.a_ns),
-                _short(one.b_ns),
+                format_duration(one.a_ns, 4),
+                format_duration(one.b_ns, 4),
                 _ratio(one.ratio),
                 _interval(one.low, one.high),
                 *beside,
@@ -110,7 +106,7 @@ def _verdict(simulated: Compared, native: Compared | None) -> str:
         return f"the simulated run is {within}"
     said = f"the simulated run is not {within}: {_named(far(simulated))}"
     if native is not None and far(native):
-        said += f"; neither is the first: {_named(far(native))}"
+        said += f"; nor is the first run: {_named(far(native))}"
     return said
 
 
@@ -130,7 +126,7 @@ def _tested(of: Compared) -> str:
     p_value = "p < 0.0001" if of.p_value < 1e-4 else f"p {of.p_value:.2g}"
     return (
         f"D {of.distance:.3f} ({p_value}; {of.count_b} and {of.count_a} latencies), "
-        f"{_short(of.moved_ns)} apart on average"
+        f"mean difference {format_duration(of.moved_ns, 4)}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Latencies of chains as tables, as JSON and as lines for other programs."""
+"""Latencies of chains as text, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.checks.latency.instances import Figures, Parts, Passage, figures
+from rsltrace.checks.latency.instances import Figures, HopMessages, HopTimes, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
 from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
@@ -54,16 +54,16 @@ def _head(one: ChainLatency) -> list[str]:
 def _row(measure: str, of: Figures | None) -> tuple[str, ...]:
     if of is None:
         return (f"  {_WORDS[measure]}", "0", *("-" for _ in _QUANTILES))
-    return f"  {_WORDS[measure]}", str(of.count), *(_short(_value(of, q)) for q in _QUANTILES)
+    return (
+        f"  {_WORDS[measure]}",
+        str(of.count),
+        *(format_duration(_value(of, q), 4) for q in _QUANTILES),
+    )
 
 
 def _value(of: Figures, quantile: str) -> int:
     value: int = getattr(of, f"{quantile}_ns")
     return value
-
-
-def _short(duration_ns: float) -> str:
-    return format_duration(round(float(f"{duration_ns:.4g}")))
 
 
 def _hops(one: ChainLatency) -> list[str]:
@@ -81,7 +81,7 @@ def _mean_and_max(durations: Any) -> str:
     if not len(durations):
         return "-"
     most = int(durations.max())
-    return f"{_short(durations.mean())} ({_short(most)})" if most else "0"
+    return f"{format_duration(durations.mean(), 4)} ({format_duration(most, 4)})" if most else "0"
 
 
 def as_json(found: Latencies) -> dict[str, Any]:
@@ -113,7 +113,7 @@ def _figures(of: Figures) -> dict[str, Any]:
     return {**asdict(of), "jitter_ns": of.jitter_ns}
 
 
-def _between(parts: Parts, passed: Passage) -> dict[str, Any]:
+def _between(parts: HopTimes, passed: HopMessages) -> dict[str, Any]:
     times = {part: figures(getattr(parts, part)) for part in _PARTS}
     return {
         **{part: None if of is None else _figures(of) for part, of in times.items()},
@@ -122,8 +122,7 @@ def _between(parts: Parts, passed: Passage) -> dict[str, Any]:
 
 
 def as_csv(found: Latencies) -> Iterator[str]:
-    """Yield a line for each output of each chain, after a line with names. Times in ns; the parts
-    are sums over the hops."""
+    """Yield a header, then a line for each output of each chain. Times in ns, summed over hops."""
     yield ",".join(("chain", "first", *_NAMED, "age_ns", *(f"{part}_ns" for part in _PARTS)))
     for one in found.chains:
         came = one.found
@@ -169,16 +168,15 @@ def compared_text(a: Latencies, b: Latencies) -> list[str]:
 
 def _compared_rows(measure: str, a: Figures | None, b: Figures | None) -> Iterator[tuple[str, ...]]:
     for name, of in (("a", a), ("b", b)):
-        values = ["-" if of is None else _short(_value(of, one)) for one in _QUANTILES]
+        values = ["-" if of is None else format_duration(_value(of, one), 4) for one in _QUANTILES]
         yield f"  {_WORDS[measure]}" if name == "a" else "", name, *values
     if a is not None and b is not None:
         by = [_value(b, one) - _value(a, one) for one in _QUANTILES]
-        yield "", "b − a", *(f"+{_short(ns)}" if ns > 0 else _short(ns) if ns else "0" for ns in by)
+        yield "", "b − a", *(format_duration(ns, 4, signed=True) if ns else "0" for ns in by)
 
 
 def compared_json(a: Latencies, b: Latencies) -> dict[str, Any]:
-    """Return the chains of two traces as JSON-compatible values: ``a``, ``b`` and ``difference`` of
-    each, null where there is none."""
+    """Return the chains of two traces as JSON-compatible values."""
     return {
         "chains": [
             {

@@ -1,4 +1,4 @@
-"""``rsltrace record --native``: run, report, and end with the status that follows."""
+"""``rsltrace record --native``: run, report and exit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.cli.output.checks import Checked
+    from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
     from rsltrace.native.recording import NativeResult
     from rsltrace.simulation.loop.stop import Stop
@@ -36,7 +36,7 @@ def run_native(
     note: Callable[[str], None],
     begins: Callable[[], None],
 ) -> NativeResult:
-    """Run a job natively; ``shows``: its progress, too. ``begins`` is called before it does."""
+    """Run a job natively; ``shows``: with progress. ``begins`` is called first."""
     from rsltrace.native.session import run_natively
     from rsltrace.run import Observer
 
@@ -60,8 +60,8 @@ def run_native(
         )
 
 
-def report_native(result: NativeResult, checked: Checked | None, *, as_json: bool) -> None:
-    """Say how a native run went."""
+def report_native(result: NativeResult, checked: CheckReport | None, *, as_json: bool) -> None:
+    """Print the result of a native run."""
     error = result.error
     for note in result.notes:
         tell(f"note: {note}")
@@ -80,7 +80,7 @@ def report_native(result: NativeResult, checked: Checked | None, *, as_json: boo
     say(f"native  events {result.events}  real {format_seconds(result.duration_ns)}  {cost}")
 
 
-def _values(result: NativeResult, checked: Checked | None) -> dict[str, Any]:
+def _values(result: NativeResult, checked: CheckReport | None) -> dict[str, Any]:
     return {
         "native": True,
         "path": str(result.path),
@@ -100,7 +100,7 @@ def _values(result: NativeResult, checked: Checked | None) -> dict[str, Any]:
 
 
 def leave(result: NativeResult, status: int) -> None:
-    """End the process, even where a callback never comes back: its thread would keep it alive."""
+    """End the process, even if the thread of a stuck callback would keep it alive."""
     if result.stuck:
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError, AttributeError):

@@ -1,4 +1,4 @@
-"""How far a search is: a line on a terminal, nothing in pipes and files."""
+"""Progress on a terminal, and signals that end a run."""
 
 from __future__ import annotations
 
@@ -16,13 +16,11 @@ if TYPE_CHECKING:
     from rsltrace.search.explore.search import Budget, Search
     from rsltrace.simulation.loop.stop import Stop
 
-# Watching a run that is being recorded: its progress on a terminal, and an end by a signal.
-
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
-    """Turn the first SIGINT, SIGTERM or SIGHUP into a proper end of the run; a second one
-    interrupts whatever callback is stuck."""
+    """End the run cleanly at the first SIGINT, SIGTERM or SIGHUP; a second one interrupts the
+    callback that is stuck."""
     from rsltrace.simulation.loop.stop import Stop
 
     ends: list[Callable[[Stop], None]] = []
@@ -30,7 +28,7 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
     process = os.getpid()
 
     def handle(number: int, frame: object) -> None:
-        if os.getpid() != process:  # forked by a node: no run to end, so as if nobody had asked
+        if os.getpid() != process:  # a node's fork, which has no run to end
             signal.signal(number, old[number])
             os.kill(os.getpid(), number)
             return
@@ -39,7 +37,7 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
         end, name = ends.pop(), _ENDS[signal.Signals(number)]
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):
-            os.write(2, f"\nrsltrace: {name}, closing the trace (once more to force)\n".encode())
+            os.write(2, f"\nrsltrace: {name}, closing the trace (repeat to force)\n".encode())
         end(Stop(name, 128 + number))
 
     for caught in _ENDS:
@@ -94,15 +92,9 @@ def progress(
         yield update
 
 
-# How far a command is that takes long: a bar on a terminal, nothing in pipes and files.
-
-
 @contextmanager
 def working(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Say on a terminal that ``what`` is under way; give a function to tell of done and total.
-
-    As long as that is not told, nobody knows how far it is: the bar moves, and the time goes on.
-    """
+    """Show a progress bar on a terminal; yield a function of the work done and the total."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield lambda done, total: None
         return
@@ -120,7 +112,7 @@ _LOOK_EVERY_S = 0.2
 
 @contextmanager
 def search_line(search: Search, budget: Budget) -> Iterator[Callable[[], None]]:
-    """Show a line about a search on a terminal; give a function that brings it up to date."""
+    """Show the progress of a search on a terminal; yield a function that updates it."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield lambda: None
         return

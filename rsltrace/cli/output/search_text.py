@@ -1,4 +1,4 @@
-"""What came of a search, for people."""
+"""The reports of ``rsltrace bisect`` and ``rsltrace explore``."""
 
 from __future__ import annotations
 
@@ -19,14 +19,12 @@ if TYPE_CHECKING:
     from rsltrace.search.bisect.repository import Commit, Repository
     from rsltrace.search.bisect.search import Found, Tried
 
-# What ``rsltrace bisect`` says: the first commit that changed a run, and how the run changed.
-
 _FILES_MAX = 12
 Kept = tuple[Path, Path] | None
 
 
 def line_of(tried: Tried) -> str:
-    """Return what came of a revision, in a line; why it failed, if it did, is another."""
+    """Return the result of a revision in a line, and why it failed in another."""
     run = tried.run
     what = f"digest {run.digest}, {run.events} events" if run.digest else "no run"
     failure = tried.why or run.failure
@@ -35,20 +33,22 @@ def line_of(tried: Tried) -> str:
 
 
 def as_text(found: Found, repository: Repository, kept: Kept) -> str:
-    """Return the answer for people; ``kept`` are the places of the traces, None if they go."""
+    """Return the report; ``kept`` are the paths of the traces, None if they are deleted."""
     first = found.first
     if first is not None:
         lines = [f"first changed at {first}  ({first.author}, {first.date})"]
         if len(first.parents) > 1:
-            lines.append(f"  a merge of {len(first.parents)} commits, none of which has the change")
+            lines.append(f"  a merge of {len(first.parents)} commits without the change")
         lines += _files(repository.changed_files(first))
     else:
         count = len(found.candidates)
-        lines = [f"first changed at one of these {count} commits: those that were skipped hide it"]
+        lines = [
+            f"first changed at one of these {count} commits; the skipped ones cannot tell which"
+        ]
         lines += [f"  {commit}" for commit in found.candidates]
     difference = _difference(found, kept)
     report = render(difference).rstrip().splitlines()
-    if kept is None:  # what to do next with traces that are gone
+    if kept is None:  # the traces are deleted
         report = [line for line in report if not line.startswith("next: ")]
     lines += ["", *report]
     lines += [f"the traces are {kept[0]} and {kept[1]}"] if kept else []
@@ -56,7 +56,7 @@ def as_text(found: Found, repository: Repository, kept: Kept) -> str:
 
 
 def as_values(found: Found, repository: Repository, kept: Kept) -> dict[str, Any]:
-    """Return the answer as what ``json`` writes."""
+    """Return the result as JSON-compatible values."""
     first = found.first
     return {
         "first": None if first is None else _commit(first),
@@ -119,8 +119,7 @@ _TEXT_MAX = 300
 def search_lines(
     search: Search, source: JobSource, folder: Path, *, caution: str = ""
 ) -> Iterator[str]:
-    """Yield the lines of the summary: what was tried, what failed, how to see it; ``caution`` is
-    what was not looked for."""
+    """Yield the lines of the summary; ``caution`` says what was not checked."""
     tally = search.tally
     failed = sum(tally.failures.values())
     yield (
@@ -130,7 +129,7 @@ def search_lines(
     if caution:
         yield caution
     if tally.plain is not None and tally.plain.failure is not None:
-        yield "the job fails as it is: its plain order needs no search"
+        yield "the job fails in its default order, without a search"
     for key in _by_frequency(tally)[:_CAUSES_MAX]:
         yield from _cause(tally.first[key], tally.failures[key], source)
     more = len(tally.failures) - _CAUSES_MAX
@@ -138,16 +137,16 @@ def search_lines(
         yield f"and {_counted(more, 'more cause')}"
     yield from search.strategy.coverage()
     if tally.forked:
-        yield f"{_counted(tally.forked, 'run')} forked from the plain one"
+        yield f"{_counted(tally.forked, 'run')} forked from the default run"
     for why, count in tally.not_forked.most_common():
-        yield f"{_counted(count, 'run')} made from the beginning: {why}"
+        yield f"{_counted(count, 'run')} run from the start: {why}"
     if search.is_exhausted:
-        yield "nothing is left to try"
-    yield f"results: {folder}, as a page: {folder / 'report.html'}"
+        yield "every run has been tried"
+    yield f"results: {folder}; report: {folder / 'report.html'}"
 
 
 def _by_frequency(tally: Tally) -> list[str]:
-    """Return the causes, the most frequent first, whichever came first."""
+    """Return the causes, the most frequent first."""
     return sorted(
         tally.failures, key=lambda key: (-tally.failures[key], tally.first[key].trial.number)
     )
@@ -162,12 +161,12 @@ def _cause(result: TrialResult, count: int, source: JobSource) -> Iterator[str]:
     yield f"  {_counted(count, 'run')}, first trial {trial.number}: {trial.why}"
     if result.trace is not None and Path(result.trace).is_file():
         at = f" --at {failure.event}" if failure.event is not None else ""
-        yield f"  see: rsltrace view {shlex.quote(result.trace)}{at}"
-    yield f"  again: {repeats(result, source)}"
+        yield f"  view: rsltrace view {shlex.quote(result.trace)}{at}"
+    yield f"  reproduce: {repeats(result, source)}"
 
 
 def repeats(result: TrialResult, source: JobSource) -> str:
-    """Return the command that makes the run of a trial again."""
+    """Return the command that reproduces the run of a trial."""
     words = ["rsltrace", "record"]
     if source.text is None:
         words.append(source.path)

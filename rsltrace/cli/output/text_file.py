@@ -1,4 +1,4 @@
-"""Files that a command writes as a whole: complete under their name, or not there."""
+"""Files that a command writes completely or not at all."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from rsltrace.trace.model.regular_file import replacement_of
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text to a file, or to the device or pipe that is there.
+    """Write a text to a file, device or pipe.
 
-    :raises OutputError: if it cannot be written; what was there stays.
+    :raises OutputError: it cannot be written; an existing file is kept.
     """
     try:
         if path.exists() and not path.is_file():
@@ -25,29 +25,27 @@ def write_text(path: Path, text: str) -> None:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
-# Pictures that a command draws with matplotlib.
-
 _SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def check_picture(path: Path) -> None:
-    """Raise what would be wrong with drawing to ``path``.
+    """Check that a picture can be written to ``path``.
 
     :raises SetupError: matplotlib is not installed.
-    :raises OutputError: nothing can be drawn to such a file.
+    :raises OutputError: the file name has another suffix, or its folder does not exist.
     """
     if path.suffix.lower() not in _SUFFIXES:
-        raise OutputError(f"{path}: a picture is one of {', '.join(_SUFFIXES)}")
+        raise OutputError(f"{path}: the file name must end in {', '.join(_SUFFIXES)}")
     if importlib.util.find_spec("matplotlib") is None:
         raise SetupError("--plot needs matplotlib: pip install 'rsltrace[fit]'")
     if not path.absolute().parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {path.parent}")
+        raise OutputError(f"{path}: the folder {path.parent} does not exist")
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure to a file, whose name says in which format.
+    """Write a figure to a file, in the format of its suffix.
 
-    :raises OutputError: the file cannot be written; what was there stays.
+    :raises OutputError: the file cannot be written; an existing file is kept.
     """
     try:
         with replacement_of(path) as work:

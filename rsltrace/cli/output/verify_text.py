@@ -1,4 +1,4 @@
-"""What ``rsltrace verify`` says: what was tried, and of two runs that differ, where and why."""
+"""The report of ``rsltrace verify``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _UNKNOWN_SOURCE = (
     "Please report it, with the callback named above."
 )
 _WAY_OUT = (
-    "  OpenBLAS rounds otherwise for each core type: compare such values with a tolerance, or "
-    f"choose one\n  that all your machines can be, for every run: {CORE_TYPE}=Haswell rsltrace …"
+    "  OpenBLAS rounds differently on each core type. Compare such values with a tolerance, or set "
+    f"a\n  core type that all your machines support: {CORE_TYPE}=Haswell rsltrace …"
 )
 
 
 def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
-    """Return the answer for people; ``again`` are the commands that repeat the runs in question."""
+    """Return the report; ``again`` are the commands that repeat the runs in question."""
     if result.trouble is not None:
         return _trouble(result, result.trouble, again[-1])
     tried = _tried(result)
@@ -161,14 +161,14 @@ def _tried(result: Verified) -> str:
 
 def _provoked(result: Verified, command: str) -> str:
     if result.by_itself:
-        return "provoked by nothing: a second run without perturbations differs, too"
+        return "cause: not a perturbation, since a second unperturbed run differs, too"
     if not result.narrowed:
-        return "not tried, as the runs are long: which perturbation alone is enough (--only)"
+        return "cause: unknown; the runs are too long to try each perturbation alone, use --only"
     if not result.provoked_by:
-        return "provoked by several of them together, or by chance: none alone is enough"
-    each = " (each alone is enough)" if len(result.provoked_by) > 1 else " (alone is enough)"
+        return "cause: several perturbations together, or chance: none alone makes a run differ"
+    each = " (each alone)" if len(result.provoked_by) > 1 else " alone"
     lines = [
-        f"provoked by: {', '.join(result.provoked_by)}{each}",
+        f"caused by: {', '.join(result.provoked_by)}{each}",
         f"  {command} --only '{result.provoked_by[0]}'",
     ]
     return "\n".join(lines + [_WAY_OUT] * (KERNEL in result.provoked_by))

@@ -35,7 +35,12 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result import BagDiff
 from rsltrace.diff.sentences.runs import moved_text, tail_text
 from rsltrace.diff.sentences.values import no_fields_text
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable
+from rsltrace.trace.model.texts import (
+    format_duration,
+    format_milliseconds,
+    format_seconds,
+    printable,
+)
 
 _COLUMNS = (
     ("equal", "equal"),
@@ -205,7 +210,7 @@ def _times(found: NativeComparison, width: int) -> Section:
                 (str(one.events_a), Style.SIDE_A),
                 (str(one.events_b), Style.SIDE_B),
                 *(
-                    (_ms(None if times is None else getattr(times, name)), style)
+                    (format_milliseconds(None if times is None else getattr(times, name)), style)
                     for name in ("median_ns", "p95_ns")
                     for times, style in ((one.a, Style.SIDE_A), (one.b, Style.SIDE_B))
                 ),
@@ -214,7 +219,3 @@ def _times(found: NativeComparison, width: int) -> Section:
     rows = [cut(row, width) for row in in_columns(cells)]
     title = line(("timing", Style.TITLE), " in ms: periods of timers, latencies after the cause")
     return Section(title, rows, 6, "callbacks", fixed=1)
-
-
-def _ms(duration_ns: int | None) -> str:
-    return "-" if duration_ns is None else f"{duration_ns / 1e6:.4g}"

@@ -17,8 +17,8 @@ from pydantic.fields import FieldInfo
 
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import attached, file_fields
-from rsltrace.job.parts.part import Part
-from rsltrace.job.reading.compose import Composition
+from rsltrace.job.parts.part import JobPart
+from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA, format_time
 
 Schema = dict[str, Any]
@@ -77,7 +77,7 @@ def file_default(field: FieldInfo) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, Part):
+    if isinstance(value, JobPart):
         return None  # its own keys tell
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
@@ -102,7 +102,7 @@ class _Maker:
     def _definition(self, model: type[BaseModel]) -> Schema:
         fields = dict(file_fields(model))
         if model is Job:
-            fields = {**dict(file_fields(Composition)), **fields}
+            fields = {**dict(file_fields(CompositionKeys)), **fields}
         definition: Schema = {
             "description": summary(model),
             "type": "object",

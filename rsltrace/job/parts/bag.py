@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     Globs,
     attach,
@@ -22,12 +22,12 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path, names_to_names
 from rsltrace.job.values.names import check_glob, check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import TimeLike, parse_time
 
 
-class QosSpec(Part):
-    """QoS that a recorded topic is played with, where it differs from what was recorded."""
+class QosSpec(JobPart):
+    """QoS that replaces the recorded one."""
 
     reliability: Annotated[
         Literal["reliable", "best_effort"] | None,
@@ -38,15 +38,15 @@ class QosSpec(Part):
         check(one_of("volatile", "transient_local"), optional=True),
     ] = Field(
         default=None,
-        description="Whether late subscriptions get what was played before.",
+        description="Whether late subscriptions receive earlier messages.",
         examples=["transient_local"],
     )
     history: Annotated[
         Literal["keep_last", "keep_all"] | None,
         check(one_of("keep_last", "keep_all"), optional=True),
-    ] = Field(default=None, description="How much is kept for these.", examples=["keep_last"])
+    ] = Field(default=None, description="Which earlier messages are kept.", examples=["keep_last"])
     depth: Annotated[int | None, check(whole(1, 2**31 - 1), optional=True)] = Field(
-        default=None, description="How many messages `keep_last` keeps.", examples=[10]
+        default=None, description="Number of messages that `keep_last` keeps.", examples=[10]
     )
 
     def values(self) -> dict[str, str | int]:
@@ -68,7 +68,7 @@ attach(
 
 def _check_qos(value: object) -> object:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of topics to QoS, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of topics to QoS, got {describe(value)}")
     check_names(value, check_glob)
     return value
 
@@ -77,14 +77,14 @@ def _check_loop(value: object) -> bool | int:
     if isinstance(value, bool):
         return value
     if not isinstance(value, int):
-        raise Problem(f"expected true, false or how often it plays, got {describe(value)}")
+        raise JobProblem(f"expected true, false or how often it plays, got {describe(value)}")
     return whole(1)(value)
 
 
 attach(_check_loop, schema={"anyOf": [{"type": "boolean"}, {"type": "integer", "minimum": 1}]})
 
 
-class BagSpec(Part):
+class BagSpec(JobPart):
     """One entry of ``bags:``.
 
     ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
@@ -98,45 +98,44 @@ class BagSpec(Part):
     }
 
     path: Annotated[str, check(check_path)] = Field(
-        description="The bag: its folder, or one `.mcap` or `.db3` file.",
+        description="The folder, `.mcap` or `.db3` file.",
         examples=["../bags/outdoor"],
     )
     topics: Globs = Field(
         default=(),
-        description="Play only these, globs in which `*` matches `/` too. Without it, all.",
+        description="Topics to play, as globs. Default: all.",
         examples=[["/imu/*", "/odom"]],
     )
     exclude: Globs = Field(
-        default=(), description="Do not play these, globs.", examples=[["/tf", "/camera/*"]]
+        default=(), description="Topics not to play, as globs.", examples=[["/tf", "/camera/*"]]
     )
     start_offset_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="start_offset",
-        description="Skip this much of the beginning, counted from the bag's first message.",
+        description="Skip this much from the first message on.",
         examples=["5s"],
     )
     duration_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="duration",
-        description="Play only this much of the bag from there on, in recorded time.",
+        description="Play only this much recorded time.",
         examples=["30s"],
     )
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="Simulated time at which its first message plays. Without it, the recorded "
-        "one. Stamps within messages stay as they are.",
+        description="Simulated time of the first message. Default: the recorded time. Header "
+        "stamps do not change.",
         examples=["0s"],
     )
     rate: Annotated[float, check(number(0, open_below=True))] = Field(
         default=1.0,
-        description="How many times as fast as recorded it plays.",
+        description="Speed factor.",
         examples=[0.5],
     )
     loop: Annotated[bool | int, check(_check_loop)] = Field(
         default=False,
-        description="How many times it plays; `true` means forever, which needs a `stop`. Each "
-        "pass begins when the last message of the pass before it plays.",
+        description="Number of passes; `true` repeats forever and needs a `stop`.",
         examples=[True, 3],
     )
     by: Annotated[
@@ -144,20 +143,18 @@ class BagSpec(Part):
         check(one_of("log_time", "publish_time", "header_stamp")),
     ] = Field(
         default="log_time",
-        description="Which time says when a message plays: when it was recorded, when it was "
-        "published (MCAP only), or the stamp of its header. A message without one (no header, or "
-        "0) plays by its log time.",
+        description="The time that a message plays at: log time, publish time (MCAP only), or "
+        "header stamp. Messages without a stamp use the log time.",
         examples=["header_stamp"],
     )
     remappings: Annotated[dict[str, str], check(_check_bag_remappings)] = Field(
         default_factory=dict,
-        description="Recorded topics that play under another name.",
+        description="Topics that play under another name.",
         examples=[{"/scan": "/lidar/scan"}],
     )
     qos: Annotated[dict[str, QosSpec], check(_check_qos)] = Field(
         default_factory=dict,
-        description="QoS by recorded topic, a glob, in place of the recorded one; the first glob "
-        "that matches counts.",
+        description="QoS by topic glob, replacing the recorded one. The first match counts.",
         examples=[{"/map": {"durability": "transient_local", "depth": 1}}],
     )
 
@@ -186,5 +183,7 @@ class BagSpec(Part):
     @classmethod
     def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if not value and from_file(info):
-            raise Problem("an empty list would play nothing: leave the key out to play all topics")
+            raise JobProblem(
+                "an empty list would play nothing: leave the key out to play all topics"
+            )
         return value

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -19,7 +19,7 @@ from rsltrace.job.values.checks import (
     text,
 )
 from rsltrace.job.values.names import check_node_glob, check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike
 
@@ -30,49 +30,45 @@ MEASURES = ("latency", "age", "last_age", "reaction", "worst_reaction")
 Topic = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
-class LatencySpec(Part):
-    """What data takes through a chain stays below a time. The chain is given by ``start`` (in a
-    file: ``from``) and ``end`` (``to``), or by all of its topics (``chain``)."""
+class LatencySpec(JobPart):
+    """A limit of an end-to-end latency. Give ``from`` and ``to``, or all topics of the chain."""
 
     TIMES: ClassVar[dict[str, str]] = {"below": "below_ns"}
 
     start: Topic = Field(
         default=None,
         alias="from",
-        description="The topic of the inputs.",
+        description="First topic of the chain.",
         examples=["/scan"],
     )
     end: Topic = Field(
         default=None,
         alias="to",
-        description="The topic of the outputs, or the node whose callback is the end.",
+        description="Last topic of the chain, or a node.",
         examples=["/cmd_vel"],
     )
     chain: Annotated[tuple[str, ...], check(items(text(check_topic)))] = Field(
         default=(),
-        description="All topics of the chain, instead of `from` and `to`.",
+        description="All topics, instead of `from` and `to`.",
         examples=[["/scan", "/objects", "/cmd_vel"]],
     )
     via: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
         default=(),
-        description="Nodes (globs) that make use of the last message that they received, as a "
-        "timer does that samples.",
+        description="Nodes (globs) that sample: their outputs depend on the last message received.",
         examples=[["/controller"]],
     )
     measure: Annotated[str, check(one_of(*MEASURES))] = Field(
         default="latency",
-        description="What has to be below: the `latency`, the `age` of data (`last_age`: until the "
-        "next output), the `reaction` to an input (`worst_reaction`: to what happens right after "
-        "the input before), as `docs/latency.md` defines them.",
+        description="What to measure, defined in `docs/latency.md`.",
         examples=["age"],
     )
     below_ns: Annotated[int, check(positive_time)] = Field(
-        alias="below", description="What all of them have to be below.", examples=["50ms"]
+        alias="below", description="The upper limit.", examples=["50ms"]
     )
     quantile: Annotated[float | None, check(number(0, 100, open_below=True), optional=True)] = (
         Field(
             default=None,
-            description="Percentage of them that has to be; without it, all.",
+            description="Percentage that has to meet the limit. Default: all.",
             examples=[99],
         )
     )
@@ -80,13 +76,13 @@ class LatencySpec(Part):
     @model_validator(mode="after")
     def _says_which_chain(self) -> LatencySpec:
         if self.chain and (self.start is not None or self.end is not None):
-            raise Problem("give either chain, or from and to", ("chain",))
+            raise JobProblem("give either chain, or from and to", ("chain",))
         if not self.chain and (self.start is None or self.end is None):
-            raise Problem("which chain? Give from and to, or chain")
+            raise JobProblem("which chain? Give from and to, or chain")
         if self.chain and len(self.chain) < 2:
-            raise Problem("a chain has two topics at least", ("chain",))
+            raise JobProblem("a chain has two topics at least", ("chain",))
         if self.start is not None and self.start == self.end:
-            raise Problem("from and to are the same topic; give a loop as a chain", ("to",))
+            raise JobProblem("from and to are the same topic; give a loop as a chain", ("to",))
         return self
 
     @property
@@ -107,7 +103,7 @@ def check_metric_name(name: str) -> None:
 check_metric_name.pattern = r"\S"  # type: ignore[attr-defined]
 
 
-class MetricSpec(Part):
+class MetricSpec(JobPart):
     """One number. Exactly one of ``expression`` and ``function``; a text alone is an
     ``expression``."""
 
@@ -115,19 +111,16 @@ class MetricSpec(Part):
 
     expression: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="What it is worth for a finished run, as in `rsltrace bisect --check`: "
-        '`last("/odom").pose.pose.position.x`, `count("/stop")`, '
-        '`max(m.data for m in messages("/error"))`, `end`.',
+        description="Expression over the finished run, as in `rsltrace bisect --check`.",
         examples=['last("/odom").pose.pose.position.x'],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function that gets the finished trace (`rsltrace.Trace`) and returns the "
-        "number, or `None` if there is none.",
+        description="Function of the finished `rsltrace.Trace` that returns the number or `None`.",
         examples=["my_robot.metrics:energy"],
     )
     unit: Annotated[str | None, check(text(), optional=True)] = Field(
-        default=None, description="Unit of the number, to be shown beside it.", examples=["m"]
+        default=None, description="Unit, for reports.", examples=["m"]
     )
 
     if TYPE_CHECKING:
@@ -143,7 +136,7 @@ class MetricSpec(Part):
     @model_validator(mode="after")
     def _says_one_thing(self) -> MetricSpec:
         if (self.expression is None) == (self.function is None):
-            raise Problem("give expression or function")
+            raise JobProblem("give expression or function")
         return self
 
 
@@ -155,12 +148,12 @@ def _rate(value: object) -> float:
     found = _RATE.fullmatch(value) if isinstance(value, str) else None
     if found is None:
         if isinstance(value, str):
-            raise Problem(f"expected a rate (9 Hz), got {describe(value)}")
+            raise JobProblem(f"expected a rate (9 Hz), got {describe(value)}")
         return float(_positive(value))
     try:
         return float(_positive(float(found[1])))
     except ValueError:
-        raise Problem(f"expected a rate above 0 (9 Hz), got {describe(value)}") from None
+        raise JobProblem(f"expected a rate above 0 (9 Hz), got {describe(value)}") from None
 
 
 attach(
@@ -176,8 +169,8 @@ attach(
 Condition = Annotated[str | None, check(text(), optional=True)]
 
 
-class CheckSpec(Part):
-    """One thing that has to be true of a run. Exactly one of ``always``, ``never``,
+class CheckSpec(JobPart):
+    """One property of the run. Exactly one of ``always``, ``never``,
     ``eventually``, ``rate``, ``latency`` and ``function``."""
 
     TIMES: ClassVar[dict[str, str]] = {"within": "within_ns", "over": "over_ns"}
@@ -192,54 +185,51 @@ class CheckSpec(Part):
 
     name: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="What the check is called in reports. Without it, what it says.",
+        description="Name of the check in reports.",
         examples=["stays on the map"],
     )
     always: Condition = Field(
         default=None,
-        description="Must hold for every message: `/topic: EXPRESSION` over its fields, or "
-        "`/topic.field < 10`. What a breakpoint of the debugger can say of messages, a check can.",
+        description="Must be true of every message: `/topic: EXPRESSION` or `/topic.field < 10`.",
         examples=["/odom.pose.pose.position.x < 10", "/scan: min(ranges) > 0.1"],
     )
     never: Condition = Field(
         default=None,
-        description="Must not happen: a message, a message of which an expression is true, a log "
-        "record (`log error`, `log warn too far`), an exception, a finding of the guard.",
+        description="Must not happen: a message, an expression over its fields, a log record, an "
+        "exception, a finding of the guard.",
         examples=["/cmd_vel.linear.x > 1.5", "log error"],
     )
     eventually: Condition = Field(
         default=None,
-        description="Has to happen `within` a time of the start (or before the end) or, with "
-        "`after`, each time after that has happened.",
+        description="Must happen `within` a time of the start, or of each `after`.",
         examples=["/goal_reached.data"],
     )
     rate: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
         default=None,
-        description="Topic whose messages come `at_least` or `at_most` so often, counted `over` a "
-        "time after each message.",
+        description="Topic whose rate must be `at_least` or `at_most` a value, counted `over` a "
+        "time.",
         examples=["/scan"],
     )
     latency: Annotated[LatencySpec | None, given] = Field(
         default=None,
-        description="How long data may take through a chain of topics: see `docs/latency.md`.",
+        description="Limit of an end-to-end latency.",
         examples=[{"from": "/scan", "to": "/cmd_vel", "below": "50ms", "quantile": 99}],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function that gets the finished trace (`rsltrace.Trace`). It returns nothing "
-        "or `True` if all is well, `False` or a text if not, or a list of `(event, text)`; an "
-        "`AssertionError` is what is wrong.",
+        description="Function of the finished `rsltrace.Trace`. It returns `None` or `True` if "
+        "all is well; else `False`, a text, or a list of `(event, text)`.",
         examples=["my_robot.checks:no_collision"],
     )
     after: Condition = Field(
         default=None,
-        description="The check applies from each time that this has happened.",
+        description="The check applies after each time that this happens.",
         examples=["/stop", "/scan: min(ranges) < 0.3"],
     )
     within_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="within",
-        description="How long the check applies: from `after`, or from the start of the run.",
+        description="How long the check applies after that, or after the start.",
         examples=["200ms"],
     )
     at_least: Annotated[float | None, check(_rate, optional=True)] = Field(
@@ -251,7 +241,7 @@ class CheckSpec(Part):
     over_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="over",
-        description="For how long messages are counted; without it, one second.",
+        description="Window in which messages are counted. Default: one second.",
         examples=["500ms"],
     )
 
@@ -286,10 +276,10 @@ class CheckSpec(Part):
         given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.KINDS)}: {what}")
+            raise JobProblem(f"give one of {', '.join(self.KINDS)}: {what}")
         (kind,) = given
         if kind == "rate" and self.at_least is None and self.at_most is None:
-            raise Problem("how often? Give at_least or at_most (9 Hz)", ("rate",))
+            raise JobProblem("how often? Give at_least or at_most (9 Hz)", ("rate",))
         for keys, kinds in (
             (("after", "within_ns"), ("always", "never", "eventually")),
             (("at_least", "at_most", "over_ns"), ("rate",)),
@@ -297,5 +287,5 @@ class CheckSpec(Part):
             for key in keys:
                 if getattr(self, key) is not None and kind not in kinds:
                     named = key.removesuffix("_ns")
-                    raise Problem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
+                    raise JobProblem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
         return self

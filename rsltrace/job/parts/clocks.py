@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -20,7 +20,7 @@ from rsltrace.job.values.checks import (
     text,
 )
 from rsltrace.job.values.names import check_node_glob
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
 
 DRIFT_MAX_PPM = 100_000
@@ -45,7 +45,7 @@ def parse_interval(value: object) -> int:
     """Return a mean time between jumps: each jump of a run is drawn and kept."""
     time_ns = parse_time(value)
     if time_ns < JUMPS_EVERY_NS_MIN:
-        raise Problem("must be at least 1ms")
+        raise JobProblem("must be at least 1ms")
     return time_ns
 
 
@@ -57,9 +57,11 @@ def parse_ppm(value: object) -> float:
             raise ValueError
         ppm = float(bare)
     except ValueError:
-        raise Problem(f"expected parts per million such as 50ppm, got {describe(value)}") from None
+        raise JobProblem(
+            f"expected parts per million such as 50ppm, got {describe(value)}"
+        ) from None
     if not -DRIFT_MAX_PPM <= ppm <= DRIFT_MAX_PPM:
-        raise Problem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
+        raise JobProblem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
     return ppm
 
 
@@ -71,21 +73,21 @@ attach(parse_interval, schema=TIME_SCHEMA)
 attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "pattern": "ppm\\s*$"}]})
 
 
-class JumpSpec(Part):
-    """A clock is set: when, and by how much."""
+class JumpSpec(JobPart):
+    """A jump of a clock."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
     LISTED: ClassVar[tuple[str, ...]] = ("at", "by")
 
     at_ns: Annotated[int, check(parse_time)] = Field(
-        alias="at", description="When, since the start of the run.", examples=["5s"]
+        alias="at", description="Time since the start.", examples=["5s"]
     )
     by_ns: Annotated[int, check(parse_signed_time)] = Field(
-        alias="by", description="How far; backwards if negative.", examples=["100ms", "-1s"]
+        alias="by", description="Size; negative is backwards.", examples=["100ms", "-1s"]
     )
 
 
-class RandomJumpsSpec(Part):
+class RandomJumpsSpec(JobPart):
     """Jumps at random times (a Poisson process) of random size (uniform), from the job's seed."""
 
     TIMES: ClassVar[dict[str, str]] = {"every": "every_ns", "most": "most_ns"}
@@ -94,52 +96,50 @@ class RandomJumpsSpec(Part):
         alias="every", description="Mean time between two jumps.", examples=["10s"]
     )
     most_ns: Annotated[int, check(positive_time)] = Field(
-        alias="most", description="Largest size, forwards or backwards.", examples=["50ms"]
+        alias="most", description="Largest size, in either direction.", examples=["50ms"]
     )
 
 
-class ClockSpec(Part):
-    """The clock of some nodes, compared with simulated time."""
+class ClockSpec(JobPart):
+    """How the clock of some nodes differs from simulated time."""
 
     TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
 
     node: Annotated[str, check(text(check_node_glob))] = Field(
         default="*",
-        description="Node, a glob; the first entry that fits counts.",
+        description="Node glob. The first match counts.",
         examples=["/lidar"],
     )
     advances: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether each look at a ROS clock shows a nanosecond more than the one before "
-        "it at the same time, though never the time of the next event. Otherwise ROS clocks stand "
-        "still throughout a callback.",
+        description="Whether each reading of a ROS clock advances it by a nanosecond. By default "
+        "it stands still during a callback.",
         examples=[True],
     )
     source: Annotated[Literal["run", "topic"], check(one_of("run", "topic"))] = Field(
         default="run",
-        description="What drives ROS time where `use_sim_time` is on: the `run` itself, or the "
-        "`topic` /clock (and `set_ros_time_override`), as natively: then it stands at 0 until the "
-        "first message, and timers of the ROS clock wait for it, too.",
+        description="What drives ROS time with `use_sim_time`: the `run`, or the `topic` /clock, "
+        "with time 0 before its first message.",
         examples=["topic"],
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(
         default=0,
         alias="offset",
-        description="How far it is ahead; behind if negative.",
+        description="How far it is ahead of simulated time.",
         examples=["-20ms"],
     )
     drift_ppm: Annotated[float, check(parse_ppm)] = Field(
         default=0.0,
         alias="drift",
-        description="How much too fast it is, in parts per million since the start of the run.",
+        description="Drift in parts per million since the start.",
         examples=["50ppm"],
     )
     jumps: Annotated[tuple[JumpSpec, ...], parts()] = Field(
-        default=(), description="When it is set.", examples=[[{"at": "5s", "by": "100ms"}]]
+        default=(), description="When it jumps.", examples=[[{"at": "5s", "by": "100ms"}]]
     )
     random_jumps: Annotated[RandomJumpsSpec | None, given] = Field(
         default=None,
-        description="It is set now and then.",
+        description="Jumps at random times.",
         examples=[{"every": "10s", "most": "50ms"}],
     )
 
@@ -147,7 +147,7 @@ class ClockSpec(Part):
     def _jumps_in_order(self) -> ClockSpec:
         for index in range(1, len(self.jumps)):
             if self.jumps[index].at_ns < self.jumps[index - 1].at_ns:
-                raise Problem("it is before the jump above", ("jumps", index, "at"))
+                raise JobProblem("it is before the jump above", ("jumps", index, "at"))
         return self
 
     def drift(self) -> Fraction:
@@ -160,7 +160,7 @@ def _clocks(value: object) -> object:
     if isinstance(value, dict):
         return (value,)
     if not isinstance(value, (list, tuple)):
-        raise Problem(
+        raise JobProblem(
             "expected a list of clocks, or what is different about all of them "
             f"(advances: true), got {describe(value)}"
         )

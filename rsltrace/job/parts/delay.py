@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import (
     check,
     given,
@@ -20,13 +20,13 @@ from rsltrace.job.values.checks import (
 )
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_glob, check_node_glob, check_service_glob
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import parse_time
 
 Probability = Annotated[float, check(number(0, 1))]
 
 
-class BurstSpec(Part):
+class BurstSpec(JobPart):
     """Loss in bursts, after Gilbert and Elliott: a good and a bad state, probabilities per message.
 
     A burst lasts 1 / ``bad_to_good`` messages on average.
@@ -47,15 +47,14 @@ class BurstSpec(Part):
 
 
 class DelaySpec(DistributionSpec):
-    """What happens to messages on their way. A plain time stands for ``{constant: time}``."""
+    """Delay and loss of messages. A plain time stands for ``{constant: time}``."""
 
     TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns", "retransmit": "retransmit_ns"}
     NEEDS_ONE: ClassVar[bool] = False
 
     drop: Probability = Field(
         default=0.0,
-        description="Probability that a message is lost. Where publisher and subscription are "
-        "reliable it is sent again, `retransmit` later.",
+        description="Probability of loss. Reliable messages are sent again `retransmit` later.",
         examples=[0.01],
     )
     burst: Annotated[BurstSpec | None, given] = Field(
@@ -70,19 +69,19 @@ class DelaySpec(DistributionSpec):
     )
     keep_order: bool = Field(
         default=True,
-        description="A message never overtakes an earlier one of its link, as in DDS.",
+        description="Whether messages of a link stay in order, as in DDS.",
         examples=[False],
     )
     retransmit_ns: Annotated[int, check(positive_time)] = Field(
         default=10_000_000,
         alias="retransmit",
-        description="What each loss costs where reliable messages are sent again.",
+        description="Extra delay of a reliable message for each loss.",
         examples=["10ms"],
     )
 
 
 class LinkSpec(DelaySpec):
-    """A delay for the links from some publishers to some subscriptions."""
+    """Delay from some publishers to some subscriptions."""
 
     topic: Annotated[str, check(text(check_glob))] = Field(
         default="*", description="Topic, a glob.", examples=["/scan"]
@@ -98,8 +97,8 @@ class LinkSpec(DelaySpec):
     )
 
 
-class OutageSpec(Part):
-    """A topic, a service or a whole node is cut off for some time."""
+class OutageSpec(JobPart):
+    """A topic, service or node is cut off for some time."""
 
     TIMES: ClassVar[dict[str, str]] = {"from": "from_ns", "to": "to_ns"}
 
@@ -113,20 +112,20 @@ class OutageSpec(Part):
         default=None, description="Node that is cut off, a glob.", examples=["/lidar"]
     )
     from_ns: Annotated[int, check(parse_time)] = Field(
-        alias="from", description="When it begins, since the start of the run.", examples=["10s"]
+        alias="from", description="Begin, since the start.", examples=["10s"]
     )
     to_ns: Annotated[int, check(parse_time)] = Field(
-        alias="to", description="When it ends, since the start of the run.", examples=["12s"]
+        alias="to", description="End, since the start.", examples=["12s"]
     )
 
     @model_validator(mode="after")
     def _one_thing(self) -> OutageSpec:
         if sum(name is not None for name in (self.topic, self.service, self.node)) != 1:
-            raise Problem("give one of topic, service or node")
+            raise JobProblem("give one of topic, service or node")
         if self.to_ns < self.from_ns:
-            raise Problem("the outage ends before it begins", ("to",))
+            raise JobProblem("the outage ends before it begins", ("to",))
         if self.to_ns == self.from_ns:
-            raise Problem("the outage ends when it begins: 'to' has to be later", ("to",))
+            raise JobProblem("the outage ends when it begins: 'to' has to be later", ("to",))
         return self
 
     @property
@@ -139,42 +138,41 @@ class OutageSpec(Part):
         raise AssertionError("checked when it was made")
 
 
-class DelaysSpec(Part):
-    """Delays and losses. Of ``links`` the first that fits counts, then ``topics`` (an exact name
-    before globs, globs in order), then ``file``, then ``default``."""
+class DelaysSpec(JobPart):
+    """Delays and losses: the first match among ``links``, ``topics`` (exact names before globs),
+    ``file`` and ``default``."""
 
     MEANT: ClassVar[str] = "default"
 
     default: Annotated[DelaySpec | None, part("constant")] = Field(
         default=None,
-        description="For every topic (except /rosout and /parameter_events) and service without a "
-        "model of its own.",
+        description="Default for topics (except /rosout and /parameter_events) and services.",
         examples=["1ms"],
     )
     topics: Annotated[dict[str, DelaySpec], named_parts("constant", check_glob)] = Field(
         default_factory=dict,
-        description="By topic, a glob. Each link of a topic draws from a stream of its own.",
+        description="By topic glob.",
         examples=[{"/scan": {"constant": "5ms"}}],
     )
     links: Annotated[tuple[LinkSpec, ...], parts()] = Field(
         default=(),
-        description="From some publishers to some subscriptions.",
+        description="Between certain publishers and subscriptions.",
         examples=[[{"topic": "/scan", "to": "/slam", "constant": "20ms"}]],
     )
     services: Annotated[dict[str, DelaySpec], named_parts("constant", check_service_glob)] = Field(
         default_factory=dict,
-        description="By service, a glob; for requests and responses alike.",
+        description="By service glob, for requests and responses.",
         examples=[{"/set_mode": "2ms"}],
     )
     outages: Annotated[tuple[OutageSpec, ...], parts()] = Field(
         default=(),
-        description="Who is cut off when. Best-effort messages are lost; reliable ones wait, as "
-        "many as the publisher's history holds.",
+        description="Outages. Best-effort messages are lost; reliable ones wait in the "
+        "publisher's history.",
         examples=[[{"node": "/lidar", "from": "10s", "to": "12s"}]],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A delay file of RSLCPP (CSV), with FIXED delays by topic.",
+        description="Delay file of RSLCPP (CSV) with FIXED delays.",
         examples=["delays.csv"],
     )
 
@@ -183,5 +181,5 @@ class DelaysSpec(Part):
         for name, model in self.services.items():
             if model.duplicate:
                 place = ("services", name, "duplicate")
-                raise Problem("requests and responses of services never arrive twice", place)
+                raise JobProblem("requests and responses of services never arrive twice", place)
         return self

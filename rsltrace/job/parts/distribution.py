@@ -7,10 +7,10 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
 from rsltrace.job.values.mappings import check_path
-from rsltrace.job.values.problem import Loc, Problem
+from rsltrace.job.values.problem import JobProblem, Loc
 from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
 from rsltrace.simulation.chance.distribution import LONGEST_NS
 
@@ -32,8 +32,8 @@ def check_short(time_ns: int, shown: object) -> int:
 attach(parse_short_time, schema=TIME_SCHEMA)
 
 
-class UniformSpec(Part):
-    """Evenly between two bounds."""
+class UniformSpec(JobPart):
+    """Uniform between two bounds."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
     TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
@@ -48,11 +48,11 @@ class UniformSpec(Part):
     @model_validator(mode="after")
     def _in_order(self) -> UniformSpec:
         if self.max_ns < self.min_ns:
-            raise Problem("max is less than min", ("max",))
+            raise JobProblem("max is less than min", ("max",))
         return self
 
 
-class NormalSpec(Part):
+class NormalSpec(JobPart):
     """Normal, truncated at zero: negative values are drawn again."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("mean", "sd")
@@ -66,7 +66,7 @@ class NormalSpec(Part):
     )
 
 
-class LognormalSpec(Part):
+class LognormalSpec(JobPart):
     """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
@@ -93,7 +93,7 @@ class LognormalSpec(Part):
         return self
 
 
-class GammaSpec(Part):
+class GammaSpec(JobPart):
     """Gamma: by mean and standard deviation, or by shape and scale."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
@@ -118,8 +118,8 @@ class GammaSpec(Part):
         return self
 
 
-class SamplesSpec(Part):
-    """Measured values, each as likely as the others: listed here, or in a file."""
+class SamplesSpec(JobPart):
+    """Measured values with equal probabilities, in a list or a file."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("values",), ("file", "unit"))
     MEANT: ClassVar[str] = "values"
@@ -132,28 +132,26 @@ class SamplesSpec(Part):
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A text file with one value per line, rounded to nanoseconds; empty lines and "
-        "# comments are skipped.",
+        description="Text file with one value per line.",
         examples=["delays.txt"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
         default="s",
-        description="Unit of the values in the file that have none.",
+        description="Unit of values without one.",
         examples=["ms"],
     )
 
     @model_validator(mode="after")
     def _one_source(self) -> SamplesSpec:
         if (self.values_ns is None) == (self.file is None):
-            raise Problem("give either values or a file")
+            raise JobProblem("give either values or a file")
         if self.values_ns == ():
-            raise Problem("an empty list has nothing to draw from", ("values",))
+            raise JobProblem("an empty list has nothing to draw from", ("values",))
         return self
 
 
-class EmpiricalSpec(Part):
-    """A table of quantiles: how many percent of all values are at most this; what lies between two
-    lines of it is evenly spread."""
+class EmpiricalSpec(JobPart):
+    """A table of quantiles with linear interpolation."""
 
     MEANT: ClassVar[str] = "values"
     MEANT_LIST: ClassVar[bool] = True
@@ -166,8 +164,8 @@ class EmpiricalSpec(Part):
     percent: Annotated[tuple[float, ...] | None, check(items(number(0, 100)), optional=True)] = (
         Field(
             default=None,
-            description="Of each value, the percentage of all that do not exceed it: from 0 to "
-            "100. Without it they are equally far apart.",
+            description="Percentage of samples up to each value, 0 to 100. Default: equally "
+            "spaced.",
             examples=[[0, 90, 100]],
         )
     )
@@ -176,37 +174,37 @@ class EmpiricalSpec(Part):
     def _a_table(self) -> EmpiricalSpec:
         values, percent = self.values_ns, self.percent
         if len(values) < 2:
-            raise Problem("a table needs two values at least, the least and the greatest")
+            raise JobProblem("a table needs two values at least, the least and the greatest")
         for index in range(1, len(values)):
             if values[index] < values[index - 1]:
-                raise Problem("it is less than the one before", ("values", index))
+                raise JobProblem("it is less than the one before", ("values", index))
         if percent is None:
             return self
         if len(percent) != len(values):
-            raise Problem(f"{len(values)} values need as many, got {len(percent)}", ("percent",))
+            raise JobProblem(f"{len(values)} values need as many, got {len(percent)}", ("percent",))
         for index, expected in ((0, 0), (len(percent) - 1, 100)):
             if percent[index] != expected:
-                raise Problem(
+                raise JobProblem(
                     f"expected {expected}, of the {'greatest' if index else 'least'} value",
                     ("percent", index),
                 )
         for index in range(1, len(percent)):
             if percent[index] <= percent[index - 1]:
-                raise Problem("it is not more than the one before", ("percent", index))
+                raise JobProblem("it is not more than the one before", ("percent", index))
         return self
 
 
 def _check_point(value: object) -> tuple[int, int]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise Problem("expected a pair: [time since the start, value]")
+        raise JobProblem("expected a pair: [time since the start, value]")
     return parse_time(value[0]), parse_short_time(value[1])
 
 
 attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 2, "maxItems": 2})
 
 
-class SeriesSpec(Part):
-    """A value that changes over time: listed here, or in a file."""
+class SeriesSpec(JobPart):
+    """Values over time, in a list or a file."""
 
     OF_TIMES: ClassVar[tuple[str, ...]] = ("points",)
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("points",), ("file", "unit"))
@@ -217,53 +215,52 @@ class SeriesSpec(Part):
         tuple[tuple[int, int], ...] | None, check(items(_check_point), optional=True)
     ] = Field(
         default=None,
-        description="Pairs [time since the start of the run, value], in order of time.",
+        description="Pairs of time since the start and value.",
         examples=[[["0s", "1ms"], ["60s", "20ms"]]],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A CSV file with two columns: time since the start, value. A first line "
-        "without numbers is a header.",
+        description="CSV file with two columns: time since the start, value.",
         examples=["link.csv"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
-        default="s", description="Unit of the numbers in the file that have none.", examples=["s"]
+        default="s", description="Unit of numbers without one.", examples=["s"]
     )
     steps: bool = Field(
         default=False,
-        description="Hold each value until the next point instead of interpolating.",
+        description="Hold each value instead of interpolating.",
         examples=[True],
     )
 
     @model_validator(mode="after")
     def _one_source(self) -> SeriesSpec:
         if (self.points is None) == (self.file is None):
-            raise Problem("give either points or a file")
+            raise JobProblem("give either points or a file")
         if self.points is not None:
             check_series(self.points)
         return self
 
 
 def check_series(points: tuple[tuple[int, int], ...]) -> None:
-    """Raise ``Problem`` unless there are points, in order of time."""
+    """Raise ``JobProblem`` unless there are points, in order of time."""
     if not points:
-        raise Problem("a series needs at least one point", ("points",))
+        raise JobProblem("a series needs at least one point", ("points",))
     for index in range(1, len(points)):
         if points[index][0] <= points[index - 1][0]:
-            raise Problem("its time is not after that of the point before", ("points", index))
+            raise JobProblem("its time is not after that of the point before", ("points", index))
 
 
-class DistributionSpec(Part):
+class DistributionSpec(JobPart):
     """A time: constant, random, or changing. Exactly one of the keys."""
 
     TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
 
     constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
-        default=None, alias="constant", description="Always this.", examples=["5ms"]
+        default=None, alias="constant", description="Constant.", examples=["5ms"]
     )
     uniform: Annotated[UniformSpec | None, given] = Field(
         default=None,
-        description="Evenly between two bounds.",
+        description="Uniform.",
         examples=[{"min": "1ms", "max": "3ms"}],
     )
     normal: Annotated[NormalSpec | None, given] = Field(
@@ -281,17 +278,17 @@ class DistributionSpec(Part):
     )
     samples: Annotated[SamplesSpec | None, given] = Field(
         default=None,
-        description="One of some measured values.",
+        description="Random choice of measured values.",
         examples=[{"file": "delays.txt", "unit": "ms"}],
     )
     empirical: Annotated[EmpiricalSpec | None, given] = Field(
         default=None,
-        description="A table of quantiles: what `rsltrace fit` writes.",
+        description="Table of quantiles, from `rsltrace fit`.",
         examples=[{"values": ["1ms", "1.2ms", "4ms"], "percent": [0, 90, 100]}],
     )
     series: Annotated[SeriesSpec | None, given] = Field(
         default=None,
-        description="A value that changes over time.",
+        description="Values over time.",
         examples=[{"points": [["0s", "1ms"], ["60s", "20ms"]]}],
     )
 
@@ -312,9 +309,11 @@ class DistributionSpec(Part):
     def _one_kind(self) -> DistributionSpec:
         given = self.kinds()
         if len(given) > 1:
-            raise Problem(f"give one of {' and '.join(given)}, not both", (given[1],), at_key=True)
+            raise JobProblem(
+                f"give one of {' and '.join(given)}, not both", (given[1],), at_key=True
+            )
         if not given and self.NEEDS_ONE:
-            raise Problem(f"give one of {', '.join(self.KINDS)}")
+            raise JobProblem(f"give one of {', '.join(self.KINDS)}")
         return self
 
     def kinds(self) -> list[str]:
@@ -323,16 +322,16 @@ class DistributionSpec(Part):
         return [kind for kind in self.KINDS if values[kind] is not None]
 
 
-def _either(part: Part, one: tuple[str, ...], other: tuple[str, ...]) -> None:
+def _either(part: JobPart, one: tuple[str, ...], other: tuple[str, ...]) -> None:
     values = {key: getattr(part, part.TIMES.get(key, key)) for key in (*one, *other)}
     given = {key for key, value in values.items() if value is not None}
     if given not in (set(one), set(other)):
-        raise Problem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
+        raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
 
 
 def files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
     """Yield (place, path) of every ``file`` in a part, however deep."""
-    if isinstance(value, Part):
+    if isinstance(value, JobPart):
         for name, field in type(value).model_fields.items():
             inner = getattr(value, name)
             place = (*loc, field.alias or name)

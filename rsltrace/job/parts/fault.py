@@ -6,19 +6,19 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, number, text, whole
 from rsltrace.job.values.field_path import check_field, field_value
 from rsltrace.job.values.names import check_node_glob, check_topic
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.times import TimeLike, parse_time
 
 _HUGE = 1.7976931348623157e308
 FullName = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
-class FaultSpec(Part):
-    """One thing that goes wrong. Exactly one of ``crash``, ``hang`` and ``restart`` (a node, and
+class FaultSpec(JobPart):
+    """One fault. Exactly one of ``crash``, ``hang`` and ``restart`` (a node, and
     when: ``at``, ``event``, or ``message`` of a ``topic``), of ``drop``, ``duplicate`` and
     ``delay`` (a topic, and which ``message``), or of ``change``, ``swap`` and ``repeat`` (a topic
     that bags play, and which ``message`` of theirs)."""
@@ -32,120 +32,114 @@ class FaultSpec(Part):
 
     crash: FullName = Field(
         default=None,
-        description="Node that is gone at once, with the process it is in (all that its entry of "
-        "`nodes` has made): no `finally` block and no exit handler runs.",
+        description="Node whose process ends at once, without `finally` blocks and exit handlers.",
         examples=["/planner"],
     )
     hang: FullName = Field(
         default=None,
-        description="Node that does nothing any more, with the process it is in, for some time "
-        "(`for`) or up to the end. What arrives meanwhile waits in its queues.",
+        description="Node whose process does nothing for some time (`for`) or to the end. Its "
+        "queues fill meanwhile.",
         examples=["/planner"],
     )
     restart: FullName = Field(
         default=None,
-        description="Node that crashes and is made anew at once, or some time (`for`) later.",
+        description="Node that crashes and starts again, at once or after `for`.",
         examples=["/planner"],
     )
     drop: FullName = Field(
         default=None,
-        description="Topic of which one message is lost, reliable or not.",
+        description="Topic of a lost message.",
         examples=["/scan"],
     )
     duplicate: FullName = Field(
         default=None,
-        description="Topic of which one message arrives twice, `by` some time apart.",
+        description="Topic of a message that arrives twice, `by` apart.",
         examples=["/scan"],
     )
     delay: FullName = Field(
         default=None,
-        description="Topic of which one message is late `by` some time; those that follow from its "
-        "publisher wait for it, as in DDS, unless the link's model says `keep_order: false`.",
+        description="Topic of a message that is late `by` some time. With `keep_order`, later "
+        "messages wait for it.",
         examples=["/scan"],
     )
     change: FullName = Field(
         default=None,
-        description="Topic that bags play, of which one message has another value in its `field`.",
+        description="Topic of a bag whose message has another value in `field`.",
         examples=["/scan"],
     )
     swap: FullName = Field(
         default=None,
-        description="Topic that bags play, of which one message and the next one change places.",
+        description="Topic of a bag whose message changes places with the next one.",
         examples=["/odom"],
     )
     repeat: FullName = Field(
         default=None,
-        description="Topic that bags play, of which one message is the one before it once more.",
+        description="Topic of a bag whose message repeats the one before.",
         examples=["/odom"],
     )
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="When it happens to a node, since the start of the run.",
+        description="Time of a node's fault, since the start.",
         examples=["2s"],
     )
     event: Annotated[int | None, check(whole(0), optional=True)] = Field(
         default=None,
-        description="The event after which it happens to a node: its number in the trace, from 0.",
+        description="Event after which it happens to a node.",
         examples=[1280],
     )
     topic: FullName = Field(
         default=None,
-        description="The topic after whose `message` it happens to a node.",
+        description="Topic after whose `message` it happens to a node.",
         examples=["/goal"],
     )
     message: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None,
-        description="Which message of the topic, from 1, in the order of publication, whoever has "
-        "published it; of those that bags play for `change`, `swap` and `repeat`.",
+        description="Which message of the topic, from 1, in the order of publication.",
         examples=[3],
     )
     for_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="for",
-        description="How long a node hangs (without it: up to the end), or is gone before it "
-        "starts again (without it: no time).",
+        description="How long a node hangs (default: to the end) or is gone (default: no time).",
         examples=["500ms"],
     )
     by_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="by",
-        description="How late a message is, or its second copy (without it: right after the "
-        "first).",
+        description="Delay of the message or its copy.",
         examples=["200ms"],
     )
     to: Annotated[str | None, check(text(check_node_glob), optional=True)] = Field(
         default=None,
-        description="The receivers that it happens to, a glob; the others get the message as it "
-        "is. Without it, all of them.",
+        description="Receivers it happens to, a glob. Default: all.",
         examples=["/slam"],
     )
 
     field: Annotated[str | None, check(text(check_field), optional=True)] = Field(
         default=None,
-        description="The field that changes: `[3]` is an item of an array, `[-1]` its last one, "
-        "`[*]` all of them.",
+        description="The field to change: `[3]` is an item of an array, `[-1]` the last one, "
+        "`[*]` all.",
         examples=["ranges[3]"],
     )
     value: Annotated[Any, check(field_value, optional=True)] = Field(
         default=None,
-        description="What the field is instead; `nan`, `inf` and `-inf` are numbers, too.",
+        description="New value; `nan`, `inf` and `-inf` are numbers.",
         examples=["nan"],
     )
     scale: Annotated[float | None, check(number(-_HUGE, _HUGE), optional=True)] = Field(
         default=None,
-        description="What the number in the field is multiplied by.",
+        description="Factor.",
         examples=[-1],
     )
     offset: Annotated[float | None, check(number(-_HUGE, _HUGE), optional=True)] = Field(
         default=None,
-        description="What is added to the number in the field.",
+        description="Summand.",
         examples=[0.5],
     )
     length: Annotated[int | None, check(whole(0), optional=True)] = Field(
         default=None,
-        description="How many items the array in the field has: it is cut, or its last one comes "
-        "again.",
+        description="New length of the array: it is cut, or the last item repeats.",
         examples=[0],
     )
 
@@ -209,7 +203,7 @@ class FaultSpec(Part):
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}: {what}")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}: {what}")
         for key, field, kinds in (
             ("at", self.at_ns, self.OF_NODES),
             ("event", self.event, self.OF_NODES),
@@ -220,40 +214,42 @@ class FaultSpec(Part):
             *((key, getattr(self, key), ("change",)) for key in ("field", *self.CHANGES)),
         ):
             if field is not None and self.kind not in kinds:
-                raise Problem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
+                raise JobProblem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
         self._says_when()
         self._says_what()
         if self.hang is not None and self.for_ns == 0:
-            raise Problem("must be more than 0; without it the node hangs up to the end", ("for",))
+            raise JobProblem(
+                "must be more than 0; without it the node hangs up to the end", ("for",)
+            )
         if self.delay is not None and not self.by_ns:
-            raise Problem("how late is the message? Give by: 200ms", ("delay",))
+            raise JobProblem("how late is the message? Give by: 200ms", ("delay",))
         return self
 
     def _says_what(self) -> None:
         if self.repeat is not None and self.message == 1:
-            raise Problem("there is no message before the first one", ("message",))
+            raise JobProblem("there is no message before the first one", ("message",))
         if self.change is None:
             return
         if self.field is None:
-            raise Problem(f"what changes? Give field: a field of {self.change}", ("change",))
+            raise JobProblem(f"what changes? Give field: a field of {self.change}", ("change",))
         given = [key for key in self.CHANGES if getattr(self, key) is not None]
         if len(given) != 1:
             what = f"{' and '.join(given)} are given" if given else "none is given"
-            raise Problem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
+            raise JobProblem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
 
     def _says_when(self) -> None:
         if not self.of_node:
             if self.message is None:
-                raise Problem(f"which message of {self.name}? Give message: 3", (self.kind,))
+                raise JobProblem(f"which message of {self.name}? Give message: 3", (self.kind,))
             return
         given = [key for key in ("at_ns", "event", "topic") if getattr(self, key) is not None]
         if len(given) > 1:
             names = " and ".join(key.removesuffix("_ns") for key in given)
-            raise Problem(f"{names} are given: say only once when it happens", (self.kind,))
+            raise JobProblem(f"{names} are given: say only once when it happens", (self.kind,))
         if (self.topic is None) != (self.message is None):
             missing = "message: 3" if self.message is None else "topic: /goal"
-            raise Problem(f"topic and message go together: give {missing}", (self.kind,))
+            raise JobProblem(f"topic and message go together: give {missing}", (self.kind,))
         if not given:
-            raise Problem(
+            raise JobProblem(
                 "when? Give at: 2s, event: 1280, or topic: /goal with message: 3", (self.kind,)
             )

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, items, text
-from rsltrace.job.values.problem import Problem, as_flag, describe
+from rsltrace.job.values.problem import JobProblem, as_flag, describe
 from rsltrace.trace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
@@ -17,21 +17,21 @@ ModeName = Literal["virtual", "record", "warn", "error", "allow"]
 
 def _module_glob(value: str) -> None:
     if not value.replace("*", "a").replace("?", "a").replace(".", "a").isidentifier():
-        raise Problem(f"expected the name of a module, or a glob like my_robot.*, got {value!r}")
+        raise JobProblem(f"expected the name of a module, or a glob like my_robot.*, got {value!r}")
 
 
-class SourceSpec(Part):
-    """What is done about one source, and the modules (globs) that may use it nevertheless."""
+class SourceSpec(JobPart):
+    """How one source is handled."""
 
     mode: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="`virtual`: the run makes the answer; `record`: the real one is kept in the "
-        "trace; `warn`: the call is a finding; `error`: it ends the run; `allow`: nothing.",
+        description="`virtual`: simulated; `record`: real, and kept in the trace; `warn`: a "
+        "finding; `error`: ends the run; `allow`: nothing.",
         examples=["warn"],
     )
     allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = Field(
         default=(),
-        description="Modules that may use the source nevertheless, globs.",
+        description="Modules that may use the source, as globs.",
         examples=[["my_robot.logging", "rerun.*"]],
     )
 
@@ -53,7 +53,9 @@ def _source(source: Source) -> BeforeValidator:
                 if given == Mode.RECORD:
                     hint = "; what this source answers cannot be recorded"
             place = ("mode",) if isinstance(value, dict) else ()
-            raise Problem(f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place)
+            raise JobProblem(
+                f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place
+            )
         return {"mode": value} if isinstance(value, str) else value
 
     mode = {"enum": valid}
@@ -71,22 +73,22 @@ def _about(source: Source, what: str) -> Any:
     default = DEFAULT_MODES[source].value
     return Field(
         default=None,
-        description=f"{what} Unless said otherwise: `{default}`.",
-        examples=[MODES[source][0].value, {"mode": "error", "allow": ["my_robot.logging"]}],
+        description=f"{what} Default: `{default}`.",
+        examples=[MODES[source][0].value],
     )
 
 
 def _state(value: object) -> object:
     if value is True or value is False or value == "record":
         return value
-    raise Problem(f"expected true, false or record, got {describe(value)}")
+    raise JobProblem(f"expected true, false or record, got {describe(value)}")
 
 
 attach(_state, schema={"enum": [True, False, "record"]})
 
 
-class GuardSpec(Part):
-    """``guard:`` of a job, or of a node, where it overrides the job's key by key.
+class GuardSpec(JobPart):
+    """``guard:`` of a job, or of a node, which overrides the job's keys.
 
     ``enabled`` false (``guard: false``) leaves everything as it is. ``state`` hashes a node's state
     after each callback; ``record`` keeps its attributes, too. A source that is None keeps what the
@@ -95,20 +97,19 @@ class GuardSpec(Part):
 
     enabled: Annotated[bool, check(flag)] = Field(
         default=True,
-        description="`false` leaves every source as it is; `guard: false` is short for it.",
+        description="`false` allows every source.",
         examples=[False],
     )
     pin: Annotated[bool | None, check(flag, optional=True)] = Field(
         default=None,
-        description="Whether `rsltrace record` starts its process once more with a fixed hash "
-        "seed, fixed addresses, in UTC, in C.UTF-8, with one thread per numerical library. For "
-        "the job as a whole only. Unless said otherwise: `true`.",
+        description="Whether `rsltrace record` pins its process: hash seed, memory addresses, time "
+        "zone, locale and thread counts. Only for the whole job. Default: `true`.",
         examples=[False],
     )
     state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
         default=None,
-        description="Whether a node's state is hashed after each of its callbacks; `record` keeps "
-        "its attributes in the trace, too.",
+        description="Whether node states are hashed after each callback; `record` also keeps the "
+        "attributes.",
         examples=[True, "record"],
     )
     clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = _about(
@@ -174,7 +175,7 @@ def _guard(value: object) -> object:
     """Let true and false stand for ``{enabled: …}``."""
     if isinstance(value, str):
         hint = as_flag(value)
-        raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
+        raise JobProblem(f"expected true, false or a mapping, got {describe(value)}{hint}")
     return {"enabled": value} if isinstance(value, bool) else value
 
 

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, text
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_topic
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import parse_time
 
 # ``start_after:`` of an entry: it starts later than the run does, as a launch file's timers and
@@ -21,13 +21,13 @@ from rsltrace.job.values.times import parse_time
 def _check_entry(value: object) -> str | int:
     """Check what names an entry of ``nodes:``: text, or its number in the list."""
     if isinstance(value, bool) or not isinstance(value, (str, int)) or value == "":
-        raise Problem(
+        raise JobProblem(
             "expected an entry of nodes: its name, what it runs, or its number in the list "
             f"(from 0), got {describe(value)}"
         )
     if isinstance(value, int):
         if value < 0:
-            raise Problem(f"entries of nodes are counted from 0, got {value}")
+            raise JobProblem(f"entries of nodes are counted from 0, got {value}")
         return int(value)
     return str(value)
 
@@ -38,10 +38,10 @@ FullName = Annotated[str | None, check(text(check_topic), optional=True)]
 EntryName = Annotated[str | int | None, check(_check_entry, optional=True)]
 
 
-class StartAfterSpec(Part):
-    """When an entry starts: once all that is given has come true, and ``delay`` later. A plain
-    time stands for ``{delay: time}``. The name of an entry is its ``name``, what it runs
-    (``package/name``, ``module:main``), or its number in the list."""
+class StartAfterSpec(JobPart):
+    """When an entry starts: ``delay`` after all conditions are true. A plain
+    time stands for ``{delay: time}``. Entries are named by
+    ``name``, by what they run, or by number."""
 
     MEANT: ClassVar[str] = "delay"
     TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
@@ -50,27 +50,26 @@ class StartAfterSpec(Part):
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="delay",
-        description="This much later: after the start of the run, or after the last of the other "
-        "conditions has come true.",
+        description="Delay after the start, or after the last of the other conditions.",
         examples=["2s"],
     )
     topic: FullName = Field(
         default=None,
-        description="After the first message on this topic.",
+        description="After the first message on a topic.",
         examples=["/map"],
     )
     service: FullName = Field(
         default=None,
-        description="After this service has got a server.",
+        description="After a service has a server.",
         examples=["/set_mode"],
     )
     node: FullName = Field(
-        default=None, description="After this node has been made.", examples=["/robot/driver"]
+        default=None, description="After a node exists.", examples=["/robot/driver"]
     )
     started: EntryName = Field(
         default=None,
-        description="After another entry has started: its constructor is done, or its main waits "
-        "or spins for the first time.",
+        description="After another entry has started: its constructor returned, or its main "
+        "waits or spins.",
         examples=["driver", 0],
     )
     ended: EntryName = Field(
@@ -87,17 +86,17 @@ class StartAfterSpec(Part):
     @model_validator(mode="after")
     def _says_something(self) -> StartAfterSpec:
         if not self.model_fields_set:
-            raise Problem(f"give one of delay, {', '.join(self.CONDITIONS)}")
+            raise JobProblem(f"give one of delay, {', '.join(self.CONDITIONS)}")
         return self
 
 
 def _check_arguments(value: object) -> dict[str, str]:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of launch arguments to values, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of launch arguments to values, got {describe(value)}")
     found: dict[str, str] = {}
     for name, given in value.items():
         if not isinstance(given, (str, int, float)):
-            raise Problem(f"expected text or a number, got {describe(given)}", (str(name),))
+            raise JobProblem(f"expected text or a number, got {describe(given)}", (str(name),))
         text = str(given).lower() if isinstance(given, bool) else str(getattr(given, "text", given))
         found[str(name)] = text
     return found
@@ -109,22 +108,21 @@ attach(
 )
 
 
-class LaunchSpec(Part):
+class LaunchSpec(JobPart):
     """A launch file; a path stands for ``{file: ...}``."""
 
     file: Annotated[str, check(check_path)] = Field(
-        description="Launch file (XML, YAML, or Python, which is run in a process of its own).",
+        description="Launch file in XML, YAML or Python.",
         examples=["launch/robot.launch.xml"],
     )
     arguments: Annotated[dict[str, str], check(_check_arguments)] = Field(
         default_factory=dict,
-        description="Launch arguments by name, as `name:=value` on a command line.",
+        description="Launch arguments.",
         examples=[{"robot": "husky", "use_lidar": True}],
     )
     skip_unsupported: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Leave out what cannot be simulated (compiled executables, other processes) "
-        "instead of refusing the launch file.",
+        description="Skip what cannot be simulated instead of refusing the file.",
         examples=[True],
     )
 

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.launch import StartAfterSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.parts.process import InputSpec, RespawnSpec, check_environment, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
 from rsltrace.job.values.mappings import check_arguments, check_path, check_remappings
@@ -24,7 +24,7 @@ from rsltrace.job.values.names import (
     check_node_name,
 )
 from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target, target_text
 from rsltrace.job.values.times import TimeLike
 
@@ -55,7 +55,7 @@ attach(
 )
 
 
-class NodeSpec(Part):
+class NodeSpec(JobPart):
     """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``,
     ``program``, ``component``.
 
@@ -79,86 +79,79 @@ class NodeSpec(Part):
 
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="What to construct: `module:Class`, a Node subclass, or `module:function`, "
-        "which returns a node or a list of nodes. Looked for in `search_path`. A file in the job's "
-        "folder may be named as `folder/file.py:Class`.",
+        description="A Node subclass, or a function that returns nodes: `module:Class` or "
+        "`folder/file.py:Class`.",
         examples=["my_robot.ekf:EkfNode"],
     )
     main: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a function that initializes rclpy, makes nodes and spins, "
-        "as `module:function`.",
+        description="A function that initializes rclpy, makes nodes and spins.",
         examples=["my_robot.talker:main"],
     )
     executable: Annotated[str | None, check(text(check_executable), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: an installed executable, as `ros2 run` would start it, as "
-        "`package/name`. A compiled one runs as a process of its own.",
+        description="An installed executable: `package/name`, as for `ros2 run`. Compiled ones "
+        "run in their own process.",
         examples=["demo_nodes_py/talker"],
     )
     script: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a Python file, run as `python script.py` runs it.",
+        description="A Python file.",
         examples=["scripts/talker.py"],
     )
     module: Annotated[str | None, check(text(check_module), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a module (or package), run as `python -m module` runs it. "
-        "Looked for in `search_path`.",
+        description="A module, run as `python -m` does.",
         examples=["my_robot.talker"],
     )
     program: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a file that uses rcl and can be executed (C, C++), run as "
-        "a process of its own.",
+        description="An executable file that uses rcl (C, C++), run in its own process.",
         examples=["build/talker"],
     )
     component: Annotated[str | None, check(text(check_component), optional=True)] = Field(
         default=None,
-        description="Instead of `node`: a component, as `package/plugin`, that a `container` is "
-        "asked to load once it is there.",
+        description="A component, `package/plugin`, which a `container` loads.",
         examples=["image_proc/image_proc::RectifyNode"],
     )
     container: Annotated[str | None, check(text(check_container), optional=True)] = Field(
         default=None,
-        description="Which node loads a `component`, by its name in full: an executable of "
-        "`rclcpp_components`, or whatever serves `<name>/_container/load_node`.",
+        description="Full name of the node that loads a `component`.",
         examples=["/camera/container"],
     )
     extra_arguments: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
-        description="Extra arguments of a `component`, as `ros2 component load -e` takes them.",
+        description="Extra arguments of a `component`.",
         examples=[{"use_intra_process_comms": True}],
     )
     isolated: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether Python code runs as a process of its own, like a `program`, and not "
-        "in the process of the run. For `executable`, `script` and `module`.",
+        description="Whether an `executable`, `script` or `module` runs in its own process.",
         examples=[True],
     )
     environment: Annotated[dict[str, str], check(check_environment)] = Field(
         default_factory=dict,
-        description="Environment variables of a process, beside those that rsltrace has itself.",
+        description="Additional environment variables of a process.",
         examples=[{"RCUTILS_LOGGING_USE_STDOUT": "1"}],
     )
     working_directory: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="The folder in which a process runs, if not that of rsltrace.",
+        description="Working directory of a process. Default: that of rsltrace.",
         examples=["data"],
     )
     respawn: Annotated[RespawnSpec | None, part("delay")] = Field(
         default=None,
-        description="How long after its end a process is started again; without it, it is not.",
+        description="Delay after which an ended process starts again. Default: it does not.",
         examples=["1s", {"delay": "500ms", "times": 3}],
     )
     required: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether the run ends when this entry has ended. Not for a `node`.",
+        description="Whether the run ends when this entry ends. Not for a `node`.",
         examples=[True],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
         default=None,
-        description="Name of the node, in place of the one it gives itself.",
+        description="Name of the node, replacing its own.",
         examples=["ekf"],
     )
     namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = Field(
@@ -166,50 +159,46 @@ class NodeSpec(Part):
     )
     parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
-        description="Its ROS parameters; `a: {b: 1}` and `a.b: 1` are the same. They win over "
-        "`parameter_files`. An empty list has no type: as in ROS, the parameter is then declared "
-        "but not set, whatever its default.",
+        description="ROS parameters, overriding `parameter_files`. `a: {b: 1}` is the same as "
+        "`a.b: 1`. An empty list is declared but not set.",
         examples=[{"frequency": 50.0, "noise": {"x": 0.1, "y": 0.1}}],
     )
     parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = Field(
         default=(),
-        description="ROS parameter files, wildcards and all; later ones win.",
+        description="ROS parameter files; later ones override earlier ones.",
         examples=[["ekf.yaml"]],
     )
     remappings: Annotated[dict[str, str], check(check_remappings)] = Field(
         default_factory=dict,
-        description="Names of topics and services that become others, as in `--ros-args -r`.",
+        description="Remapped topics and services.",
         examples=[{"odom": "/husky/odom"}],
     )
     arguments: Annotated[dict[str, Any] | tuple[str, ...], check(check_arguments)] = Field(
         default_factory=dict,
-        description="Keyword arguments of a `node`; a list of command-line words of all others.",
+        description="Keyword arguments of a `node`; else a list of command-line arguments.",
         examples=[{"robots": 3}, ["--rate", 10]],
     )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
         default="stop",
-        description="What happens when a callback raises: `stop` ends the run (exit status 3); "
-        "`log` writes exception and traceback to the trace, logs an error, and goes on. A "
-        "constructor that raises always ends the run.",
+        description="What an exception in a callback does: `stop` ends the run with status 3, "
+        "`log` records it and continues. A constructor that raises always ends the "
+        "run.",
         examples=["log"],
     )
     guard: Annotated[GuardSpec | None, guard_part] = Field(
         default=None,
-        description="What is done about sources of nondeterminism in this node, where that differs "
-        "from the job's `guard`.",
+        description="Guard settings of this node that differ from the job's.",
         examples=[{"random": "allow"}],
     )
     start_after: Annotated[StartAfterSpec | None, part("delay")] = Field(
         default=None,
-        description="When it starts, if not with the run: after a time (which may stand for "
-        "`{delay: ...}`), after a topic, service or node is there, or after another entry has "
-        "started or ended.",
+        description="When the entry starts: after a time, or after a topic, service, node or "
+        "entry is there.",
         examples=["2s", {"service": "/set_mode"}, {"ended": "my_robot/calibrate", "delay": "1s"}],
     )
     stdin: Annotated[tuple[InputSpec, ...] | None, inputs] = Field(
         default=None,
-        description="What is typed at the terminal that it reads from (`input()`, `sys.stdin`, "
-        "`termios`, `curses`): the name of a text file, or a list. Not for a `node`.",
+        description="Terminal input of the process: a text file or a list. Not for a `node`.",
         examples=["answers.txt", ["start", {"at": "2s", "keys": "wwq"}]],
     )
     # Not a key of a job file: where the entry came from, if not from the job itself.
@@ -253,26 +242,26 @@ class NodeSpec(Part):
     def _check_kind(self) -> NodeSpec:
         kinds = [name for name in _KINDS if getattr(self, name) is not None]
         if not kinds:
-            raise Problem(f"missing key: give one of {_ONE_OF}")
+            raise JobProblem(f"missing key: give one of {_ONE_OF}")
         if len(kinds) > 1:
-            raise Problem(
+            raise JobProblem(
                 f"'{kinds[0]}' says what to run already: give only one of {_ONE_OF}",
                 (kinds[1],),
                 at_key=True,
             )
         if self.guard is not None and self.guard.pin is not None:
-            raise Problem(
+            raise JobProblem(
                 "'pin' is for the process that all nodes share: write it in the job's own 'guard:'",
                 ("guard", "pin"),
             )
         if self.node is not None and isinstance(self.arguments, tuple):
-            raise Problem(
+            raise JobProblem(
                 "a node takes arguments by name (a mapping); a list of command-line words is for "
                 f"{_WITH_WORDS}",
                 ("arguments",),
             )
         if self.node is not None and self.stdin is not None:
-            raise Problem(
+            raise JobProblem(
                 "a 'node' has no terminal of its own, all of them are in one process: give a "
                 f"function that spins it as {_WITH_WORDS}",
                 ("stdin",),
@@ -281,7 +270,7 @@ class NodeSpec(Part):
         self._check_process(kinds[0])
         self._check_loading(kinds[0])
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
-            raise Problem(
+            raise JobProblem(
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
                 ("arguments",),
             )
@@ -289,22 +278,22 @@ class NodeSpec(Part):
 
     def _check_process(self, kind: str) -> None:
         if self.isolated and kind in ("node", "main", "component"):
-            raise Problem(
+            raise JobProblem(
                 f"a '{kind}' is a part of a program: name what runs it as 'script', 'module' or "
                 "'executable' to have it in a process of its own",
                 ("isolated",),
             )
         if self.is_process and self.stdin is not None:
-            raise Problem("a process has no terminal in a run", ("stdin",), at_key=True)
+            raise JobProblem("a process has no terminal in a run", ("stdin",), at_key=True)
         if self.is_process and self.guard is not None:
-            raise Problem(
+            raise JobProblem(
                 "the guard is for Python code in the process of the run", ("guard",), at_key=True
             )
         for key in ("environment", "working_directory", "respawn"):
             if getattr(self, key) and not (self.is_process or kind == "executable"):
-                raise Problem(_ONLY_A_PROCESS[key], (key,), at_key=True)
+                raise JobProblem(_ONLY_A_PROCESS[key], (key,), at_key=True)
         if self.required and kind in ("node", "component"):
-            raise Problem(
+            raise JobProblem(
                 f"a '{kind}' lasts as long as the run: only a program ends", ("required",)
             )
 
@@ -312,17 +301,17 @@ class NodeSpec(Part):
         if kind != "component":
             for key in ("container", "extra_arguments"):
                 if getattr(self, key):
-                    raise Problem(f"only a 'component' has '{key}:'", (key,), at_key=True)
+                    raise JobProblem(f"only a 'component' has '{key}:'", (key,), at_key=True)
             return
         if self.container is None:
-            raise Problem("say which 'container:' loads the component, by its name: /container")
+            raise JobProblem("say which 'container:' loads the component, by its name: /container")
         for key, instead in (
             ("arguments", "a component takes 'parameters:' and 'extra_arguments:'"),
             ("stdin", "a component has no terminal in a run"),
             ("guard", "the guard is for Python code in the process of the run"),
         ):
             if getattr(self, key):
-                raise Problem(instead, (key,), at_key=True)
+                raise JobProblem(instead, (key,), at_key=True)
 
     @property
     def is_process(self) -> bool:

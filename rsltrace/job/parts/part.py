@@ -18,9 +18,9 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.job.parts.keys import field_at, file_fields, models_in
 from rsltrace.job.values.checks import from_file
 from rsltrace.job.values.problem import (
+    JobProblem,
+    JobProblems,
     Loc,
-    Problem,
-    Problems,
     as_flag,
     describe,
     format_loc,
@@ -37,9 +37,9 @@ if TYPE_CHECKING:
 _VARIABLE = re.compile(r"\$\{?([A-Za-z_][A-Za-z0-9_]*)\}?")
 
 
-def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[Problem]:
+def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[JobProblem]:
     """Return the findings of a failed validation of ``model``, worded and with full locations."""
-    found: list[Problem] = []
+    found: list[JobProblem] = []
     entries = error.errors(include_url=False)
     # A misspelt key is one mistake, not two: the key that it was meant to be is not missing.
     meant = {
@@ -52,8 +52,8 @@ def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[Prob
     for entry in entries:
         loc: Loc = entry["loc"]
         cause = entry.get("ctx", {}).get("error")
-        if isinstance(cause, (Problem, Problems)):
-            items = cause.items if isinstance(cause, Problems) else [cause]
+        if isinstance(cause, (JobProblem, JobProblems)):
+            items = cause.items if isinstance(cause, JobProblems) else [cause]
             hint = _as_variable(entry["input"])
             found += [
                 _named(item.message + hint, loc + item.loc, at_key=item.at_key) for item in items
@@ -64,7 +64,7 @@ def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[Prob
             continue
         elif entry["type"] == "missing":
             inside = f"{format_loc(loc[:-1])}: " if loc[:-1] else ""
-            found.append(Problem(f"{inside}the key '{loc[-1]}' is missing", loc))
+            found.append(JobProblem(f"{inside}the key '{loc[-1]}' is missing", loc))
         else:
             text = _wording(entry["type"], entry["msg"], cause, entry["input"])
             text += _as_variable(entry["input"])
@@ -77,9 +77,9 @@ def worded_problems(error: ValidationError, model: type[BaseModel]) -> list[Prob
     return found
 
 
-def _named(message: str, loc: Loc, *, at_key: bool = False) -> Problem:
+def _named(message: str, loc: Loc, *, at_key: bool = False) -> JobProblem:
     place = format_loc(loc[:-1] if at_key else loc)
-    return Problem(f"{place}: {message}" if place else message, loc, at_key=at_key)
+    return JobProblem(f"{place}: {message}" if place else message, loc, at_key=at_key)
 
 
 def _wording(kind: str, message: str, cause: object, value: object) -> str:
@@ -145,7 +145,7 @@ _PLUGINS = "pydantic.plugin._loader"
 are installed, which takes longer than to read a job."""
 
 
-class Part(BaseModel):
+class JobPart(BaseModel):
     """Base of a job and its parts. Built wrongly, it raises ``JobError``, not pydantic's error."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
@@ -176,7 +176,7 @@ class Part(BaseModel):
         for key, name in cls.TIMES.items():
             if name in data:
                 if key in data:
-                    raise Problem(f"give either {key} or {name}, not both", (name,))
+                    raise JobProblem(f"give either {key} or {name}, not both", (name,))
                 value = data[name]
                 data = {k: v for k, v in data.items() if k != name}
                 data[key] = value if value is None else Nanoseconds(value)

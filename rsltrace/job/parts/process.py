@@ -6,10 +6,10 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, is_plain, text, whole
 from rsltrace.job.values.mappings import check_path
-from rsltrace.job.values.problem import Collected, Problem, describe
+from rsltrace.job.values.problem import JobProblem, ProblemCollector, describe
 from rsltrace.job.values.times import parse_time
 
 # ``stdin:`` of an entry: what is typed at its terminal, and when.
@@ -21,20 +21,20 @@ _LINE_MAX = 4000
 def _line(value: object) -> str:
     """Check one line; a number stands for its digits."""
     if not is_plain(value):
-        raise Problem(f"expected a line of text, got {describe(value)}")
+        raise JobProblem(f"expected a line of text, got {describe(value)}")
     line = str(getattr(value, "text", value))
     if "\n" in line or "\r" in line:
-        raise Problem("this is more than one line: write each as an entry of its own")
+        raise JobProblem("this is more than one line: write each as an entry of its own")
     if len(line.encode()) > _LINE_MAX:
-        raise Problem(f"a terminal takes lines of at most {_LINE_MAX} bytes")
+        raise JobProblem(f"a terminal takes lines of at most {_LINE_MAX} bytes")
     return line
 
 
 attach(_line, schema={"type": ["string", "number"]})
 
 
-class InputSpec(Part):
-    """Something that is typed: one of ``line``, ``keys``, ``file`` and ``end``. Text alone is a
+class InputSpec(JobPart):
+    """Terminal input: one of ``line``, ``keys``, ``file`` and ``end``. Text alone is a
     ``line``."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ("line", "keys", "file", "end")
@@ -43,17 +43,16 @@ class InputSpec(Part):
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="When, since the start of the run. Without it, as soon as what comes before "
-        "has been read.",
+        description="Time since the start. Default: when the input before has been read.",
         examples=["2.5s"],
     )
     line: Annotated[str | None, check(_line, optional=True)] = Field(
-        default=None, description="A line, and the Enter key.", examples=["start", 42]
+        default=None, description="A line with Enter.", examples=["start", 42]
     )
     keys: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="Keys one after the other, without Enter (which is `\\r`): `\\e[A` is the up "
-        "arrow, `\\x03` is Ctrl-C.",
+        description="Keys without Enter (which is `\\r`): `\\e[A` is the up arrow, `\\x03` is "
+        "Ctrl-C.",
         examples=["wwad", "\x1b[A"],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
@@ -61,7 +60,7 @@ class InputSpec(Part):
     )
     end: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="The end of the input (Ctrl-D): who reads a line gets an end of file.",
+        description="End of the input (Ctrl-D).",
         examples=[True],
     )
 
@@ -69,9 +68,9 @@ class InputSpec(Part):
     def _one(self) -> InputSpec:
         given = [key for key in self.ONE_OF if getattr(self, key) not in (None, False)]
         if len(given) != 1:
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}")
         if self.keys == "":
-            raise Problem("no key is given", ("keys",))
+            raise JobProblem("no key is given", ("keys",))
         return self
 
 
@@ -80,7 +79,7 @@ def _inputs(value: object) -> object:
     if isinstance(value, str):
         return ({"file": value}, {"end": True})
     if not isinstance(value, (list, tuple)):
-        raise Problem(
+        raise JobProblem(
             "expected a file whose lines are typed, or a list of what is typed, got "
             f"{describe(value)}"
         )
@@ -93,17 +92,17 @@ inputs = check(_inputs, optional=True, entry_shorthand="line", or_text=True)
 def check_environment(value: object) -> dict[str, str]:
     """Check a mapping of environment variables to texts."""
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to texts, got {describe(value)}")
-    problems = Collected()
+        raise JobProblem(f"expected a mapping of names to texts, got {describe(value)}")
+    problems = ProblemCollector()
     for name, content in value.items():
         with problems.at(str(name), at_key=True):
             if not isinstance(name, str) or not name or "=" in name or "\0" in name:
-                raise Problem(f"{name!r} cannot be the name of an environment variable")
+                raise JobProblem(f"{name!r} cannot be the name of an environment variable")
         with problems.at(str(name)):
             if isinstance(content, bool) or not isinstance(content, (str, int, float)):
-                raise Problem(f"expected a text, got {describe(content)}")
+                raise JobProblem(f"expected a text, got {describe(content)}")
             if "\0" in str(content):
-                raise Problem("an environment variable cannot hold a NUL character")
+                raise JobProblem("an environment variable cannot hold a NUL character")
     problems.check()
     return {name: str(getattr(content, "text", content)) for name, content in value.items()}
 
@@ -114,9 +113,8 @@ attach(
 )
 
 
-class RespawnSpec(Part):
-    """A process is started again when it has ended, even by a failure. A plain time stands for
-    ``{delay: time}``."""
+class RespawnSpec(JobPart):
+    """Restart of a process that has ended. A plain time stands for ``{delay: time}``."""
 
     MEANT: ClassVar[str] = "delay"
     TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
@@ -124,12 +122,12 @@ class RespawnSpec(Part):
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="delay",
-        description="How much simulated time passes before it starts again.",
+        description="Simulated time before the restart.",
         examples=["1s"],
     )
     times: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None,
-        description="How often it is started again at most; without it there is no limit.",
+        description="Maximum number of restarts. Default: unlimited.",
         examples=[3],
     )
 

@@ -7,28 +7,28 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, field_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import Globs, check, flag, whole
-from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 # ``hooks:``: functions that are called around the construction of the nodes.
 
 
-class HooksSpec(Part):
-    """What is called before the first and after the last node is constructed."""
+class HooksSpec(JobPart):
+    """Functions called around the construction of the nodes."""
 
     before: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function called with the job before the first node is constructed. It may "
-        "return nodes of its own (one, or a list).",
+        description="Function of the job, called before the first node is constructed. It may "
+        "return nodes.",
         examples=["my_robot.setup:prepare"],
     )
     after: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function called with the list of all nodes after the last one is constructed, "
-        "before the run starts. It may return more nodes.",
+        description="Function of the list of nodes, called after construction and before the "
+        "run. It may return more nodes.",
         examples=["my_robot.setup:wire"],
     )
 
@@ -39,28 +39,28 @@ class HooksSpec(Part):
         ) -> None: ...
 
 
-class RecordSpec(Part):
-    """Which payloads the trace keeps. Hashes are kept in any case."""
+class RecordSpec(JobPart):
+    """Which messages the trace keeps. Hashes are always kept."""
 
     payloads: Annotated[bool, check(flag)] = Field(
         default=True,
-        description="Whether messages are kept at all; their hashes are in any case.",
+        description="Whether to keep messages. Their hashes are always kept.",
         examples=[False],
     )
     topics: Globs = Field(
         default=("*",),
-        description="Topics and services whose messages are kept, globs.",
+        description="Topics and services to keep, as globs.",
         examples=[["/odom", "/robot1/*"]],
     )
     exclude: Globs = Field(
         default=(),
-        description="Topics and services whose messages are not kept, globs.",
+        description="Topics and services not to keep, as globs.",
         examples=[["/camera/*"]],
     )
     segment_events: Annotated[int, check(whole(1, SEGMENT_EVENTS))] = Field(
         default=SEGMENT_EVENTS,
-        description="After how many events they are written to the file; what a killed or crashed "
-        "run loses is fewer. 1 is slow, and right for finding out what happened before a crash.",
+        description="Write the file after this many events; a killed run loses fewer. Use 1 "
+        "(slow) to investigate a crash.",
         examples=[1],
     )
 
@@ -79,5 +79,7 @@ class RecordSpec(Part):
     @classmethod
     def _not_empty(cls, value: tuple[str, ...]) -> tuple[str, ...]:
         if not value:
-            raise Problem("an empty list would keep no payload: write 'payloads: false' for that")
+            raise JobProblem(
+                "an empty list would keep no payload: write 'payloads: false' for that"
+            )
         return value

@@ -10,11 +10,11 @@ from pydantic import Field, model_validator
 
 from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
 from rsltrace.job.values.mappings import check_path
 from rsltrace.job.values.names import check_node_glob
-from rsltrace.job.values.problem import Problem, describe, meant_by
+from rsltrace.job.values.problem import JobProblem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time
 
@@ -26,68 +26,67 @@ NodeGlob = Annotated[str, check(text(check_node_glob))]
 NameGlob = Annotated[str | None, check(text(), optional=True)]
 
 
-class PriorityRuleSpec(Part):
+class PriorityRuleSpec(JobPart):
     """A priority for a node, for one of its entities, or for a whole callback group."""
 
     priority: Annotated[int, check(whole(-PRIORITY_MAX, PRIORITY_MAX))] = Field(
-        description="Higher runs first; what no rule fits has 0.", examples=[10]
+        description="Higher runs first. Default: 0.", examples=[10]
     )
     node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/controller"])
     entity: NameGlob = Field(
         default=None,
-        description="Topic, service, or name of a timer's callback, a glob.",
+        description="Glob of a topic, service or timer callback.",
         examples=["/scan", "Controller.on_timer"],
     )
     group_of: NameGlob = Field(
         default=None,
-        description="Everything in the callback group of this entity, a glob.",
+        description="Glob of an entity: everything in its callback group.",
         examples=["/scan"],
     )
 
     @model_validator(mode="after")
     def _not_both(self) -> PriorityRuleSpec:
         if self.entity is not None and self.group_of is not None:
-            raise Problem("give entity or group_of, not both", ("group_of",), at_key=True)
+            raise JobProblem("give entity or group_of, not both", ("group_of",), at_key=True)
         return self
 
 
-class DepartureSpec(Part):
-    """A choice at which another than the first that became ready runs."""
+class DepartureSpec(JobPart):
+    """A choice at which a callback other than the first ready one runs."""
 
     choice: Annotated[int, check(whole(0))] = Field(
-        description="Which choice, from 0. Only times at which more than one can run count.",
+        description="Index of the choice. Only times with several candidates count.",
         examples=[37],
     )
     run: Annotated[int, check(whole(0))] = Field(
-        description="Which of those that can run, from 0, in the order in which they became ready, "
-        "timers last.",
+        description="Index of the candidate, by the time it became ready, timers last.",
         examples=[2],
     )
     of: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="Its node and entity, to read and to be checked: another one is an error.",
+        description="Node and entity of the candidate; others are an error.",
         examples=["/planner /scan"],
     )
 
 
-class PctSpec(Part):
+class PctSpec(JobPart):
     """Probabilistic concurrency testing: random priorities, changed at random choices."""
 
     depth: Annotated[int, check(whole(1, 100))] = Field(
         default=3,
-        description="How many constraints of order the bug needs: 1 for one pair of events.",
+        description="Number of ordering constraints of the bug: 1 for one pair of events.",
         examples=[3],
     )
     choices: Annotated[int, check(whole(1))] = Field(
         default=1000,
-        description="How many choices a run has, at most: priorities change within so many.",
+        description="Maximum number of choices in a run.",
         examples=[500],
     )
 
 
-class PolicySpec(Part):
-    """Which of the callbacks that are ready runs next. Exactly one of the keys but ``after`` and
-    ``seed``; a word alone is an ``order``."""
+class PolicySpec(JobPart):
+    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone
+    is an ``order``."""
 
     TIMES: ClassVar[dict[str, str]] = {"after": "after_ns"}
     ONE_OF: ClassVar[tuple[str, ...]] = (
@@ -102,50 +101,46 @@ class PolicySpec(Part):
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
-        description="`fifo` (first come, first served; timers last), `rate_monotonic` (shortest "
-        "period first: of the timer that a callback is, or that its chain begins with), `wait_set` "
-        "(rclcpp's executors: timers first, the rest as polling points find it), `rclpy` (rclpy's) "
-        "or `permutation` (what is ready at one instant in an order that the seed decides).",
+        description="`fifo`: first come, first served, timers last. `rate_monotonic`: shortest "
+        "period of the chain first. `wait_set`: as rclcpp's executors. `rclpy`: as "
+        "rclpy's. `permutation`: random order at each instant.",
         examples=["rate_monotonic"],
     )
     priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
-        description="Highest priority first; the first rule that fits counts.",
+        description="Highest priority first. The first matching rule counts.",
         examples=[[{"node": "/controller", "priority": 10}]],
     )
     departures: Annotated[tuple[DepartureSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
-        description="First come, first served, but for these choices: what `rsltrace explore` "
-        "writes of an order that it has found.",
+        description="First come, first served, except for these choices, which `rsltrace "
+        "explore` writes.",
         examples=[[{"choice": 37, "run": 2}]],
     )
     pct: Annotated[PctSpec | None, part("depth")] = Field(
         default=None,
-        description="Random priorities of entities, as the job's `seed` decides, that change at "
-        "`depth` - 1 random choices.",
+        description="Random priorities that change at `depth` - 1 random choices.",
         examples=[{"depth": 3, "choices": 500}],
     )
     recorded: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A trace whose order of events is followed exactly.",
+        description="A trace whose order is followed exactly.",
         examples=["run1.mcap"],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="A class of your own, called without arguments: see docs/policies.md.",
+        description="Your own policy class (docs/policies.md).",
         examples=["my_robot.policy:LongestQueue"],
     )
     after_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="after",
-        description="Up to this time, since the start of the run, it is first come, first served: "
-        "with `order`, `priority`, `pct` and `function`.",
+        description="First come, first served until this time.",
         examples=["30s"],
     )
     seed: Annotated[int | None, check(whole(0), optional=True)] = Field(
         default=None,
-        description="What `permutation` and `pct` draw from, instead of the job's `seed`: another "
-        "order, with the same delays, losses and the like.",
+        description="Seed of `permutation` and `pct`. Default: the job's.",
         examples=[7],
     )
 
@@ -168,73 +163,71 @@ class PolicySpec(Part):
     def _one(self) -> PolicySpec:
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
         if len(given) != 1:
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}")
         if self.after_ns is not None and given[0] in ("departures", "recorded"):
-            raise Problem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
+            raise JobProblem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
         draws = self.pct is not None or self.order == "permutation"
         if self.seed is not None and not draws:
-            raise Problem("only permutation and pct draw anything", ("seed",), at_key=True)
+            raise JobProblem("only permutation and pct draw anything", ("seed",), at_key=True)
         choices: set[int] = set()
         for index, departure in enumerate(self.departures or ()):
             if departure.choice in choices:
-                raise Problem(
+                raise JobProblem(
                     f"choice {departure.choice} is there twice", ("departures", index, "choice")
                 )
             choices.add(departure.choice)
         return self
 
 
-class ExecutorSpec(Part):
+class ExecutorSpec(JobPart):
     """A simulated executor: a number of workers for some nodes."""
 
     nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
-        default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]
+        default=("*",), description="Nodes, as globs.", examples=[["/camera", "/detector"]]
     )
     workers: Annotated[int, check(whole(1, 1024))] = Field(
         default=1,
-        description="Callbacks it can run at once; 1 is a single-threaded executor.",
+        description="Number of callbacks it runs in parallel.",
         examples=[4],
     )
 
 
 class EntityExecutionSpec(DistributionSpec):
-    """How long the callbacks of some entities of some nodes take."""
+    """Execution times of some entities."""
 
     node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/detector"])
     entity: Annotated[str, check(text())] = Field(
-        description="Topic, service, or name of a timer's callback, a glob.", examples=["/image"]
+        description="Glob of a topic, service or timer callback.", examples=["/image"]
     )
 
 
-class ExecutionSpec(Part):
-    """How long callbacks take. Of ``entities`` the first that fits counts, then ``nodes``, then
-    ``default``."""
+class ExecutionSpec(JobPart):
+    """Execution times: the first match among ``entities``, ``nodes`` and ``default``."""
 
     MEANT: ClassVar[str] = "default"
 
     default: Annotated[DistributionSpec | None, part("constant")] = Field(
-        default=None, description="For every callback without a time of its own.", examples=["1ms"]
+        default=None, description="Default of all callbacks.", examples=["1ms"]
     )
     nodes: Annotated[dict[str, DistributionSpec], named_parts("constant", check_node_glob)] = Field(
         default_factory=dict,
-        description="By node, a glob.",
+        description="By node glob.",
         examples=[{"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}],
     )
     entities: Annotated[tuple[EntityExecutionSpec, ...], parts()] = Field(
         default=(),
-        description="By entity of a node.",
+        description="By entity.",
         examples=[[{"node": "/detector", "entity": "/image", "constant": "50ms"}]],
     )
 
 
-class ThreadsSpec(Part):
-    """Where threads of one process, and callbacks that its executors run at once, take turns."""
+class ThreadsSpec(JobPart):
+    """Where threads of one process take turns."""
 
     switch: Annotated[str, check(one_of(WHEN_BLOCKED, EVERY_LINE))] = Field(
         default=WHEN_BLOCKED,
-        description="`when_blocked`: each runs until it blocks or ends. `every_line`: before each "
-        "line of the user's own code the policy is asked whether it goes on, or another one that "
-        "could run at the same time; `fifo` lets it go on.",
+        description="`when_blocked`: a thread runs until it blocks or ends. `every_line`: the "
+        "policy chooses a thread before each line of user code.",
         examples=["every_line"],
     )
 
@@ -246,12 +239,12 @@ def _policy(value: object) -> object:
     if value in PolicySpec.ONE_OF:
         example = PolicySpec.model_fields[value].examples or [None]
         shown = json.dumps({value: example[0]}).replace('"', "")
-        raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
+        raise JobProblem(f"{value!r} alone does not say enough; write for example {shown}")
     if value not in ORDERS:
         word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
         near = meant_by(word, names) or nearest(word, names)
         hint = f"; did you mean {near}?" if near else ""
-        raise Problem(
+        raise JobProblem(
             f"expected {' or '.join(ORDERS)}, or a mapping with "
             f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
         )
@@ -274,7 +267,7 @@ def _executors(value: object) -> object:
         hint = ""
         if isinstance(value, str) and value.startswith("multi"):
             hint = "; write [{workers: 4}]"
-        raise Problem(
+        raise JobProblem(
             f"expected {' or '.join(_EXECUTORS)} or a list of executors, got "
             f"{describe(value)}{hint}"
         )

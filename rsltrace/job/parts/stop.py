@@ -6,29 +6,28 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import check, part, positive_time, text, whole
 from rsltrace.job.values.names import check_field_path, check_topic
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_size, parse_time
 
 
-class TopicStop(Part):
-    """A message on topic ``name`` ends the run; its field ``exit_code`` is the exit status."""
+class TopicStop(JobPart):
+    """A message that ends the run."""
 
     name: Annotated[str, check(text(check_topic))] = Field(
-        description="The topic, in full.", examples=["/done"]
+        description="Full name of the topic.", examples=["/done"]
     )
     exit_code: Annotated[str | None, check(text(check_field_path), optional=True)] = Field(
         default=None,
-        description="Field of the message that is the exit status of `rsltrace record`. Without "
-        "it the status is 0.",
+        description="Field that is the exit status. Default: status 0.",
         examples=["data"],
     )
 
 
-class StopSpec(Part):
-    """What ends a run. Any of the conditions; times in nanoseconds, ``None`` where not given."""
+class StopSpec(JobPart):
+    """What ends a run: the first of these conditions."""
 
     MEANT: ClassVar[str] = "duration"
     TIMES: ClassVar[dict[str, str]] = {
@@ -41,7 +40,7 @@ class StopSpec(Part):
     duration_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="duration",
-        description="After this much simulated time, including what is due then.",
+        description="After this much simulated time, inclusive.",
         examples=["60s"],
     )
     time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -50,7 +49,7 @@ class StopSpec(Part):
     timeout_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="timeout",
-        description="After this much simulated time, as a failure: with exit status 1.",
+        description="After this much simulated time, with exit status 1.",
         examples=["120s"],
     )
     events: Annotated[int | None, check(whole(1), optional=True)] = Field(
@@ -58,26 +57,25 @@ class StopSpec(Part):
     )
     topic: Annotated[TopicStop | None, part("name")] = Field(
         default=None,
-        description="When a message is published on a topic; its name stands for `{name: ...}`.",
+        description="After a message on a topic.",
         examples=["/done", {"name": "/done", "exit_code": "data"}],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="When this function, asked between time steps with a `Progress`, returns "
-        "`True` or an integer, which is the exit status.",
+        description="When this function returns `True` or an exit status. It is called with a "
+        "`Progress` between time steps.",
         examples=["my_robot.checks:finished"],
     )
     quiescence_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="quiescence",
-        description="When nothing has been published for this long.",
+        description="After this much time without a message.",
         examples=["2s"],
     )
 
     size: Annotated[int | None, check(parse_size, optional=True)] = Field(
         default=None,
-        description="When the file of the trace has reached this size (checked between time steps; "
-        "what is still in memory is not counted).",
+        description="When the trace file reaches this size.",
         examples=["500MiB"],
     )
 

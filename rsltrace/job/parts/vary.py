@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, check_names, one_of, whole
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.job.values.times import parse_time
 
 METHODS = ("grid", "random", "latin_hypercube")
@@ -42,9 +42,9 @@ def _bound(value: object) -> float | str:
         parse_time(value)
         return value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise Problem(f"expected a number, or a time with a unit (5ms), got {describe(value)}")
+        raise JobProblem(f"expected a number, or a time with a unit (5ms), got {describe(value)}")
     if not abs(value) < float("inf"):
-        raise Problem(f"expected a finite number, got {value}")
+        raise JobProblem(f"expected a finite number, got {value}")
     return value
 
 
@@ -53,10 +53,10 @@ _bound_schema = {"anyOf": [{"type": "number"}, {"type": "string"}]}
 
 def _pair(value: object) -> tuple[float | str, float | str]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
-        raise Problem(f"expected two values, as in [0.5, 2.0], got {describe(value)}")
+        raise JobProblem(f"expected two values, as in [0.5, 2.0], got {describe(value)}")
     first, second = map(_bound, value)
     if is_time(first) != is_time(second):
-        raise Problem("give two numbers, or two times with units")
+        raise JobProblem("give two numbers, or two times with units")
     return first, second
 
 
@@ -66,14 +66,14 @@ Pair = Annotated["tuple[float | str, float | str] | None", check(_pair, optional
 
 def _values(value: object) -> tuple[Any, ...]:
     if not isinstance(value, (list, tuple)) or not value:
-        raise Problem(f"expected a list of values, got {describe(value)}")
+        raise JobProblem(f"expected a list of values, got {describe(value)}")
     return tuple(value)
 
 
 attach(_values, schema={"type": "array", "minItems": 1})
 
 
-class SettingSpec(Part):
+class SettingSpec(JobPart):
     """The values of one setting. Exactly one of ``values``, ``uniform``, ``log_uniform``,
     ``normal`` and ``integers``; a list alone is ``values``."""
 
@@ -87,30 +87,30 @@ class SettingSpec(Part):
 
     values: Annotated[tuple[Any, ...] | None, check(_values, optional=True)] = Field(
         default=None,
-        description="These, each as a job file has it there.",
+        description="The values.",
         examples=[["slow", "fast"]],
     )
     uniform: Pair = Field(
         default=None,
-        description="Evenly between two numbers, or two times.",
+        description="Uniform between two numbers or times.",
         examples=[[0.5, 2.0], ["1ms", "20ms"]],
     )
     log_uniform: Pair = Field(
         default=None,
-        description="Between two numbers or times above 0, evenly in their logarithm.",
+        description="Uniform in the logarithm.",
         examples=[[0.001, 1.0]],
     )
     normal: Pair = Field(
         default=None,
-        description="Normal: mean and standard deviation. Times are not less than 0.",
+        description="Normal: mean and standard deviation. Times are at least 0.",
         examples=[[1.0, 0.1]],
     )
     integers: Pair = Field(
-        default=None, description="The integers from one to another.", examples=[[1, 10]]
+        default=None, description="Integers from one to another.", examples=[[1, 10]]
     )
     steps: Annotated[int | None, check(whole(2, 100_000), optional=True)] = Field(
         default=None,
-        description="How many values, equally far apart, a grid has of `uniform` or `log_uniform`.",
+        description="Number of values in a grid of `uniform` or `log_uniform`.",
         examples=[5],
     )
 
@@ -123,24 +123,24 @@ class SettingSpec(Part):
     def _makes_sense(self) -> SettingSpec:
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
         if len(given) != 1:
-            raise Problem(f"give one of {', '.join(self.ONE_OF)}, or a list of values")
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}, or a list of values")
         kind = given[0]
         if self.steps is not None and kind not in ("uniform", "log_uniform"):
-            raise Problem(f"steps are for uniform and log_uniform, not for {kind}", ("steps",))
+            raise JobProblem(f"steps are for uniform and log_uniform, not for {kind}", ("steps",))
         if self.values is not None:
             return self
         first, second = self.bounds
         if kind == "normal":
             if second <= 0:
-                raise Problem("the standard deviation must be more than 0", (kind, 1))
+                raise JobProblem("the standard deviation must be more than 0", (kind, 1))
         elif second <= first:
-            raise Problem("the second value must be greater than the first", (kind, 1))
+            raise JobProblem("the second value must be greater than the first", (kind, 1))
         if kind == "log_uniform" and first <= 0:
-            raise Problem("must be more than 0", (kind, 0))
+            raise JobProblem("must be more than 0", (kind, 0))
         if kind == "integers":
             pair = self.integers or ()
             if any(is_time(bound) or bound != int(bound) for bound in pair):
-                raise Problem("expected two integers, as in [1, 10]", (kind,))
+                raise JobProblem("expected two integers, as in [1, 10]", (kind,))
         return self
 
     @property
@@ -160,7 +160,7 @@ class SettingSpec(Part):
 
 def _settings(values: object) -> object:
     if not isinstance(values, dict):
-        raise Problem(f"expected a mapping of keys of the job to values, got {describe(values)}")
+        raise JobProblem(f"expected a mapping of keys of the job to values, got {describe(values)}")
     check_names(values, check_setting)
     return {
         name: {"values": value} if isinstance(value, (list, tuple)) else value
@@ -168,9 +168,8 @@ def _settings(values: object) -> object:
     }
 
 
-class VarySpec(Part):
-    """What differs from run to run when a job is explored (`rsltrace explore`). Other commands run
-    the job as it is."""
+class VarySpec(JobPart):
+    """Settings that ``rsltrace explore --strategy vary`` changes."""
 
     MEANT: ClassVar[str] = "settings"
 
@@ -178,7 +177,7 @@ class VarySpec(Part):
         dict[str, SettingSpec],
         check(_settings, names={"pattern": r"^\S.*$"}, value_shorthand="values"),
     ] = Field(
-        description="By key of the job, written as for `--set`: a list of values, or a range.",
+        description="By key, as for `--set`: a list of values, or a range.",
         examples=[
             {
                 "nodes.ekf.parameters.rate": [10.0, 50.0],
@@ -189,16 +188,15 @@ class VarySpec(Part):
     method: Annotated[Literal["grid", "random", "latin_hypercube"], check(one_of(*METHODS))] = (
         Field(
             default="random",
-            description="Which values go together: every combination (`grid`), each drawn by "
-            "itself (`random`), or so that each setting's range is covered evenly "
-            "(`latin_hypercube`, of SciPy).",
+            description="How values are combined: every combination (`grid`), `random`, or "
+            "evenly spread (`latin_hypercube`, needs SciPy).",
             examples=["latin_hypercube"],
         )
     )
     samples: Annotated[int | None, check(whole(1, SAMPLES_MAX), optional=True)] = Field(
         default=None,
-        description="How many combinations there are. A grid says so itself; `random` has no end "
-        "without it, `latin_hypercube` 100.",
+        description="Number of combinations. Default: all of a grid, unlimited for `random`, 100 "
+        "for `latin_hypercube`.",
         examples=[200],
     )
 
@@ -215,16 +213,16 @@ class VarySpec(Part):
     @model_validator(mode="after")
     def _goes_together(self) -> VarySpec:
         if not self.settings:
-            raise Problem("nothing varies: name at least one key of the job", ("settings",))
+            raise JobProblem("nothing varies: name at least one key of the job", ("settings",))
         if self.method != "grid":
             return self
         if self.samples is not None:
-            raise Problem("a grid has as many combinations as it has", ("samples",))
+            raise JobProblem("a grid has as many combinations as it has", ("samples",))
         for name, spec in self.settings.items():
             if spec.kind in ("uniform", "log_uniform") and spec.steps is None:
-                raise Problem("how many values? Give steps: 5", ("settings", name, spec.kind))
+                raise JobProblem("how many values? Give steps: 5", ("settings", name, spec.kind))
             if spec.kind == "normal":
-                raise Problem(
+                raise JobProblem(
                     "a grid has no normal distribution: give a list of values",
                     ("settings", name, spec.kind),
                 )

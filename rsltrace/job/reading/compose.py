@@ -18,14 +18,14 @@ from pydantic import Field
 from rsltrace.errors import JobError
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import shorthand_at, without_alternatives
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.override import apply_override
-from rsltrace.job.reading.substitute import Substitution
+from rsltrace.job.reading.substitute import JobSubstitution
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource
 from rsltrace.job.values.checks import attach, check, check_names, is_plain, items, text
 from rsltrace.job.values.mappings import check_path, near_path
 from rsltrace.job.values.names import check_variable
-from rsltrace.job.values.problem import Collected, Loc, Problem, describe
+from rsltrace.job.values.problem import JobProblem, Loc, ProblemCollector, describe
 
 DEPTH_MAX = 20
 _WHAT = frozenset(("node", "main", "executable", "script", "module", "launch"))
@@ -42,13 +42,15 @@ attach(_paths, schema={"anyOf": [_PATH, {"type": "array", "items": _PATH}]})
 
 def _variables(value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to values, got {describe(value)}")
+        raise JobProblem(f"expected a mapping of names to values, got {describe(value)}")
     check_names(value, check_variable)
-    problems = Collected()
+    problems = ProblemCollector()
     for name, inner in value.items():
         with problems.at(name):
             if inner is None or isinstance(inner, (dict, list)):
-                raise Problem(f"a variable is text, a number, true or false, got {describe(inner)}")
+                raise JobProblem(
+                    f"a variable is text, a number, true or false, got {describe(inner)}"
+                )
     problems.check()
     return value
 
@@ -61,39 +63,33 @@ attach(
 )
 
 
-class Composition(Part):
+class CompositionKeys(JobPart):
     """The keys that say what a job file is put together from. They are gone once it is read."""
 
     base: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="A job file to extend, relative to this file. What is written here wins: "
-        "mappings are merged key by key (of keys that exclude each other, such as distributions, "
-        "the base's goes), an entry of `nodes` changes the base's node of the same "
-        "`name` (others are added), other lists replace the base's, and `null` takes away what "
-        "the base says.",
+        description="A job file to extend. Mappings are merged key by key, entries of `nodes` by "
+        "`name`; other lists replace those of the base, and `null` removes a key.",
         examples=["../robot/job.yaml"],
     )
     include: Annotated[tuple[str, ...], check(_paths)] = Field(
         default=(),
-        description="Files whose keys belong to this job, too: a path or a list of paths, relative "
-        "to this file. Their `nodes`, `launch` and `bags` are added in front of this file's; apart "
-        "from that they are merged like a base, later ones over earlier ones.",
+        description="Job files to merge, later ones over earlier ones. Their `nodes`, `launch` "
+        "and `bags` are added before this file's.",
         examples=[["sensors.yaml", "../common/recording.yaml"]],
     )
     vars: Annotated[dict[str, Any], check(_variables)] = Field(
         default_factory=dict,
-        description="Values to use elsewhere in the job as `$(var NAME)`; "
-        "`--set vars.NAME=...` gives them others. Also understood in every value: "
-        "`$(env NAME default)`, `$(find-pkg-share PACKAGE)`, `$(find-pkg-prefix PACKAGE)` and "
-        "`$(dirname)`, the folder of the file; the share of a package in `search_path` that nobody "
-        "has built is its folder. Text without quotes is read again after that, so "
-        "`seed: $(env SEED 7)` is a number. `\\$(` stands for itself.",
+        description="Values for `$(var NAME)`, which `--set vars.NAME=...` overrides. Values may "
+        "also contain `$(env NAME default)`, `$(find-pkg-share PACKAGE)`, "
+        "`$(find-pkg-prefix PACKAGE)` and `$(dirname)`, the folder of the file. "
+        "Unquoted text is parsed again afterwards. Write `\\$(` for a plain `$(`.",
         examples=[{"robot": "husky", "rate": 50.0}],
     )
 
 
 @dataclass(eq=False)
-class Composed:
+class ComposedJob:
     """A job put together: its values, its own file, and from what else it was made."""
 
     root: Item
@@ -117,14 +113,14 @@ class Composed:
 
 def compose(
     name: str, read: Callable[[str], YamlSource], overrides: Sequence[tuple[str, str]]
-) -> Composed:
+) -> ComposedJob:
     """Return the job of the file ``name``, which ``read`` parses, with overrides applied.
 
     An override is (what messages call it, ``key=value``). Raises ``JobError``.
     """
     source = read(name)
-    composed = Composed(_root(source, name), source)
-    early = Substitution(None)
+    composed = ComposedJob(_root(source, name), source)
+    early = JobSubstitution(None)
     composed.root = _with_others(composed.root, name, read, early, [], composed)
     for label, override in overrides:
         composed.root = apply_override(composed.root, label, override, folder=os.getcwd())
@@ -132,7 +128,7 @@ def compose(
     values = dict(composed.root.value)
     variables = values.get("vars")
     known = variables.value if variables is not None and _is_mapping(variables) else {}
-    late = Substitution(known, lambda: _search_path(composed.root, Substitution(known)))
+    late = JobSubstitution(known, lambda: _search_path(composed.root, JobSubstitution(known)))
     composed.root = late.tree(composed.root)
     composed.substituted = early.used or late.used or bool(variables)
     return composed
@@ -151,9 +147,9 @@ def _with_others(
     root: Item,
     name: str,
     read: Callable[[str], YamlSource],
-    early: Substitution,
+    early: JobSubstitution,
     outer: list[str],
-    composed: Composed,
+    composed: ComposedJob,
 ) -> Item:
     """Return the values of a file with those of its base and included files below them."""
     outer = [*outer, os.path.realpath(name)]
@@ -180,9 +176,9 @@ def _other(
     root: Item,
     name: str,
     read: Callable[[str], YamlSource],
-    early: Substitution,
+    early: JobSubstitution,
     outer: list[str],
-    composed: Composed,
+    composed: ComposedJob,
     item: Item,
     role: str,
 ) -> Item:
@@ -215,7 +211,7 @@ def _other(
     return _with_search_path(_with_others(other, shown, read, early, outer, composed))
 
 
-def _search_path(root: Item, substitution: Substitution) -> list[Path]:
+def _search_path(root: Item, substitution: JobSubstitution) -> list[Path]:
     """Return the folders of a job's ``search_path``, or the folder of its file."""
     listed = root.value.get("search_path")
     items = listed.value if listed is not None and isinstance(listed.value, list) else [listed]

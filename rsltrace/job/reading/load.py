@@ -15,11 +15,11 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import file_fields, keys_with
 from rsltrace.job.parts.part import worded_problems
-from rsltrace.job.reading.compose import Composition, compose
+from rsltrace.job.reading.compose import CompositionKeys, compose
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
 from rsltrace.job.values.checks import FROM_FILE
-from rsltrace.job.values.mappings import FileText
-from rsltrace.job.values.problem import Loc, Problem, format_loc, unknown_key
+from rsltrace.job.values.mappings import TextWithFolder
+from rsltrace.job.values.problem import JobProblem, Loc, format_loc, unknown_key
 from rsltrace.trace.model.regular_file import read_regular
 
 # The values of job files as a tree in which every value knows the file and line it came from.
@@ -57,7 +57,7 @@ def plain(item: Item, base_dir: str) -> object:
     if isinstance(value, str):
         folder = item.place.source.folder
         if folder is not None and folder != base_dir:
-            return FileText(value, os.path.relpath(folder, base_dir))
+            return TextWithFolder(value, os.path.relpath(folder, base_dir))
     return value
 
 
@@ -128,7 +128,7 @@ def _load(
     assert isinstance(given, dict)
 
     job_keys = [key for key, _ in file_fields(Job)]
-    composing = {key for key, _ in file_fields(Composition)}
+    composing = {key for key, _ in file_fields(CompositionKeys)}
     problems = _composition_problems({key: given[key] for key in given if key in composing})
     values: dict[str, object] = {}
     for key, value in given.items():
@@ -159,11 +159,11 @@ def _parse(name: str) -> YamlSource:
     return parse_yaml(_read(Path(name)), name, folder=folder)
 
 
-def _composition_problems(values: dict[str, object]) -> list[Problem]:
+def _composition_problems(values: dict[str, object]) -> list[JobProblem]:
     try:
-        Composition.model_validate(values, context=FROM_FILE)
+        CompositionKeys.model_validate(values, context=FROM_FILE)
     except ValidationError as error:
-        return worded_problems(error, Composition)
+        return worded_problems(error, CompositionKeys)
     return []
 
 
@@ -222,7 +222,7 @@ def _read(path: Path) -> str:
         ) from None
 
 
-def _job_error(root: Item, problems: list[Problem]) -> JobError:
+def _job_error(root: Item, problems: list[JobProblem]) -> JobError:
     """Return one error that tells all problems: the first file's first, each in its order."""
     found = [(place_at(root, p.loc, at_key=p.at_key), p.message) for p in problems]
     names = list(

@@ -22,7 +22,7 @@ _DECLARE_SEVERAL = "declare_parameters"
 
 
 @dataclass(frozen=True)
-class Found:
+class NodeSource:
     """A target in its source. ``folder`` is where its module was found (None: Python's own path).
 
     ``parameters`` are those that are declared with a literal name; the value is None where the
@@ -39,7 +39,7 @@ class Found:
     topics: tuple[str, ...] = ()
 
 
-def look_up(target: str, folders: list[Path]) -> Found:
+def inspect_target(target: str, folders: list[Path]) -> NodeSource:
     """Find ``module:Class`` in ``folders`` or Python's own path.
 
     :raises JobError: if there is no such module, or it has no such class or function.
@@ -58,13 +58,13 @@ def look_up(target: str, folders: list[Path]) -> Found:
         if name not in names:
             raise JobError(f"{target}: {file} has no {name!r}{did_you_mean(name, names)}")
     if body is None:
-        return Found(target, folder, {})
+        return NodeSource(target, folder, {})
     name, is_main = _node_name(body), _is_main(body)
     topics = _topics(body if isinstance(body, ast.ClassDef) else tree, name)
-    return Found(target, folder, _parameters(body), name, is_main, topics)
+    return NodeSource(target, folder, _parameters(body), name, is_main, topics)
 
 
-def look_up_file(source: str) -> Found:
+def inspect_file(source: str) -> NodeSource:
     """Find ``path/to/file.py:Class``, or the one class of nodes in ``path/to/file.py``.
 
     Its module is named from the folder above the outermost package that the file is in.
@@ -88,7 +88,7 @@ def look_up_file(source: str) -> Found:
     folder, module = Path(os.path.abspath(file.parent)), file.stem
     while (folder / "__init__.py").is_file() and folder.name:
         folder, module = folder.parent, f"{folder.name}.{module}"
-    return look_up(f"{module}:{attribute}", [folder])
+    return inspect_target(f"{module}:{attribute}", [folder])
 
 
 def _parsed(file: Path) -> ast.Module:

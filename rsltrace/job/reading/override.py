@@ -22,7 +22,7 @@ _APPEND = "+"
 
 
 @dataclass(frozen=True)
-class _Step:
+class _PathStep:
     """One part of a path, where it stands, and how it was written."""
 
     text: str
@@ -72,17 +72,17 @@ def as_overlay(overrides: Iterable[tuple[str, str]]) -> tuple[dict[str, Any], li
     return said, left
 
 
-def _steps(source: YamlSource) -> tuple[list[_Step], int]:
+def _steps(source: YamlSource) -> tuple[list[_PathStep], int]:
     """Return the path of an override, and where its value begins."""
     text, at = source.text, 0
-    steps: list[_Step] = []
+    steps: list[_PathStep] = []
     while True:
         match = _STEP.match(text, at)
         if match is None:
             break
         quoted = match.group(1) is not None or match.group(2) is not None
         name = next(group for group in match.groups() if group is not None)
-        steps.append(_Step(name.strip() if not quoted else name, _place(source, at), quoted))
+        steps.append(_PathStep(name.strip() if not quoted else name, _place(source, at), quoted))
         at = match.end()
         if text[at : at + 1] == ".":
             at += 1
@@ -98,7 +98,7 @@ def _place(source: YamlSource, at: int) -> Place:
     return Place(source, Mark(1, at + 1))
 
 
-def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
+def _set(item: Item | None, steps: list[_PathStep], value: Item, loc: Loc) -> Item:
     """Return ``item`` with the value at the end of the path replaced."""
     if not steps:
         return value
@@ -132,7 +132,7 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
     return replace(item, value=values)
 
 
-def _key(values: dict[Any, Item], steps: list[_Step]) -> tuple[str, int]:
+def _key(values: dict[Any, Item], steps: list[_PathStep]) -> tuple[str, int]:
     """Return the key that a path goes on with: parameters may have dots in their names."""
     for used in range(len(steps), 1, -1):
         name = ".".join(step.text for step in steps[:used])
@@ -141,7 +141,7 @@ def _key(values: dict[Any, Item], steps: list[_Step]) -> tuple[str, int]:
     return steps[0].text, 1
 
 
-def _set_in_list(items: list[Item], steps: list[_Step], value: Item, loc: Loc) -> list[Item]:
+def _set_in_list(items: list[Item], steps: list[_PathStep], value: Item, loc: Loc) -> list[Item]:
     step, name = steps[0], ".".join(map(str, loc))
     if step.text == _APPEND and not step.quoted:
         return [*items, _set(None, steps[1:], value, (*loc, len(items)))]
@@ -152,7 +152,7 @@ def _set_in_list(items: list[Item], steps: list[_Step], value: Item, loc: Loc) -
     return [*items[:index], new, *items[index + 1 :]]
 
 
-def _index(items: list[Item], step: _Step, name: str) -> int:
+def _index(items: list[Item], step: _PathStep, name: str) -> int:
     if step.text.isdecimal() and not step.quoted:
         if int(step.text) < len(items):
             return int(step.text)

@@ -13,7 +13,7 @@ from typing import Any
 
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import models_in
-from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.times import Nanoseconds
 
 _NOT_FINITE = {".nan": float("nan"), ".inf": float("inf"), "-.inf": float("-inf")}
@@ -43,7 +43,7 @@ def job_from_resolved(
     return Job(**given, **unknown, base_dir=Path(folder), source_name=name or "<python>")
 
 
-def _given(part: type[Part], value: Any) -> Any:
+def _given(part: type[JobPart], value: Any) -> Any:
     """Return a part's values by the keys of its constructor, times marked as nanoseconds."""
     if not isinstance(value, dict):
         return value
@@ -55,17 +55,17 @@ def _given(part: type[Part], value: Any) -> Any:
                 found[name] = inner  # unknown here: the models say so
             continue
         key = field.alias or name
-        models = [model for model in models_in(field.annotation) if issubclass(model, Part)]
+        models = [model for model in models_in(field.annotation) if issubclass(model, JobPart)]
         if part.counts_ns(name):
             found[key] = _counted(inner)
-        elif models and models[0] is not Part:
+        elif models and models[0] is not JobPart:
             found[key] = _parts(models, inner)
         else:
             found[key] = _finite_or_not(inner)
     return found
 
 
-def _parts(models: list[type[Part]], value: Any) -> Any:
+def _parts(models: list[type[JobPart]], value: Any) -> Any:
     """Return parts wherever they are in a value: itself, in a list, or in a mapping of names."""
     if isinstance(value, list):
         return [_parts(models, item) for item in value]

@@ -34,7 +34,7 @@ _NOT_HERE = {
 }
 
 
-class Substitution:
+class JobSubstitution:
     """Replaces ``$(...)`` in values. ``variables`` are those of ``vars:``, or None before these
     are known; ``folders`` returns where packages are looked for that nobody has built."""
 

@@ -133,7 +133,7 @@ def parse_yaml(
     try:
         root = YAML().compose(written)
         if root is not None:
-            source.root = _Builder(source).build(root)
+            source.root = _YamlValueBuilder(source).build(root)
     except MarkedYAMLError as error:
         raise _syntax_error(source, error) from None
     except ReaderError as error:
@@ -163,7 +163,7 @@ def bare_value(text: str) -> object:
         return text
 
 
-class _Builder:
+class _YamlValueBuilder:
     """Makes items of composed nodes."""
 
     def __init__(self, source: YamlSource) -> None:

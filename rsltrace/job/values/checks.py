@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, ValidationInfo
 
 from rsltrace.errors import nearest
 from rsltrace.job.values.names import check_glob
-from rsltrace.job.values.problem import Collected, Problem, as_flag, describe
+from rsltrace.job.values.problem import JobProblem, ProblemCollector, as_flag, describe
 from rsltrace.job.values.times import TIME_SCHEMA, parse_time
 
 FROM_FILE = {"from_file": True}
@@ -45,7 +45,7 @@ def check(
 
     def validate(value: object, info: ValidationInfo) -> object:
         if value is None and from_file(info):
-            raise Problem("no value is given: give one, or leave the key out")
+            raise JobProblem("no value is given: give one, or leave the key out")
         return None if value is None and optional else function(value)
 
     return BeforeValidator(attach(validate, schema=getattr(function, "schema", None), **facts))
@@ -77,7 +77,7 @@ def parts(shorthand: str | None = None, *, optional: bool = False) -> BeforeVali
             hint = _as_list(values) if shorthand is not None else ""
             if isinstance(values, dict):
                 hint = "; put '- ' in front of each entry"
-            raise Problem(f"expected a list, got {describe(values)}{hint}")
+            raise JobProblem(f"expected a list, got {describe(values)}{hint}")
         if shorthand is None:
             return tuple(values)
         return tuple({shorthand: v} if isinstance(v, str) else v for v in values)
@@ -93,7 +93,7 @@ def named_parts(
 
     def entries(values: object) -> object:
         if not isinstance(values, dict):
-            raise Problem(f"expected a mapping of names to {what}, got {describe(values)}")
+            raise JobProblem(f"expected a mapping of names to {what}, got {describe(values)}")
         check_names(values, rule)
         return {
             name: {shorthand: value} if is_plain(value) else value for name, value in values.items()
@@ -105,7 +105,7 @@ def named_parts(
 
 def check_names(names: Iterable[object], rule: Callable[[str], None]) -> None:
     """Raise ``Problems`` with every key of a mapping that is not text that ``rule`` accepts."""
-    problems = Collected()
+    problems = ProblemCollector()
     for name in names:
         with problems.at(str(name), at_key=True):
             text(rule)(name)
@@ -117,7 +117,7 @@ def text(rule: Callable[[str], None] | None = None) -> Callable[[Any], str]:
 
     def function(value: object) -> str:
         if not isinstance(value, str):
-            raise Problem(f"expected text, got {describe(value)}")
+            raise JobProblem(f"expected text, got {describe(value)}")
         if rule is not None:
             rule(value)
         return str(value)
@@ -133,10 +133,10 @@ def whole(least: int, most: int = 2**63 - 1) -> Callable[[Any], int]:
 
     def function(value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int):
-            raise Problem(f"expected an integer, got {describe(value)}{_as_integer(value)}")
+            raise JobProblem(f"expected an integer, got {describe(value)}{_as_integer(value)}")
         if not least <= value <= most:
             bound = f"at least {least}" if value < least else f"at most {most}"
-            raise Problem(f"must be {bound}, got {value}")
+            raise JobProblem(f"must be {bound}, got {value}")
         return int(value)
 
     attach(function, schema={"type": "integer", "minimum": least, "maximum": most})
@@ -159,7 +159,7 @@ def one_of(*choices: str) -> Callable[[Any], str]:
         if not isinstance(value, str) or value not in choices:
             near = nearest(str(value).lower(), choices) if len(choices) > 2 else None
             hint = f"; did you mean {near}?" if near else ""
-            raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}{hint}")
+            raise JobProblem(f"expected {' or '.join(choices)}, got {describe(value)}{hint}")
         return str(value)
 
     attach(function, schema={"enum": list(choices)})
@@ -169,7 +169,7 @@ def one_of(*choices: str) -> Callable[[Any], str]:
 def flag(value: object) -> bool:
     """Check true or false."""
     if not isinstance(value, bool):
-        raise Problem(f"expected true or false, got {describe(value)}{as_flag(value)}")
+        raise JobProblem(f"expected true or false, got {describe(value)}{as_flag(value)}")
     return value
 
 
@@ -181,12 +181,12 @@ def number(least: float, most: float | None = None, *, open_below: bool = False)
 
     def function(value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise Problem(f"expected a number, got {describe(value)}{_as_number(value)}")
+            raise JobProblem(f"expected a number, got {describe(value)}{_as_number(value)}")
         low = value > least if open_below else value >= least
         if not low or (most is not None and not value <= most) or value in (float("inf"),):
             above = f"greater than {least:g}" if open_below else f"at least {least:g}"
             below = f" and at most {most:g}" if most is not None else ""
-            raise Problem(f"must be {above}{below}, got {getattr(value, 'text', value)}")
+            raise JobProblem(f"must be {above}{below}, got {getattr(value, 'text', value)}")
         return float(value)
 
     schema: dict[str, object] = {"type": "number"}
@@ -212,7 +212,7 @@ def positive_time(value: object) -> int:
     """Check a time that must be more than nothing."""
     time_ns = parse_time(value)
     if time_ns == 0:
-        raise Problem("must be more than 0")
+        raise JobProblem("must be more than 0")
     return time_ns
 
 
@@ -225,9 +225,9 @@ def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ..
 
     def check_items(values: object) -> tuple[object, ...]:
         if not isinstance(values, (list, tuple)):
-            raise Problem(f"expected a list, got {describe(values)}{_as_list(values)}")
+            raise JobProblem(f"expected a list, got {describe(values)}{_as_list(values)}")
         checked: list[object] = []
-        problems = Collected()
+        problems = ProblemCollector()
         for index, value in enumerate(values):
             with problems.at(index):
                 checked.append(function(value))

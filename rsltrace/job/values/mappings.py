@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.errors import nearest
 from rsltrace.job.values.checks import attach, text
 from rsltrace.job.values.names import check_remap_from, check_remap_to
-from rsltrace.job.values.problem import Collected, Problem, Problems, describe
+from rsltrace.job.values.problem import JobProblem, JobProblems, ProblemCollector, describe
 from rsltrace.job.values.times import ExactFloat
 
 # Telling a program's own words from the ROS arguments on one command line.
@@ -37,12 +37,12 @@ def split_ros_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
 # Paths in a job: they start at the folder of the file they are written in.
 
 
-class FileText(str):
+class TextWithFolder(str):
     """Text from a file of another folder than the job's: a path in it starts at ``folder``."""
 
     folder: str
 
-    def __new__(cls, value: str, folder: str) -> FileText:
+    def __new__(cls, value: str, folder: str) -> TextWithFolder:
         self = super().__new__(cls, value)
         self.folder = folder
         return self
@@ -54,9 +54,9 @@ def check_path(value: object) -> str:
     if isinstance(value, os.PathLike):
         value = os.fspath(value)
     if isinstance(value, str) and not value:
-        raise Problem("a path cannot be empty")
+        raise JobProblem("a path cannot be empty")
     path = text()(value)
-    if not isinstance(value, FileText) or os.path.isabs(path):
+    if not isinstance(value, TextWithFolder) or os.path.isabs(path):
         return path
     return os.path.normpath(os.path.join(value.folder, path)).replace(os.sep, "/")
 
@@ -88,8 +88,8 @@ def names_to_names(
 ) -> dict[str, str]:
     """Check a mapping of names to names, each side by a rule of its own."""
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to names (from: to), got {describe(value)}")
-    problems = Collected()
+        raise JobProblem(f"expected a mapping of names to names (from: to), got {describe(value)}")
+    problems = ProblemCollector()
     for name, to in value.items():
         with problems.at(str(name), at_key=True):
             text(rule_from)(name)
@@ -120,25 +120,27 @@ def check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:
     if isinstance(value, (list, tuple)):
         return _check_words(value)
     if not isinstance(value, dict):
-        raise Problem(
+        raise JobProblem(
             "expected a mapping of argument names to values (node:) or a list of command-line "
             f"words (main:, executable:, script:, module:), got {describe(value)}"
         )
     for name in value:
         if not isinstance(name, str) or not name.isidentifier():
-            raise Problem(f"{name!r} cannot be the name of an argument", (str(name),), at_key=True)
+            raise JobProblem(
+                f"{name!r} cannot be the name of an argument", (str(name),), at_key=True
+            )
     return {name: _plain_floats(item) for name, item in value.items()}
 
 
 def _check_words(values: list[object] | tuple[object, ...]) -> tuple[str, ...]:
     """Check command-line words; a number stands for its digits, as on a command line."""
     problems = [
-        Problem(f"expected a word of a command line, got {describe(value)}", (index,))
+        JobProblem(f"expected a word of a command line, got {describe(value)}", (index,))
         for index, value in enumerate(values)
         if isinstance(value, bool) or not isinstance(value, (str, int, float))
     ]
     if problems:
-        raise Problems(problems)
+        raise JobProblems(problems)
     return tuple(str(getattr(value, "text", value)) for value in values)
 
 
@@ -157,7 +159,7 @@ def _plain_floats(value: object) -> object:
     # What user code gets must not carry types of ours.
     if isinstance(value, ExactFloat):
         return float(value)
-    if isinstance(value, FileText):
+    if isinstance(value, TextWithFolder):
         return str(value)
     if type(value) is dict:
         return {key: _plain_floats(item) for key, item in value.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.job.values.problem import Loc, Problem, Problems, describe
+from rsltrace.job.values.problem import JobProblem, JobProblems, Loc, describe
 
 Scalar = bool | int | float | str
 ParameterValue = Scalar | tuple[bool, ...] | tuple[int, ...] | tuple[float, ...] | tuple[str, ...]
@@ -19,36 +19,36 @@ _KINDS = ((bool, "bool"), (int, "integer"), (float, "float"), (str, "text"))
 def flatten_parameters(values: object) -> dict[str, ParameterValue]:
     """Return ``{"nested.a": 1}`` for ``{"nested": {"a": 1}}``.
 
-    Raises ``Problems`` with the place of each value that is not a ROS parameter value.
+    Raises ``JobProblems`` with the place of each value that is not a ROS parameter value.
     """
     if not isinstance(values, dict):
-        raise Problem(f"expected a mapping of parameter names to values, got {describe(values)}")
+        raise JobProblem(f"expected a mapping of parameter names to values, got {describe(values)}")
     flat: dict[str, ParameterValue] = {}
-    problems: list[Problem] = []
+    problems: list[JobProblem] = []
     for name, loc, value in _leaves(values, "", (), problems):
         try:
             if name in flat:
-                raise Problem(f"the parameter {name!r} is given twice", loc, at_key=True)
+                raise JobProblem(f"the parameter {name!r} is given twice", loc, at_key=True)
             flat[name] = _value(value, loc)
-        except Problem as problem:
+        except JobProblem as problem:
             problems.append(problem)
     if problems:
-        raise Problems(problems)
+        raise JobProblems(problems)
     return flat
 
 
 def _leaves(
-    values: dict[object, object], prefix: str, loc: Loc, problems: list[Problem]
+    values: dict[object, object], prefix: str, loc: Loc, problems: list[JobProblem]
 ) -> Iterator[tuple[str, Loc, object]]:
     for key, value in values.items():
         place = (*loc, key if isinstance(key, (str, int)) else str(key))
         if not isinstance(key, str):
             problems.append(
-                Problem(f"a parameter's name is text, got {describe(key)}", place, at_key=True)
+                JobProblem(f"a parameter's name is text, got {describe(key)}", place, at_key=True)
             )
         elif key == "ros__parameters":
             problems.append(
-                Problem(
+                JobProblem(
                     "this looks like a ROS parameter file: list it in parameter_files, or put the "
                     "values directly below 'parameters'",
                     place,
@@ -58,7 +58,7 @@ def _leaves(
         elif not all(key.split(".")):
             # Names are otherwise free: qos_overrides./scan.publisher.depth is one.
             problems.append(
-                Problem(
+                JobProblem(
                     f"{key!r} is not a parameter name: a part before or after a '.' is empty",
                     place,
                     at_key=True,
@@ -84,7 +84,7 @@ def _list(values: list[object] | tuple[object, ...], loc: Loc) -> ParameterValue
             hint = ""
             if {first, _kind(element)} == {"integer", "float"}:
                 hint = "; write the integers with a decimal point"
-            raise Problem(
+            raise JobProblem(
                 f"element {index} is {_with_article(_kind(element))}, element 0 is "
                 f"{_with_article(first)}: rcl takes lists of one type{hint}",
                 (*loc, index),
@@ -97,15 +97,15 @@ def _scalar(value: object, loc: Loc) -> Scalar:
         return value
     if isinstance(value, int):
         if not INTEGER_MIN <= value <= INTEGER_MAX:
-            raise Problem(f"{value} does not fit a ROS integer (64 bits, signed)", loc)
+            raise JobProblem(f"{value} does not fit a ROS integer (64 bits, signed)", loc)
         return int(value)
     if isinstance(value, float):
         return float(value)
     if isinstance(value, str):
         return str(value)
     if value is None:
-        raise Problem("no value is given, and a ROS parameter cannot be null", loc)
-    raise Problem(
+        raise JobProblem("no value is given, and a ROS parameter cannot be null", loc)
+    raise JobProblem(
         f"a ROS parameter is true or false, a number, text, or a list of these; got "
         f"{describe(value)}",
         loc,

@@ -1,6 +1,6 @@
 """What is wrong with a value of a job: a message for its author, and the place within the value.
 
-Checks raise ``Problem`` (a ``ValueError``, so pydantic collects it with its own findings).
+Checks raise ``JobProblem`` (a ``ValueError``, so pydantic collects it with its own findings).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ Loc = tuple["str | int", ...]
 """A place in a job as keys and list indices: ``("nodes", 0, "name")``."""
 
 
-class Problem(ValueError):
+class JobProblem(ValueError):
     """One finding. ``loc`` is relative to the value being validated; ``at_key`` blames the key."""
 
     def __init__(self, message: str, loc: Loc = (), *, at_key: bool = False) -> None:
@@ -24,19 +24,19 @@ class Problem(ValueError):
         self.at_key = at_key
 
 
-class Problems(ValueError):
+class JobProblems(ValueError):
     """Several findings of one validator."""
 
-    def __init__(self, items: list[Problem]) -> None:
+    def __init__(self, items: list[JobProblem]) -> None:
         super().__init__("; ".join(item.message for item in items))
         self.items = items
 
 
-class Collected:
+class ProblemCollector:
     """What is wrong with the entries of a list or mapping, to be raised all at once."""
 
     def __init__(self) -> None:
-        self._items: list[Problem] = []
+        self._items: list[JobProblem] = []
 
     @contextmanager
     def at(self, *loc: str | int, at_key: bool = False) -> Iterator[None]:
@@ -44,12 +44,12 @@ class Collected:
         try:
             yield
         except ValueError as error:
-            self._items.append(Problem(str(error), loc, at_key=at_key))
+            self._items.append(JobProblem(str(error), loc, at_key=at_key))
 
     def check(self) -> None:
-        """Raise ``Problems`` if there was one."""
+        """Raise ``JobProblems`` if there was one."""
         if self._items:
-            raise Problems(self._items)
+            raise JobProblems(self._items)
 
 
 def format_loc(loc: Loc) -> str:
@@ -83,7 +83,7 @@ _BY_NAME = ("topics", "nodes")
 
 def unknown_key(
     key: object, valid: Iterable[str], loc: Loc, *, below: Iterable[str] = ()
-) -> Problem:
+) -> JobProblem:
     """Return the finding that ``key``, below ``loc``, is none of the ``valid`` keys; ``below`` are
     those of them that have such a key."""
     below = list(below)
@@ -104,7 +104,7 @@ def unknown_key(
         advice = f"valid keys are {', '.join(names)}"
     shown = repr(key) if isinstance(key, str) else describe(key).removeprefix("the number ")
     place = key if isinstance(key, (str, int)) else text
-    return Problem(f"unknown key {shown}{inside}; {advice}", (*loc, place), at_key=True)
+    return JobProblem(f"unknown key {shown}{inside}; {advice}", (*loc, place), at_key=True)
 
 
 _OTHER_WORDS = {

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from rsltrace.job.values.checks import attach, text
 from rsltrace.job.values.names import check_target, dotted_target
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 
 Target = str | Callable[..., object]
 """``module:attribute`` as text, or (in Python) the class or function itself."""
@@ -27,7 +27,7 @@ def check_callable_target(value: object) -> Target:
     if callable(value):
         return value
     if not isinstance(value, str):
-        raise Problem(f"expected module:Class or module:function, got {describe(value)}")
+        raise JobProblem(f"expected module:Class or module:function, got {describe(value)}")
     return text(check_target)(dotted_target(value))
 
 

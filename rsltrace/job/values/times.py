@@ -12,7 +12,7 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from typing import NamedTuple
 
-from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
 # Sizes in a job: a number of bytes, or a number with a unit (``4MiB``).
@@ -47,19 +47,19 @@ _SIZES_EXPECTED = (
 def parse_size(value: object) -> int:
     """Return a size of a job in bytes. Raises ``ValueError`` unless it is a whole number."""
     if isinstance(value, bool) or not isinstance(value, (int, str)):
-        raise Problem(f"{_SIZES_EXPECTED}, got {describe(value)}")
+        raise JobProblem(f"{_SIZES_EXPECTED}, got {describe(value)}")
     if isinstance(value, int):
         return _sizes_checked(Fraction(value), str(value))
     match = _SIZE_TEXT.fullmatch(value)
     if match is None:
-        raise Problem(f"{_SIZES_EXPECTED}, got {describe(value)}")
+        raise JobProblem(f"{_SIZES_EXPECTED}, got {describe(value)}")
     number, unit = match.groups()
     if not unit:
-        raise Problem(f"{value!r} has no unit: write '{number}B' for bytes")
+        raise JobProblem(f"{value!r} has no unit: write '{number}B' for bytes")
     if unit not in UNITS:
         near = [known for known in UNITS if known.lower() in (unit.lower(), f"{unit.lower()}b")]
         hint = f"did you mean {' or '.join(near)}?" if near else f"units are {', '.join(UNITS)}"
-        raise Problem(f"unknown unit {unit!r} in {value!r}; {hint}")
+        raise JobProblem(f"unknown unit {unit!r} in {value!r}; {hint}")
     return _sizes_checked(Fraction(number) * UNITS[unit], value.strip())
 
 
@@ -73,9 +73,9 @@ def format_size(size: int) -> str:
 
 def _sizes_checked(size: Fraction, shown: str) -> int:
     if size.denominator != 1:
-        raise Problem(f"{shown} is not a whole number of bytes")
+        raise JobProblem(f"{shown} is not a whole number of bytes")
     if not 1 <= size <= SIZE_MAX:
-        raise Problem(f"a size must be from 1B to {format_size(2**62)}, got {shown}")
+        raise JobProblem(f"a size must be from 1B to {format_size(2**62)}, got {shown}")
     return int(size)
 
 

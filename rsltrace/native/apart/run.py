@@ -32,7 +32,7 @@ from rsltrace.native.recording import (
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.native.support import check_loopback, domain
 from rsltrace.run.plans.entries import missed_starts
-from rsltrace.run.plans.scheduling import has_stop
+from rsltrace.run.stop_rules import has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
@@ -172,7 +172,7 @@ class MultiProcessRun(NativeRun):
                 "seen where it arrives, and its cause is unknown"
             )
         self.create(stack, output, self.merge, described, self._sources, force=force)
-        self.watch_topic(self._on_message)
+        self.watch_stop_topics(self._on_message)
 
     def _start(self, start: Start) -> Child:
         child = Child(start, self._hear, self._ended)

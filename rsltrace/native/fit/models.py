@@ -149,9 +149,7 @@ def ks_distance(a: Durations, b: Durations, *, same: float = 0.0) -> float:
 def _nearest_family(ordered: Durations) -> Model:
     """Return the family of the least BIC, fitted by maximum likelihood."""
     if importlib.util.find_spec("scipy") is None:
-        raise SetupError(
-            "fitting families of distributions needs SciPy: pip install 'rsltrace[fit]'"
-        )
+        raise SetupError("--as distributions needs SciPy: pip install 'rsltrace[fit]'")
     from scipy import stats
 
     values = np.maximum(ordered.astype(np.float64), 1.0)  # a logarithm of each

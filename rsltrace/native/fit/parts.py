@@ -14,7 +14,7 @@ from rsltrace.native.fit.models import FEW, Model, as_job_has_it, model_of, seri
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
-TABLES, FAMILIES, SERIES = HOW = ("tables", "families", "series")
+TABLES, DISTRIBUTIONS, SERIES = HOW = ("tables", "distributions", "series")
 OWN_POLICY = "priority"
 """What native executors go by whose priorities are those of the job's own policy."""
 _TAIL_NS = 500_000
@@ -33,16 +33,15 @@ class Fit:
 
 
 def fit(measured: NativeTimes, how: str = TABLES) -> Fit:
-    """Return models of all that was measured: ``tables`` or ``families`` (see ``model_of``), or
-    ``series`` (see ``series_of``).
+    """Return models of the measured times: ``tables``, ``distributions`` or ``series``.
 
-    :raises SetupError: of ``families``, if SciPy is missing.
+    :raises SetupError: of ``distributions``, if SciPy is missing.
     """
 
     def model(since: Durations, durations: Durations) -> Model:
         if how == SERIES:
             return series_of(since, durations)
-        return model_of(durations, family=how == FAMILIES)
+        return model_of(durations, family=how == DISTRIBUTIONS)
 
     links = [(one, model(one.since, one.delays)) for one in measured.links if len(one.delays)]
     executions = [(one, model(one.since, one.busy)) for one in measured.executions]

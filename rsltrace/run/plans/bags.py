@@ -15,7 +15,7 @@ from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.job.values.names import check_topic
 from rsltrace.run.plans.faults import BagFaults, check_changes
-from rsltrace.run.plans.scheduling import end_ns_of, has_stop
+from rsltrace.run.stop_rules import end_ns_of, has_stop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.format import PREFIX_OWN
 from rsltrace.trace.model.event import EventKind

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
-
-from rsltrace.errors import RunError
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,50 +66,5 @@ def stop_after_events(count: int) -> StopCondition:
 
     def condition(progress: Progress) -> Stop | None:
         return Stop(f"{count} events") if progress.events >= count else None
-
-    return condition
-
-
-def stop_when_quiet(duration_ns: int, reason: str) -> StopCondition:
-    """Stop once nothing was published, called or answered for ``duration_ns``."""
-
-    def condition(progress: Progress) -> Stop | None:
-        quiet_since = max(progress.activity_ns, progress.start_ns)
-        next_ns = progress.now_ns if progress.next_ns is None else progress.next_ns
-        return Stop(reason) if next_ns - quiet_since > duration_ns else None
-
-    return condition
-
-
-def stop_when(function: Callable[[Progress], object], name: str) -> StopCondition:
-    """Stop when a user's function says so.
-
-    ``True`` stops with exit status 0, an integer other than a bool stops with that exit status,
-    ``None`` and ``False`` go on; so the integer 0 stops with status 0, too.
-
-    :raises RunError: if the function raises, or returns anything else.
-    """
-
-    def condition(progress: Progress) -> Stop | None:
-        try:
-            answer = function(progress)
-        except SystemExit as error:
-            answer = 0 if error.code is None else error.code
-            if not isinstance(answer, int):
-                return Stop(f"function {name} raised SystemExit: {answer}", 1)
-        except Exception as error:
-            raise RunError(
-                f"the stop function {name} raised {type(error).__qualname__}: {error}"
-            ) from error
-        else:
-            if answer is None or answer is False:
-                return None
-        code = 0 if answer is True else answer
-        if not isinstance(code, int):
-            raise RunError(
-                f"the stop function {name} returned {answer!r}; "
-                "expected None, a bool or an integer exit status"
-            )
-        return Stop(f"function {name}", code)
 
     return condition

@@ -1,4 +1,4 @@
-"""Times and texts for people. Texts come from files that anybody may have made."""
+"""Texts of traces, safe to print on a terminal, and times and durations as text."""
 
 from __future__ import annotations
 
@@ -26,22 +26,31 @@ def patience_ns(seconds: float) -> int:
     return int(seconds * NS_PER_S) or int(seconds > 0)
 
 
-def format_duration(duration_ns: int, digits: int = _DIGITS) -> str:
-    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``, rounded.
+def format_duration(duration_ns: float, digits: int = _DIGITS, *, signed: bool = False) -> str:
+    """Return a duration rounded to some digits: ``12.5 s``, ``3.2 ms``, ``250 ns``.
 
-    From a million seconds on it is exact: these are times since 1970.
+    A million seconds and more are written in full: they are times since 1970.
     """
-    size = abs(duration_ns)
-    if size >= _IN_FULL_NS:
-        return f"{format_seconds(duration_ns).rstrip('0').rstrip('.')} s"
+    sign = "+" if signed else ""
+    if abs(duration_ns) >= _IN_FULL_NS:
+        plus = sign if duration_ns > 0 else ""
+        return f"{plus}{format_seconds(int(duration_ns)).rstrip('0').rstrip('.')} s"
+    rounded = float(f"{duration_ns:.{digits}g}")
     for unit, scale in (("s", NS_PER_S), ("ms", 1_000_000), ("us", 1_000)):
-        if size >= scale:
-            return f"{duration_ns / scale:.{digits}g} {unit}"
-    return f"{duration_ns} ns"
+        if abs(rounded) >= scale:
+            return f"{rounded / scale:{sign}.{digits}g} {unit}"
+    return f"{round(rounded):{sign}d} ns"
+
+
+def format_milliseconds(duration_ns: int | None) -> str:
+    """Return a duration for a column in milliseconds."""
+    if duration_ns is None:
+        return "-"
+    return f"{duration_ns / 1e6:.{4 if abs(duration_ns) < 10 * NS_PER_S else 9}g}"
 
 
 def durations_apart(a_ns: int, b_ns: int) -> tuple[str, str]:
-    """Return two durations for people, with enough digits to differ."""
+    """Return two durations with as many digits as it takes to see the difference."""
     for digits in range(_DIGITS, _DIGITS_MAX):
         a, b = format_duration(a_ns, digits), format_duration(b_ns, digits)
         if _told_ns(a) != _told_ns(b) or a_ns == b_ns:

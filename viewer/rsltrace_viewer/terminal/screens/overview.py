@@ -338,7 +338,7 @@ def _latency(chain: Chain | None) -> str:
     if chain is None or chain.latency is None:
         return "-"
     times = (chain.latency.p50_ns, chain.latency.max_ns, chain.oldest_ns)
-    return ", ".join("-" if one is None else _short(one) for one in times)
+    return ", ".join("-" if one is None else format_duration(one, 3) for one in times)
 
 
 def _ending(run: Run, name: str) -> Pieces:
@@ -370,9 +370,11 @@ def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[_Column]:
 
 def _times(of: Callable[[Part], Times | None], row: _Row, *, busy: bool) -> str:
     found = [None if part is None else of(part) for part in row]
-    texts = [_short(one.mean_ns) if one is not None and one.count else "" for one in found]
+    texts = [
+        format_duration(one.mean_ns, 3) if one is not None and one.count else "" for one in found
+    ]
     if len(found) == 1 and texts[0] and found[0] is not None:
-        texts.append(_short(found[0].most_ns))
+        texts.append(format_duration(found[0].most_ns, 3))
     if busy and texts[0]:
         texts[-1] += f" {_some(row).share:>4.0%}"
     return ", ".join(text or "-" for text in texts) if any(texts) else ""
@@ -400,7 +402,3 @@ def _filter_of(field: str, part: Part) -> str:
     if field == "entity":
         return f'node:"{part.node}" entity:"{part.name}"'
     return f'{field}:"{part.node if field == "node" else part.name}"'
-
-
-def _short(duration_ns: int) -> str:
-    return format_duration(round(float(f"{duration_ns:.3g}")))

@@ -1,0 +1,46 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+set_option = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set a key of the job, such as stop.duration=10s or nodes.ekf.parameters.rate=20.0. "
+    "Repeatable.",
+)
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's."
+)
+until_option = click.option(
+    "--until",
+    metavar="T",
+    help="Stop at time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
+)
+timeout_option = click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Kill a run after S seconds of real time (default: 30 times the duration of the first "
+    "run, at least 120).",
+)
+no_pin_option = click.option(
+    "--no-pin",
+    is_flag=True,
+    help="Do not pin the hash seed, memory addresses, time zone, locale and thread counts.",
+)
+job_folder_option = click.option(
+    "--job-folder",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="The folder of the job file (default: the trace's folder, or the working directory).",
+)
+trust_option = click.option(
+    "--trust", is_flag=True, help="Run the code that TRACE names without asking."
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
