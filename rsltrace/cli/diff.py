@@ -113,9 +113,9 @@ class Tolerance(_Type):
     help="First read all of both traces; check all checksums, hashes and messages.",
 )
 @click.option(
-    "--as-far-as-they-go",
+    "--allow-truncated",
     is_flag=True,
-    help="It is enough if recordings that are cut agree until there.",
+    help="Accept truncated recordings that agree up to where they end.",
 )
 @click.option(
     "--again",
@@ -142,7 +142,7 @@ def diff(
     relative: tuple[tuple[str, float], ...],
     by: str,
     check: bool,
-    as_far_as_they_go: bool,
+    allow_truncated: bool,
     again: str | None,
     output: Path | None,
 ) -> int:
@@ -155,8 +155,8 @@ def diff(
     FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
     topics and a colon. A tolerance never makes two traces identical.
 
-    The exit status is 0 if nothing differs, 1 if the runs diverge, or one of the files is cut (then
-    nobody knows, unless --as-far-as-they-go is enough), 2 for trouble, 3 if they are equal within
+    The exit status is 0 if nothing differs, 1 if the runs diverge, or a file is truncated
+    (unless --allow-truncated accepts that), 2 for trouble, 3 if they are equal within
     tolerance and not identical.
     """
     if again is not None:
@@ -170,7 +170,7 @@ def diff(
         absolute=absolute,
         relative=relative,
         by=by,
-        as_far_as_they_go=as_far_as_they_go,
+        allow_truncated=allow_truncated,
     )
     return _diff(golden, others, form, options, output, check=check)
 

@@ -134,7 +134,7 @@ class Diff:
     bytes_read: int = 0
     remarks: tuple[Remark, ...] = ()
     tolerance: BagDiff | None = None
-    as_far_as_they_go: bool = False
+    allow_truncated: bool = False
     """Whether it is enough that they agree as far as they go."""
 
     effect: Divergence | None = None
@@ -168,7 +168,7 @@ class Diff:
     @property
     def agrees_until_cut(self) -> bool:
         """Whether a recording is cut, and the runs agree as far as both go."""
-        return self.verdict is Verdict.AS_FAR_AS_THEY_GO
+        return self.verdict is Verdict.AGREE_UNTIL_TRUNCATED
 
     @property
     def within_tolerance(self) -> bool:
@@ -197,7 +197,7 @@ class Diff:
             return 0
         if self.agrees_until_cut:
             agrees = self.agreeing or (self.native is not None and self.native.compared)
-            return 0 if self.as_far_as_they_go and agrees else EXIT_DIVERGED
+            return 0 if self.allow_truncated and agrees else EXIT_DIVERGED
         return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED
 
     def _repr_html_(self) -> str:

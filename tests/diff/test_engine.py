@@ -313,7 +313,7 @@ def test_an_interrupted_run_agrees_only_as_far_as_it_goes(tmp_path: Path) -> Non
     Simulation(PLAN, tmp_path / "b.mcap", storage=Storage(50, close=False)).run()
     _cut(tmp_path / "b.mcap", (tmp_path / "b.mcap").stat().st_size // 2)
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
+    assert diff.verdict is Verdict.AGREE_UNTIL_TRUNCATED
     assert not diff.b.complete
     assert diff.b.stop_reason == "interrupted"
     assert diff.agreeing == diff.b.events > 100
@@ -322,7 +322,7 @@ def test_an_interrupted_run_agrees_only_as_far_as_it_goes(tmp_path: Path) -> Non
     )
     assert "the recording of b" in diff.notes[0]
     assert (diff.identical, diff.diverged, diff.failed, diff.exit_code) == (False, False, True, 1)
-    accepted = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    accepted = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", allow_truncated=True)
     assert (accepted.identical, accepted.failed, accepted.exit_code) == (False, False, 0)
 
 
@@ -330,7 +330,7 @@ def test_two_runs_that_were_both_interrupted_are_not_identical(tmp_path: Path) -
     for name in ("a.mcap", "b.mcap"):
         Simulation(PLAN, tmp_path / name, storage=Storage(50, close=False)).run()
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
+    assert diff.verdict is Verdict.AGREE_UNTIL_TRUNCATED
     assert diff.sentence.endswith("events: both recordings are cut")
     assert diff.exit_code == 1
 
@@ -346,14 +346,14 @@ def test_a_trace_is_not_identical_to_its_own_beginning(tmp_path: Path) -> None:
             diff = rsltrace.diff(tmp_path / f"{a}.mcap", tmp_path / f"{b}.mcap")
             verdicts.add(diff.verdict)
             assert diff.exit_code == 1, size
-    assert verdicts == {Verdict.AS_FAR_AS_THEY_GO}
+    assert verdicts == {Verdict.AGREE_UNTIL_TRUNCATED}
 
 
 def test_a_cut_run_still_diverges_where_it_does_something_else(tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     fault = Fault("bit", step(20, 1))
     Simulation(PLAN, tmp_path / "b.mcap", (fault,), storage=Storage(50, close=False)).run()
-    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", allow_truncated=True)
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     assert diff.exit_code == 1
 
@@ -377,13 +377,13 @@ def test_runs_without_an_event_are_not_equal_if_their_jobs_are_not(
     )
     for path in (a, b, c):
         _cut(path, size) if size else None
-    for options in ({}, {"as_far_as_they_go": True}):
+    for options in ({}, {"allow_truncated": True}):
         diff = rsltrace.diff(a, b, **options)
         assert diff.verdict is Verdict.DIFFERENT_JOBS
         assert diff.exit_code == 1
         assert '("x", "y")' in diff.sentence
         same = rsltrace.diff(a, c, **options)
-        assert same.verdict is (Verdict.AS_FAR_AS_THEY_GO if size else Verdict.IDENTICAL)
+        assert same.verdict is (Verdict.AGREE_UNTIL_TRUNCATED if size else Verdict.IDENTICAL)
         assert same.exit_code == (1 if size else 0)
 
 

@@ -310,7 +310,7 @@ def cut() -> Diff:
     return Diff(
         sides[0],
         dataclasses.replace(sides[1], complete=False, stop_reason="interrupted"),
-        Verdict.AS_FAR_AS_THEY_GO,
+        Verdict.AGREE_UNTIL_TRUNCATED,
         AgreeUntilCut(4096, ("b",)),
         4096,
         remarks=(Interrupted("b", "runs/run2.mcap", 4096, 10_000 * MS),),
@@ -321,7 +321,7 @@ def cut_recording() -> BagDiff:
     return dataclasses.replace(
         equal_within_tolerance(),
         b=dataclasses.replace(recordings().b, complete=False),
-        verdict=BagVerdict.AS_FAR_AS_THEY_GO,
+        verdict=BagVerdict.AGREE_UNTIL_TRUNCATED,
         topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 0, 0, 0, 0),),
     )
 
@@ -376,9 +376,9 @@ def test_a_cut_recording_is_green_nowhere_unless_that_is_enough(
     assert 'failures="1"' in render(diff, "junit")
     assert render(diff, "github").startswith("::error ")
     assert "identical" not in render(diff, "markdown")
-    assert json.loads(render(diff, "json"))["verdict"] == "agree-as-far-as-they-go"
+    assert json.loads(render(diff, "json"))["verdict"] == "agree-until-truncated"
     assert "agree" in render(diff).splitlines()[0]
-    enough = dataclasses.replace(diff, as_far_as_they_go=True)
+    enough = dataclasses.replace(diff, allow_truncated=True)
     assert (enough.identical, enough.failed, enough.exit_code) == (False, False, 0)
     assert 'failures="0"' in render(enough, "junit")
     assert render(enough, "github").startswith("::notice ")

@@ -20,4 +20,4 @@ def test_the_pages_can_be_set() -> None:
         [*command, *pages], capture_output=True, text=True, timeout=300, check=True
     )
     assert done.stderr == ""
-    assert "--as-far-as-they-go" in done.stdout
+    assert "--allow-truncated" in done.stdout

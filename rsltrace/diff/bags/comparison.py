@@ -266,7 +266,7 @@ class _Comparison:
         else:
             verdict = BagVerdict.WITHIN_TOLERANCE if tolerated else BagVerdict.EQUAL
             if not (a.complete and b.complete):
-                verdict = BagVerdict.AS_FAR_AS_THEY_GO
+                verdict = BagVerdict.AGREE_UNTIL_TRUNCATED
         if self._options.by != BY_STAMP and topics:
             self._note(LogTimesIgnored())
         for topic in topics:
@@ -283,7 +283,7 @@ class _Comparison:
             first=first,
             next_step=_next_step(a, b, first, self._options),
             remarks=tuple(self._remarks),
-            as_far_as_they_go=self._options.as_far_as_they_go,
+            allow_truncated=self._options.allow_truncated,
         )
 
 

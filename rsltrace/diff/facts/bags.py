@@ -23,7 +23,7 @@ class BagVerdict(Enum):
 
     EQUAL = "equal"
     WITHIN_TOLERANCE = "equal-within-tolerance"
-    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
+    AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
     """One of them is cut, and until there they agree (or are equal within tolerance)."""
     DIFFERENT = "different"
 
@@ -140,7 +140,7 @@ class BagComparison:
     first: MessageDivergence | None = None
     next_step: str = ""
     remarks: tuple[Remark, ...] = ()
-    as_far_as_they_go: bool = False
+    allow_truncated: bool = False
     """Whether it is enough that they agree as far as they go."""
 
     @property
@@ -161,7 +161,7 @@ class BagComparison:
     @property
     def agrees_until_cut(self) -> bool:
         """Whether a recording is cut, and they agree as far as both go."""
-        return self.verdict is BagVerdict.AS_FAR_AS_THEY_GO
+        return self.verdict is BagVerdict.AGREE_UNTIL_TRUNCATED
 
     @property
     def failed(self) -> bool:
@@ -179,7 +179,7 @@ class BagComparison:
     @property
     def _is_enough(self) -> bool:
         """Whether agreeing as far as they go was asked for, and something agrees."""
-        return self.as_far_as_they_go and any(t.agreeing for t in self.topics)
+        return self.allow_truncated and any(t.agreeing for t in self.topics)
 
 
 # -- native runs ---------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ class Verdict(Enum):
     """Why two runs diverge. The set is closed; ``Diff.sentence`` puts it in words."""
 
     IDENTICAL = "identical"
-    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
+    AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
     """One of the recordings is cut, and until there they agree: nobody knows what came after."""
     DIFFERENT_JOBS = "different-jobs"
     """One of the runs has no event to compare, and their jobs or graphs are others."""

@@ -77,7 +77,7 @@ def _facts(side: Recording) -> list[Piece]:
         (printable(side.kind), ""),
         (f"{side.messages} messages", ""),
         (format_duration(side.end_ns - side.start_ns), ""),
-        ("" if side.complete else "cut off", Style.FAINT),
+        ("" if side.complete else "truncated", Style.FAINT),
     ]
 
 
@@ -88,7 +88,7 @@ def divergence_section(found: MessageDivergence, width: int) -> Section:
     cells = []
     for name, style, message in (("a", Style.SIDE_A, found.a), ("b", Style.SIDE_B, found.b)):
         if message is None:
-            cells.append([(name, style), ("nothing here", Style.FAINT)])
+            cells.append([(name, style), ("no such message", Style.FAINT)])
         else:
             time = f"log time {format_seconds(message.stamp_ns)} s"
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])

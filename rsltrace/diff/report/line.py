@@ -199,7 +199,7 @@ NOTHING = Section((), [], 0, "")
 
 _SENTENCE_LINES = 6
 _NOTES_LEAST = 2
-_LEFT_OUT = line(("… a taller terminal shows more, and so does | less", Style.FAINT))
+_LEFT_OUT = line(("… a taller terminal or | less shows more", Style.FAINT))
 
 
 def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:

@@ -41,6 +41,7 @@ from rsltrace.diff.facts.remarks import (
     Told,
 )
 from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences.values import IN_ONE
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.phrases import seconds_text
 
@@ -84,7 +85,7 @@ def remark_text(remark: Remark) -> str:
 
 @says(Identical)
 def _(outcome: Identical, of: object) -> str:
-    but = " but for names of programs" if outcome.names_differ else ""
+    but = " except for program names" if outcome.names_differ else ""
     digest = f", digest {outcome.digest}" if outcome.digest else ""
     return f"the two runs are identical{but}: {outcome.events} events{digest}"
 
@@ -92,10 +93,10 @@ def _(outcome: Identical, of: object) -> str:
 @says(AgreeUntilCut)
 def _(outcome: AgreeUntilCut, of: object) -> str:
     cut = outcome.cut
-    are_cut = "both recordings are cut" if len(cut) == 2 else f"the recording of {cut[0]} is cut"
+    are_cut = "both recordings are" if len(cut) == 2 else f"the recording of {cut[0]} is"
     if outcome.events:
-        return f"the two runs agree as far as they go, {outcome.events} events: {are_cut}"
-    return f"nothing can be compared: {are_cut}, and has no event"
+        return f"the two runs agree in the first {outcome.events} events; {are_cut} truncated"
+    return f"nothing can be compared: {are_cut} truncated and without events"
 
 
 @says(DifferentJobs)
@@ -103,7 +104,7 @@ def _(outcome: DifferentJobs, of: object) -> str:
     names = [f'"{name}"' for name in outcome.jobs]
     which = f" ({names[0]}, {names[1]})" if names[0] != names[1] else ""
     have = "have" if len(outcome.empty) > 1 else "has"
-    empty = f"{' and '.join(outcome.empty)} {have} no event to compare"
+    empty = f"{' and '.join(outcome.empty)} {have} no events to compare"
     return f"these are runs of different jobs{which}, and {empty}"
 
 
@@ -127,14 +128,14 @@ def _(outcome: NativeCompared, of: Compared) -> str:
     which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
     said = sum(topic.agreeing for topic in found.content.topics)
     order = (
-        f"{found.moved} of the {found.compared} callbacks of both began in another order"
+        f"{found.moved} of the {found.compared} common callbacks started in a different order"
         if found.moved
-        else f"the {found.compared} callbacks of both began in the same order"
+        else f"the {found.compared} common callbacks started in the same order"
     )
     if found.differs:
-        return f"{which}, and the contents differ{_where(found)}; {order}"
+        return f"{which}, and the messages differ{_where(found)}; {order}"
     return (
-        f"{which}, and the contents are the same but for times: {said} messages on "
+        f"{which}, and the messages are the same except for times: {said} messages on "
         f"{len(found.content.topics)} topics; {order}"
     )
 
@@ -150,16 +151,16 @@ def _where(found: NativeComparison) -> str:
         return text
     text += f": message {shown.index} "
     if first.moved:
-        return f"{text}came in another order, and others are missing or differ"
+        return f"{text}came in a different order, and others are missing or differ"
     if first.presence is not Presence.BOTH:
-        return f"{text}is {first.presence.value}"
+        return f"{text}is {IN_ONE[first.presence]}"
     return text + (f"has a different {first.fields[0].path}" if first.fields else "differs")
 
 
 def tail_text(tail: Tail) -> str:
-    """Return ``/odom: 2 more messages in a, at its end``."""
+    """Return ``/odom: 2 more messages at the end of a``."""
     more = f"{tail.more} more message{'' if tail.more == 1 else 's'}"
-    return f"{tail.topic}: {more} in {tail.run}, at its end"
+    return f"{tail.topic}: {more} at the end of {tail.run}"
 
 
 # -- recordings ------------------------------------------------------------------------------------
@@ -171,14 +172,14 @@ def recordings_sentence(of: BagComparison, name: str = "The recordings") -> str:
     messages = sum(topic.agreeing for topic in topics)
     counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
     if of.verdict is BagVerdict.EQUAL:
-        return f"{name} are equal: {counted} say the same."
+        return f"{name} are equal: {counted}."
     if of.verdict is not BagVerdict.DIFFERENT:
         return _nearly_equal(of.verdict, topics, counted, name)
     if first is None:
         lone = [f"{topic.topic} is only in a" for topic in of.topics_only_a]
         lone += [f"{topic.topic} is only in b" for topic in of.topics_only_b]
         more = f" and {len(lone) - 3} more" if len(lone) > 3 else ""
-        same = f"{counted} in both agree, but " if messages else ""
+        same = f"{counted} agree, but " if messages else ""
         text = f"{same}{', '.join(lone[:3])}{more}."
         return text[0].upper() + text[1:]
     when = f"{format_seconds(first.after_ns)} s after the start"
@@ -188,18 +189,17 @@ def recordings_sentence(of: BagComparison, name: str = "The recordings") -> str:
 def _nearly_equal(verdict: BagVerdict, topics: Sequence[TopicDiff], counted: str, name: str) -> str:
     tolerated = sum(topic.tolerated for topic in topics)
     ignored = sum(topic.ignored for topic in topics)
-    if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
-        how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
-        how += f" but for what is ignored ({ignored} differ in it)" if ignored else ""
-        agree = f"{name[:1].lower()}{name[1:]} agree: {counted} {how}"
-        return f"As far as they go, {agree}; not both are whole."
+    if verdict is BagVerdict.AGREE_UNTIL_TRUNCATED:
+        how = f"are equal{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
+        how += f" except for ignored fields ({ignored} differ there)" if ignored else ""
+        return f"{name} agree until one of them is truncated: {counted} {how}."
     if not tolerated:
-        ignoring = f"{ignored} of {counted} differ in it"
-        return f"{name} are equal but for what is ignored, not identical: {ignoring}."
-    also = f", {ignored} more in what is ignored" if ignored else ""
+        ignoring = f"{ignored} of {counted} differ there"
+        return f"{name} are equal except for ignored fields, not identical: {ignoring}."
+    also = f", {ignored} more only in ignored fields" if ignored else ""
     return (
         f"{name} are equal within tolerance, not identical: {tolerated} of {counted} "
-        f"differ, none by more than is tolerated{also}."
+        f"differ within tolerance{also}."
     )
 
 
@@ -211,7 +211,7 @@ def _first_message(first: MessageDivergence) -> str:
         return f"message {first.a.index} of a is missing in b"
     if first.presence is Presence.ONLY_B:
         assert first.b is not None
-        return f"message {first.b.index} of b is extra, not in a"
+        return f"message {first.b.index} of b is not in a"
     assert first.a is not None
     text = f"message {first.a.index}"
     differing = len(first.fields) + first.more_fields
@@ -227,7 +227,7 @@ def moved_text(found: MessageDivergence) -> str:
         return ""
     if found.swapped_at is not None:
         return f"messages {found.swapped_at} and {found.swapped_at + 1} are swapped"
-    return f"message {found.a.index} of a is message {found.b.index} of b, in another order"
+    return f"message {found.a.index} of a is message {found.b.index} of b (different order)"
 
 
 def _number(count: int, noun: str) -> str:
@@ -244,15 +244,15 @@ def _(remark: Told, of: object) -> str:
 
 @says(Interrupted)
 def _(remark: Interrupted, of: object) -> str:
-    there = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
-    was = f"the recording of {remark.run} ({remark.path}) was interrupted"
-    return f"{was}: compared is what is there, {there}"
+    compared = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
+    cut = f"the recording of {remark.run} ({remark.path}) is truncated"
+    return f"{cut}: only its {compared} are compared"
 
 
 @says(EndedByException)
 def _(remark: EndedByException, of: object) -> str:
     when = f"event {remark.event}, {seconds_text(remark.stamp_ns)} s"
-    return f"{remark.run} ended by an exception: {remark.reason}, {when}"
+    return f"{remark.run} ended with an exception ({when}): {remark.reason}"
 
 
 @says(OtherEnd)
@@ -265,29 +265,29 @@ def _(remark: ComparedAs, of: object) -> str:
     return f"{printable(remark.a)} in a is compared with {printable(remark.b)} in b"
 
 
-def _asked(globs: Sequence[str]) -> str:
+def _globs(globs: Sequence[str]) -> str:
     return printable(", ".join(globs))
 
 
 @says(NothingAskedFor)
 def _(remark: NothingAskedFor, of: object) -> str:
     return (
-        f"nothing that was asked for ({_asked(remark.asked)}) differs among the events that were "
-        "aligned; shown is where the runs diverge"
+        f"nothing selected ({_globs(remark.asked)}) differs in the aligned events; this report "
+        "shows where the runs diverge"
     )
 
 
 @says(ShownLater)
 def _(remark: ShownLater, of: object) -> str:
-    where = f"shown is where {_asked(remark.asked)} differs"
-    return f"the runs diverge at event {remark.start}; {where}"
+    shown = f"this report shows where {_globs(remark.asked)} differs"
+    return f"the runs diverge at event {remark.start}; {shown}"
 
 
 @says(ShownPastTolerated)
 def _(remark: ShownPastTolerated, of: object) -> str:
-    covered = "only in what is ignored or within tolerance"
-    shown = "shown is the first difference that is not"
-    return f"the runs diverge at event {remark.start}, but there {covered}; {shown}"
+    covered = "but only in ignored fields or within tolerance"
+    shown = "this report shows the first other difference"
+    return f"the runs diverge at event {remark.start}, {covered}; {shown}"
 
 
 @says(MoreDivergences)
@@ -299,13 +299,14 @@ def _(remark: MoreDivergences, of: object) -> str:
 @says(CannotRepeat)
 def _(remark: CannotRepeat, of: object) -> str:
     if remark.job:
-        return f"{remark.trace} was made elsewhere: its job {_shown(remark.job)} is not here"
+        job = _shown(remark.job)
+        return f"no command to reproduce this: the job {job} of {remark.trace} is not here"
     more = len(remark.options) - _OPTIONS_MAX
     told = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
     told += f" and {more} more" if more > 0 else ""
     return (
         f"no command to reproduce this: {remark.trace} comes from a job that could run code "
-        f"({told}); use that only if you know where the trace is from"
+        f"({told}); run that only if you trust the source of the trace"
     )
 
 
@@ -316,8 +317,8 @@ def _shown(text: str) -> str:
 @says(JobChanged)
 def _(remark: JobChanged, of: object) -> str:
     return (
-        f"{remark.job} is not what {remark.trace} was recorded with: it was made elsewhere, or the "
-        "job has been changed since"
+        f"{remark.job} has changed since {remark.trace} was recorded, or the trace is of another "
+        "job"
     )
 
 
@@ -340,8 +341,8 @@ def _(remark: ComparedByBytes, of: object) -> str:
 def reproduction_text(of: RepeatedRun) -> str:
     """Return which of two runs a third one repeats."""
     if of.place is None:
-        too = "too" if of.repeats is Repeats.A else "another one"
-        return f"a and b are the same run, and {of.again} {too}"
+        too = "is the same too" if of.repeats is Repeats.A else "is different"
+        return f"a and b are identical; {of.again} {too}"
     third, where = f"the third run ({of.again})", f"at event {of.place}, where a and b diverge"
     if of.repeats in (Repeats.A, Repeats.B):
         return f"{third} reproduces {of.repeats.value}: it does the same {where}"

@@ -46,12 +46,12 @@ _NOTES = {
     FieldNoteKind.OTHER_TYPES: "different types",
     FieldNoteKind.NO_SUCH_FIELD: "only one of the types has this field",
     FieldNoteKind.LENGTHS: "length {a} and {b}",
-    FieldNoteKind.SAME_ELEMENTS: "the same elements in another order",
-    FieldNoteKind.SAME_WORDS: "the same words in another order",
+    FieldNoteKind.SAME_ELEMENTS: "the same elements in a different order",
+    FieldNoteKind.SAME_WORDS: "the same words in a different order",
     FieldNoteKind.FIRST_BYTE: "first at byte {a}",
     FieldNoteKind.FIRST_CHARACTER: "first at character {a}",
     FieldNoteKind.CONSTANTS: "{a} → {b}",
-    FieldNoteKind.NAN_PAYLOAD: "NaN with another payload",
+    FieldNoteKind.NAN_PAYLOAD: "NaN with a different payload",
     FieldNoteKind.NAN_IN_A: "NaN in a only",
     FieldNoteKind.NAN_IN_B: "NaN in b only",
     FieldNoteKind.INFINITE_IN_A: "infinite in a only",
@@ -65,11 +65,11 @@ _LINKS = {
     LinkKind.ANSWERED: "answered",
     LinkKind.LOGGED: "logged to",
     LinkKind.TRIGGERED: "triggered",
-    LinkKind.MADE_TASK: "made or resumed a task of",
+    LinkKind.MADE_TASK: "created or resumed a task of",
     LinkKind.CAUSED: "caused",
     LinkKind.CHANGED_STATE: "may have changed the state of",
     LinkKind.DRAWN_AGAIN: "draws a different value in",
-    LinkKind.MADE_RECEIVER: "made a receiver of",
+    LinkKind.MADE_RECEIVER: "created a receiver of",
     LinkKind.KEEPS_WAITING: "keeps waiting",
     LinkKind.ENDED_BEFORE: "ended before",
 }
@@ -218,7 +218,7 @@ def _label(message: MessageDifference) -> str:
 
 @says(Moved)
 def _(fate: Moved, of: object) -> str:
-    return "in another order"
+    return "in a different order"
 
 
 @says(SentTimes)
@@ -262,7 +262,7 @@ def fate_text(message: MessageDifference) -> str:
 def no_fields_text(message: MessageDifference | MessageDivergence) -> str:
     """Say why no field of a message is shown, and how to see it; "" where there are some."""
     if isinstance(message, MessageDifference) and isinstance(message.fate, Moved):
-        return "sent in another order"
+        return "sent in a different order"
     return "" if message.no_fields is None else sentence(message.no_fields, message)
 
 
@@ -271,7 +271,7 @@ def _(why: NoFields, of: MessageDifference | MessageDivergence) -> str:
     if why is NoFields.ALL_IGNORED:
         return "all fields that differ are ignored"
     if why is NoFields.EQUAL_FIELDS:
-        return "its fields are equal, but what the recorder hashed of it is not"
+        return "its fields are equal, but the recorded hashes differ"
     if why is NoFields.UNREADABLE:
         return of.error
     if why is NoFields.UNDESCRIBED_BYTES:

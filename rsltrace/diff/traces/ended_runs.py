@@ -37,14 +37,14 @@ def agree_until_cut(a: Trace, b: Trace, options: DiffOptions) -> Diff:
     return Diff(
         a=side(a),
         b=side(b),
-        verdict=Verdict.AS_FAR_AS_THEY_GO,
+        verdict=Verdict.AGREE_UNTIL_TRUNCATED,
         outcome=AgreeUntilCut(events, cut),
         agreeing=events,
         settings=(*job_settings(a, b), *environment_settings(a, b)),
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
         remarks=tuple(interruptions(a, b)),
-        as_far_as_they_go=options.as_far_as_they_go,
+        allow_truncated=options.allow_truncated,
     )
 
 

@@ -98,7 +98,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
             *interruptions(a, b),
             *(one for one in content.remarks if not isinstance(one, LogTimesIgnored)),
         ),
-        as_far_as_they_go=options.as_far_as_they_go,
+        allow_truncated=options.allow_truncated,
         native=found,
     )
 
@@ -107,7 +107,7 @@ def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
     if found.differs:
         return Verdict.OTHER_CONTENT
     if not (a.complete and b.complete):
-        return Verdict.AS_FAR_AS_THEY_GO
+        return Verdict.AGREE_UNTIL_TRUNCATED
     return Verdict.SAME_CONTENT
 
 
