@@ -383,7 +383,7 @@ def test_a_cut_recording_is_green_nowhere_unless_that_is_enough(
     assert 'failures="0"' in render(enough, "junit")
     assert render(enough, "github").startswith("::notice ")
     assert json.loads(render(enough, "json"))["failed"] is False
-    assert "1 of 2 runs agrees only as far as the recordings go." in render([diff, enough])
+    assert "1 of 2 runs agrees only up to where a recording is truncated." in render([diff, enough])
     assert "agree with runs" in render([enough, enough]) or "agree with bags" in render(
         [enough] * 2
     )
@@ -402,7 +402,7 @@ def test_a_report_fits_a_screen_whatever_there_is_to_say(width: int) -> None:
     lines = render(crowded, "text", width=width).splitlines()
     assert len(lines) <= 40
     text = "\n".join(lines)
-    for needed in ("ranges[17]", "<- h", "before it", "reaches", "next: ", "job.yaml"):
+    for needed in ("ranges[17]", "<- h", "before it", "affects", "next: ", "job.yaml"):
         assert needed in text, needed
     # only what names the two files (a digest must not be cut) and commands may be wider
     wide = [row for row in lines if len(row) > width]

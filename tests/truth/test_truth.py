@@ -84,7 +84,7 @@ def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(Diff, "sentence", property(lambda self: "something differs"))
     monkeypatch.setattr(
-        Divergence, "root_sentence", property(lambda self: "chance decided otherwise")
+        Divergence, "root_sentence", property(lambda self: "random draws differ")
     )
     monkeypatch.setattr(oracle, "diff", lying)
     (outcome,) = try_cases([("value, in code", 0)])

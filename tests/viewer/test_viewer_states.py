@@ -100,7 +100,7 @@ def test_rerun_tells_them_too(tmp_path: Path) -> None:
 
     a, b = (record(tmp_path, "record", gain, f"{gain}.mcap") for gain in ("1", "2"))
     text = document(rsltrace.diff(a, b))
-    assert "state of the node after it\n  total  1.0  |  2.0" in text
+    assert "state of the node afterwards\n  total  1.0  |  2.0" in text
     at = text.index("! environment: os.environ['GAIN']\n")
     assert text[at:].splitlines()[1:3] == ["      a '1'", "      b '2'"]
 

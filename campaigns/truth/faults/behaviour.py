@@ -160,7 +160,7 @@ def exception(rng: random.Random, world: World) -> Change:
     truth = truth_of(
         node,
         verdicts=("exception",),
-        first=("raised RuntimeError: planted in b and not in a",),
+        first=("raised an exception only in b: RuntimeError: planted",),
         never=(*Truth().never, "happened only"),
     )
     return Change(node, ['raise RuntimeError("planted")'], truth, at=rng.randint(1, 6))
