@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
 from rsltrace.diff.facts.causes import Judgement, UnrecordedAnswer, Verdict
-from rsltrace.diff.facts.evidence import CallDifference, CauseStep, EventView, Reach, Setting
+from rsltrace.diff.facts.evidence import (
+    AffectedTopic,
+    CallDifference,
+    CauseStep,
+    EventView,
+    Setting,
+)
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
 
 if TYPE_CHECKING:
@@ -32,7 +38,7 @@ class Divergence(Judgement):
     before_b: tuple[EventView, ...] = ()
     same_node_a: tuple[EventView, ...] = ()
     same_node_b: tuple[EventView, ...] = ()
-    reaches: tuple[Reach, ...] = ()
+    reaches: tuple[AffectedTopic, ...] = ()
     next_step: str = ""
     calls: tuple[CallDifference, ...] = ()
 
@@ -95,7 +101,7 @@ class EntityCount:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class ComparedRun:
     """One of the two files."""
 
     path: str
@@ -121,8 +127,8 @@ class Diff:
     missing, extra or at another time; else it is None.
     """
 
-    a: Side
-    b: Side
+    a: ComparedRun
+    b: ComparedRun
     verdict: Verdict
     outcome: Outcome
     agreeing: int

@@ -201,8 +201,8 @@ def test_ignored_fields(compare: Any) -> None:
         diff = compare(a, b, DiffOptions(ignore=(glob,)))
         assert (diff.verdict, diff.exit_code) == (BagVerdict.WITHIN_TOLERANCE, 3)
         assert diff.sentence == (
-            "The recordings are equal except for ignored fields, not identical: 2 of 10 messages on "
-            "1 topic differ there."
+            "The recordings are equal except for ignored fields, not identical: 2 of 10 messages "
+            "on 1 topic differ there."
         )
         assert counts(diff) == (8, 0, 0, 0, 0)
         assert diff.topics[0].ignored == 2

@@ -124,7 +124,9 @@ def test_qos_that_fits_no_more(
         assert diff.identical
         return
     who = (
-        "/source created publisher /signal" if end == "OFFERED" else "/sink created subscription /signal"
+        "/source created publisher /signal"
+        if end == "OFFERED"
+        else "/sink created subscription /signal"
     )
     name, old, _, *new = told.split(" ")
     backwards = f"{name} {' '.join(new)} → {old}"

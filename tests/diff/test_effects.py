@@ -143,7 +143,9 @@ def test_what_is_ignored_or_tolerated_does_not_lead(recorded: Callable[..., Path
     diff = rsltrace.diff(a, b, ignore=ignored)
     assert "/cmd_vel (linear.x 2.0 → 3.0)" in diff.sentence
     assert any("but only in ignored fields or within tolerance" in note for note in diff.notes)
-    assert not any("this report shows where" in note for note in diff.notes), "no topic was asked for"
+    assert not any("this report shows where" in note for note in diff.notes), (
+        "no topic was asked for"
+    )
     assert diff.agreeing == 1
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from rsltrace.diff.causes.calls import call_difference
 from rsltrace.diff.causes.likely_cause import telling_calls
-from rsltrace.diff.facts.causes import OutsideAnswers
+from rsltrace.diff.facts.causes import ExternalAnswers
 from rsltrace.diff.facts.evidence import (
     CallDifference,
     FieldDifference,
@@ -28,7 +28,7 @@ def call(
 
 
 def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str:
-    return sentence(OutsideAnswers("/picker", telling_calls(calls, messages)))
+    return sentence(ExternalAnswers("/picker", telling_calls(calls, messages)))
 
 
 @pytest.mark.parametrize(

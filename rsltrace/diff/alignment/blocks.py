@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.alignment.align import EarlierPairs, Pairs, align
+from rsltrace.diff.alignment.align import EarlierPairs, EventPairs, align
 from rsltrace.diff.alignment.rows import (
     CONSTRUCT,
     SHUTDOWN,
-    Rows,
+    EventColumns,
     Run,
     load_rows,
     longest_increasing,
@@ -59,8 +59,8 @@ class AlignedBlock:
     """A part of both runs. ``items`` are in the order of events; ``end_a`` and ``end_b`` are the
     indexes up to which the runs are aligned after it. ``rows`` reach a little further."""
 
-    rows_a: Rows
-    rows_b: Rows
+    rows_a: EventColumns
+    rows_b: EventColumns
     items: list[EventPair]
     end_a: int
     end_b: int
@@ -141,7 +141,7 @@ class AlignedBlocks:
 
     def _next(
         self, first_a: int, first_b: int, past: EarlierPairs, taken_a: set[int], taken_b: set[int]
-    ) -> tuple[AlignedBlock, Pairs]:
+    ) -> tuple[AlignedBlock, EventPairs]:
         events, margin = self.events, max(_MARGIN_MIN, self.events // 4)
         while True:
             rows_a = load_rows(self.run_a, first_a, first_a + events + margin)
@@ -187,7 +187,7 @@ def equal_block(run_a: Run, run_b: Run, first_a: int, first_b: int) -> EqualBloc
     return EqualBlock(first_a, first_b, counts, first_a + done, first_b + done)
 
 
-def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
+def _cuts(a: EventColumns, b: EventColumns, events: int) -> tuple[int, int]:
     """Return how many events of each belong to the block: all before some common time."""
     limits = []
     for rows in (a, b):
@@ -202,9 +202,9 @@ def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
 
 
 def _items(
-    a: Rows,
-    b: Rows,
-    pairs: Pairs,
+    a: EventColumns,
+    b: EventColumns,
+    pairs: EventPairs,
     end_a: int,
     end_b: int,
     taken_a: set[int],
@@ -243,7 +243,7 @@ def _items(
     return [item for _, _, _, item in keyed]
 
 
-def _spine(a: Rows, b: Rows, pairs: Pairs) -> frozenset[int]:
+def _spine(a: EventColumns, b: EventColumns, pairs: EventPairs) -> frozenset[int]:
     """Return the places in b of as many pairs as can be that are in the same order in both runs,
     have the same input and happened at the same time: what the rest is ordered by."""
     times_a, times_b = a.times, b.times
@@ -259,7 +259,7 @@ def _spine(a: Rows, b: Rows, pairs: Pairs) -> frozenset[int]:
     )
 
 
-def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> EventPair:
+def _pair(a: EventColumns, b: EventColumns, place_a: int, place_b: int) -> EventPair:
     same = (
         a.stamp[place_a] == b.stamp[place_b]
         and a.input[place_a] == b.input[place_b]

@@ -149,7 +149,7 @@ OF_THEIR_OWN = (EntityKind.MAIN.label, EntityKind.THREAD.label)
 
 
 @dataclass
-class Rows:
+class EventColumns:
     """The events ``first <= index < first + len(stamp)`` of a run, as columns.
 
     ``number`` is the entity, ``owner`` what a difference in this event may change for later ones:
@@ -224,7 +224,7 @@ def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
     return rows
 
 
-def load_rows(run: Run, first: int, last: int) -> Rows:
+def load_rows(run: Run, first: int, last: int) -> EventColumns:
     """Read the events ``first <= index < last`` (as far as there are such) of a run."""
     columns: dict[str, list[int]] = {name: [] for name in _COLUMNS}
     numbers: list[int] = []
@@ -234,7 +234,7 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
             values += part[name].tolist()
     nodes = run.matching.nodes
     stateful = {n: n for n, key in enumerate(run.matching.keys) if key.kind in OF_THEIR_OWN}
-    rows = Rows(
+    rows = EventColumns(
         run=run,
         first=first,
         at_end=first + len(numbers) >= run.trace.event_count,
@@ -270,7 +270,7 @@ _COLUMNS = (
 ).split()
 
 
-def _constructed(rows: Rows, place: int) -> int:
+def _constructed(rows: EventColumns, place: int) -> int:
     """Return the number of the first node that a constructor made (0: none)."""
     keys = rows.run.matching.keys
     for kind, number, _, _ in rows.outputs(rows.first + place):

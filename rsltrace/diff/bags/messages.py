@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 from rsltrace.diff.bags.pairing import LOOKAHEAD, MessagePair, Pairing
 from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
-from rsltrace.diff.bags.source import Source, SourceTopic
+from rsltrace.diff.bags.source import RecordingSource, SourceTopic
 from rsltrace.diff.facts.bags import BagMessage, MessageDivergence, TopicDiff
-from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
+from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
 from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.values.fields import diff_messages, field_differences, preview
 from rsltrace.diff.values.globs import FieldRules
@@ -43,14 +43,16 @@ class TopicPair:
     full_b: Keys
 
 
-class Fetched:
+class FetchedMessages:
     """Gives the messages of the gaps, by topic and index, decoded.
 
     Without tolerances only what is shown is needed: one pass per file collects it for all topics.
     With tolerances every gap is looked at: each topic is then read by itself, in step.
     """
 
-    def __init__(self, a: Source, b: Source, pairs: list[TopicPair], options: DiffOptions) -> None:
+    def __init__(
+        self, a: RecordingSource, b: RecordingSource, pairs: list[TopicPair], options: DiffOptions
+    ) -> None:
         self._a, self._b = a, b
         self._context = options.context
         self._collected: tuple[dict[int, dict[int, bytes]], ...] = ({}, {})
@@ -58,7 +60,7 @@ class Fetched:
             for side, source in ((0, a), (1, b)):
                 self._collect(source, side, pairs)
 
-    def _collect(self, source: Source, side: int, pairs: list[TopicPair]) -> None:
+    def _collect(self, source: RecordingSource, side: int, pairs: list[TopicPair]) -> None:
         ranges: dict[int, tuple[int, int]] = {}
         for pair in pairs:
             if pair.gaps:
@@ -97,7 +99,7 @@ class _Side:
 
     def __init__(
         self,
-        source: Source,
+        source: RecordingSource,
         number: int,
         *,
         known: dict[int, bytes] | None = None,
@@ -137,7 +139,7 @@ class _Side:
 
 
 def compare_topic(
-    pair: TopicPair, fetched: Fetched, starts: tuple[int, int], options: DiffOptions
+    pair: TopicPair, fetched: FetchedMessages, starts: tuple[int, int], options: DiffOptions
 ) -> TopicDiff:
     """Return how the messages of one topic compare. Raises BagError or TraceError."""
     own = options.for_topic(pair.a.name)
@@ -280,9 +282,9 @@ def _divergence(
         try:
             fields, more = diff_messages(a.get(one.a), b.get(one.b), options)
             if not fields:
-                no_fields = NoFields.UNDESCRIBED_BYTES
+                no_fields = NoFieldsReason.UNDESCRIBED_BYTES
         except TraceError as error:
-            no_fields, problem = NoFields.UNREADABLE, str(error)
+            no_fields, problem = NoFieldsReason.UNREADABLE, str(error)
     side, stamps, index = (a, pair.stamps_a, one.a) if in_a else (b, pair.stamps_b, one.b)
     before = range(max(index - options.context, 0), index)
     return MessageDivergence(

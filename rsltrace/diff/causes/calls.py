@@ -230,10 +230,10 @@ def _exit_text(value: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    return str(_Shown(value)) if isinstance(value, (dict, list)) else repr(value)
+    return str(_AnswerText(value)) if isinstance(value, (dict, list)) else repr(value)
 
 
-class _Shown:
+class _AnswerText:
     """A decoded value whose ``repr`` is that of the answer itself."""
 
     def __init__(self, value: Any) -> None:
@@ -242,11 +242,11 @@ class _Shown:
     def __repr__(self) -> str:
         value = self._value
         if isinstance(value, list):
-            return repr([_Shown(item) for item in value])
+            return repr([_AnswerText(item) for item in value])
         if isinstance(value, dict) and "bytes" in value:
             return repr(base64.b64decode(value["bytes"], validate=True))
         if isinstance(value, dict) and "tuple" in value:
-            return repr(tuple(_Shown(item) for item in value["tuple"]))
+            return repr(tuple(_AnswerText(item) for item in value["tuple"]))
         if isinstance(value, dict) and "error" in value:
             kind, _, text, *_ = value["error"]
             return f"{kind}: {text}"

@@ -8,8 +8,8 @@ from collections.abc import Callable
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair
 from rsltrace.diff.alignment.rows import CONSTRUCT, SHUTDOWN
 from rsltrace.diff.causes.propagation import (
+    DivergenceOrigin,
     FoundDivergence,
-    Origin,
     Propagation,
     outputs_of_one,
 )
@@ -100,7 +100,7 @@ class EffectSearch:
                 self.found = propagation.found_at(item, origin)
                 return
 
-    def _is_wanted(self, item: EventPair, origin: Origin) -> bool:
+    def _is_wanted(self, item: EventPair, origin: DivergenceOrigin) -> bool:
         if self._covered is not None and self._covered(item):
             return False
         return self.past_covered or origin.root in self._setups

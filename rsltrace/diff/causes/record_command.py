@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rsltrace.diff.facts.remarks import CannotRepeat, JobChanged, Remark
+from rsltrace.diff.facts.remarks import JobChanged, NoRecordCommand, Remark
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
@@ -134,9 +134,9 @@ def record_again(trace: Trace) -> RecordAgain:
     for option, change in options_of(trace):
         _take(words, option, change, name)
     if words.foreign:
-        return RecordAgain("", (CannotRepeat(trace.name, options=tuple(words.foreign)),))
+        return RecordAgain("", (NoRecordCommand(trace.name, options=tuple(words.foreign)),))
     if words.job and not path:
-        return RecordAgain("", (CannotRepeat(trace.name, job=name),))
+        return RecordAgain("", (NoRecordCommand(trace.name, job=name),))
     changed = words.job and not is_same
     return RecordAgain(words.command(), (JobChanged(trace.name, path),) if changed else ())
 

@@ -10,7 +10,7 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
-from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
+from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
 from rsltrace.diff.facts.remarks import Remark
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ class BagVerdict(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class ComparedRecording:
     """One of the two sides. ``kind`` is ``mcap``, ``sqlite3`` or ``trace``.
 
     ``complete`` is false for a file that was cut off and read as far as it goes.
@@ -72,7 +72,7 @@ class MessageDivergence:
     after_ns: int
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
-    no_fields: NoFields | None = None
+    no_fields: NoFieldsReason | None = None
     error: str = ""
     before: tuple[BagMessage, ...] = ()
     moved: bool = False
@@ -130,8 +130,8 @@ class BagComparison:
     the log time).
     """
 
-    a: Recording
-    b: Recording
+    a: ComparedRecording
+    b: ComparedRecording
     verdict: BagVerdict
     by: str
     topics: tuple[TopicDiff, ...] = ()
@@ -202,7 +202,7 @@ class CallbackTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Tail:
+class ExtraMessages:
     """A topic of which ``run`` has ``more`` messages, at its end."""
 
     topic: str
@@ -211,7 +211,7 @@ class Tail:
 
 
 @dataclass(frozen=True, slots=True)
-class MovedCallback:
+class ReorderedCallback:
     """A callback that ran in another order: its events."""
 
     entity: EntityKey
@@ -235,8 +235,8 @@ class NativeComparison:
     changed places."""
     first: MessageDivergence | None
     """The first that does, on a topic that both have."""
-    tails: tuple[Tail, ...]
+    tails: tuple[ExtraMessages, ...]
     compared: int
     moved: int
-    first_moved: MovedCallback | None
+    first_moved: ReorderedCallback | None
     callbacks: tuple[CallbackTimes, ...]

@@ -9,14 +9,14 @@ from rsltrace.diff.facts.evidence import Fact
 
 
 @dataclass(frozen=True, slots=True)
-class Told(Fact):
+class ReaderNote(Fact):
     """What a reader of recordings has said."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
-class Interrupted(Fact):
+class TruncatedRecording(Fact):
     """The recording of ``run`` is cut off."""
 
     run: str
@@ -36,7 +36,7 @@ class EndedByException(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherEnd(Fact):
+class DifferentEnd(Fact):
     """Identical events, another ``what`` (reason, exit code)."""
 
     what: str
@@ -45,7 +45,7 @@ class OtherEnd(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedAs(Fact):
+class RenamedProgram(Fact):
     """Two names of one program."""
 
     a: str
@@ -53,14 +53,14 @@ class ComparedAs(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NothingAskedFor(Fact):
+class SelectionIsEqual(Fact):
     """No difference among what was asked for (globs)."""
 
     asked: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class ShownLater(Fact):
+class SelectionDivergesLater(Fact):
     """The runs diverge at event ``start``; shown is where what was asked for differs."""
 
     start: int
@@ -68,7 +68,7 @@ class ShownLater(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ShownPastTolerated(Fact):
+class StartIsTolerated(Fact):
     """At event ``start`` all that differs is ignored or within tolerance; shown is what is not."""
 
     start: int
@@ -83,7 +83,7 @@ class MoreDivergences(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class CannotRepeat(Fact):
+class NoRecordCommand(Fact):
     """There is no command to record a trace once more: it takes ``options`` that could run code, or
     the ``job`` is not here."""
 
@@ -106,7 +106,7 @@ class LogTimesIgnored(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherType(Fact):
+class DifferentType(Fact):
     """A topic that has another type in each recording."""
 
     topic: str
@@ -115,27 +115,27 @@ class OtherType(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedByBytes(Fact):
+class UndecodedMessages(Fact):
     """Messages that could not be decoded."""
 
     error: str
 
 
 Remark = (
-    Told
-    | Interrupted
+    ReaderNote
+    | TruncatedRecording
     | EndedByException
-    | OtherEnd
-    | ComparedAs
-    | NothingAskedFor
-    | ShownLater
-    | ShownPastTolerated
+    | DifferentEnd
+    | RenamedProgram
+    | SelectionIsEqual
+    | SelectionDivergesLater
+    | StartIsTolerated
     | MoreDivergences
-    | CannotRepeat
+    | NoRecordCommand
     | JobChanged
     | LogTimesIgnored
-    | OtherType
-    | ComparedByBytes
+    | DifferentType
+    | UndecodedMessages
 )
 
 
@@ -152,7 +152,7 @@ class Identical(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class AgreeUntilCut(Fact):
+class EqualUntilTruncated(Fact):
     """They agree as far as the recordings go that are ``cut``."""
 
     events: int
@@ -168,7 +168,7 @@ class DifferentJobs(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class Diverged(Fact):
+class RunsDiverge(Fact):
     """See the divergences. ``searched_to`` is the event up to which no effect of another set-up was
     found (-1: to the end), None if none was looked for, or one was found. ``foreign`` are the names
     of the jobs where the runs have no node in common."""
@@ -178,11 +178,11 @@ class Diverged(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NativeCompared(Fact):
+class NativeRuns(Fact):
     """See ``Diff.native``."""
 
 
-Outcome = Identical | AgreeUntilCut | DifferentJobs | Diverged | NativeCompared
+Outcome = Identical | EqualUntilTruncated | DifferentJobs | RunsDiverge | NativeRuns
 
 
 # -- which of two runs a third one repeats -------------------------------------------------------

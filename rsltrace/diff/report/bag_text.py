@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from rsltrace.diff.facts.bags import (
     BagComparison,
     BagMessage,
+    ComparedRecording,
     LoneTopic,
     MessageDivergence,
     NativeComparison,
-    Recording,
     TopicDiff,
 )
 from rsltrace.diff.facts.evidence import Presence
@@ -33,7 +33,7 @@ from rsltrace.diff.report.line import (
     wrapped,
 )
 from rsltrace.diff.result import BagDiff
-from rsltrace.diff.sentences.runs import moved_text, tail_text
+from rsltrace.diff.sentences.runs import order_text, tail_text
 from rsltrace.diff.sentences.values import no_fields_text
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
@@ -71,7 +71,7 @@ def bag_report(
     return fitted(head, sections, None if options.everything else height)
 
 
-def _facts(side: Recording) -> list[Piece]:
+def _facts(side: ComparedRecording) -> list[Piece]:
     return [
         (printable(side.path), ""),
         (printable(side.kind), ""),
@@ -94,7 +94,7 @@ def divergence_section(found: MessageDivergence, width: int) -> Section:
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])
     rows += in_columns(cells)
     only = None if found.presence is Presence.BOTH else found.a or found.b
-    if moved := moved_text(found):
+    if moved := order_text(found):
         only = found.a
         rows.append(line(f"    {printable(moved)}"))
     preview = only.preview if only is not None else ""

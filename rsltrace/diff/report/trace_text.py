@@ -24,7 +24,7 @@ from rsltrace.diff.report.line import (
     notes_section,
     wrapped,
 )
-from rsltrace.diff.result import Diff, Side
+from rsltrace.diff.result import ComparedRun, Diff
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
 from rsltrace.trace.model.texts import format_seconds, printable, told_apart
@@ -112,7 +112,7 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
 
-def _facts(side: Side, width: int) -> list[Piece]:
+def _facts(side: ComparedRun, width: int) -> list[Piece]:
     narrow = width < _NARROW
     time = seconds_text(side.end_ns) if narrow else format_seconds(side.end_ns)
     ended = side.stop_reason or ("" if side.complete else "truncated")

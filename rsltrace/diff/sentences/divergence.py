@@ -6,39 +6,39 @@ from collections.abc import Sequence
 
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
-    CameFrom,
-    CauseOf,
-    EndedBefore,
-    FollowsFrom,
-    Happening,
+    CauseKind,
+    Consequence,
+    DifferentDraw,
+    DifferentInput,
+    DifferentOrder,
+    DifferentOutput,
+    DifferentSenders,
+    DifferentTime,
+    DivergenceKind,
+    EarlierEnd,
+    EventInOneRun,
+    ExceptionInOneRun,
+    ExternalAnswers,
     Judgement,
+    NoEarlierDifference,
+    NoEventsLeft,
+    NoMoreMessages,
     NotDelivered,
-    NothingArrives,
-    NothingBefore,
-    NothingLeft,
-    OnlyInOne,
-    OtherDraw,
-    OtherInput,
-    OtherOrder,
-    OtherOutput,
-    OtherTime,
-    OutsideAnswers,
     ParameterFiles,
-    QueueOverflowed,
-    RaisedInOne,
-    Reason,
+    QueueOverflow,
     RunEnd,
+    SameCause,
     SetOrder,
-    Slept,
-    StillWaits,
+    SleepTimes,
+    UnfinishedCall,
     UnrecordedAnswer,
     Verdict,
-    WaitedFor,
+    WaitInOneRun,
 )
 from rsltrace.diff.facts.evidence import (
     CallDifference,
-    EntitiesChanged,
     EntityChange,
+    EntityChanges,
     EventView,
     MessageDifference,
     Presence,
@@ -52,10 +52,10 @@ from rsltrace.diff.sentences.values import (
     a_first,
     because_of,
     durations,
-    fate_text,
     field_text,
     joined,
     listed,
+    output_change_text,
     pair_text,
     state_text,
     what_differs,
@@ -113,33 +113,33 @@ def sentence_of(of: Judgement) -> str:
     text = sentence(of.what, of)
     if of.node_diverged:
         text += ", because its node had already diverged"
-    if isinstance(of.what, EntitiesChanged):
+    if isinstance(of.what, EntityChanges):
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
-@says(Happening.CONSTRUCTED_IN_ONE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.CONSTRUCTED_IN_ONE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     has, has_not = _has(of)
     name = _one(of).entity.name or "a part of the run"
     return f"the graphs differ: {name} is constructed in {has} but not in {has_not}"
 
 
-@says(Happening.NODE_RENAMED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.NODE_RENAMED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     return f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
 
 
-@says(Happening.CONSTRUCTION_ORDER)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.CONSTRUCTION_ORDER)
+def _(what: DivergenceKind, of: Judgement) -> str:
     return "the nodes are constructed in a different order"
 
 
-@says(Happening.OTHER_ENTITIES)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_ENTITIES)
+def _(what: DivergenceKind, of: Judgement) -> str:
     changed = a_first([m for m in of.messages if m.kind is OutputKind.ENTITY])
     types: dict[str, list[str]] = {}
     for m in changed:
@@ -153,15 +153,15 @@ def _(what: Happening, of: Judgement) -> str:
     return f"the graphs differ: {phrase(_one(of))} created different entities ({listed(things)})"
 
 
-@says(Happening.OTHER_CONSTRUCTION, Happening.OTHER_CONSTRUCTION_SAME_JOB)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_CONSTRUCTION, DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB)
+def _(what: DivergenceKind, of: Judgement) -> str:
     text = f"{phrase(_one(of))} {_did(of.messages)}"
-    same = what is Happening.OTHER_CONSTRUCTION_SAME_JOB
+    same = what is DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB
     return f"{text}, in the same job and environment" if same else text
 
 
-@says(OtherOrder)
-def _(what: OtherOrder, of: Judgement) -> str:
+@says(DifferentOrder)
+def _(what: DifferentOrder, of: Judgement) -> str:
     text = f"{at_time(what.event.stamp_ns)} the same events ran in a different order"
     if of.a is None or of.b is None:
         return text
@@ -170,8 +170,8 @@ def _(what: OtherOrder, of: Judgement) -> str:
     return f"{text}: {phrase(of.a)} ran first in a, {phrase(of.b)} in b"
 
 
-@says(OnlyInOne)
-def _(what: OnlyInOne, of: Judgement) -> str:
+@says(EventInOneRun)
+def _(what: EventInOneRun, of: Judgement) -> str:
     has, has_not = _has(of)
     text = f"{_at(_one(of))} happened only in {has}"
     if what.loss is not None:
@@ -183,16 +183,16 @@ def _(what: OnlyInOne, of: Judgement) -> str:
     return text
 
 
-@says(RaisedInOne)
-def _(what: RaisedInOne, of: Judgement) -> str:
+@says(ExceptionInOneRun)
+def _(what: ExceptionInOneRun, of: Judgement) -> str:
     a, _ = _both(of)
     when = ", after shutting down its context" if what.after_shutdown else ""
     error = f": {what.error}" if what.error else ""
     return f"{_received(a)} raised an exception only in {'a' if a.raised else 'b'}{when}{error}"
 
 
-@says(OtherTime)
-def _(what: OtherTime, of: Judgement) -> str:
+@says(DifferentTime)
+def _(what: DifferentTime, of: Judgement) -> str:
     a, b = _both(of)
     if a.stamp_ns == b.stamp_ns:
         return f"{_at(a)} was due at different times in a and b"
@@ -209,7 +209,7 @@ def _times(a: EventView, b: EventView) -> str:
     return f"{times}, {format_duration(abs(late_ns))} {late}"
 
 
-def slept_text(slept: Slept) -> str:
+def slept_text(slept: SleepTimes) -> str:
     """Return ``slept 7 ms in b and not in a``."""
     if slept.a is not None and slept.b is not None:
         in_a, in_b = durations_apart(slept.a, slept.b)
@@ -219,49 +219,49 @@ def slept_text(slept: Slept) -> str:
     return f"slept {format_duration(slept.b or 0)} in b but not in a"
 
 
-@says(Happening.BAG_MESSAGES_SWAPPED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.BAG_MESSAGES_SWAPPED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     early, late = sorted((a.stamp_ns, b.stamp_ns))
     times = f"{at_time(early)} and {at_time(late)}"
     return f"the bag's messages on {a.entity.name} {times} are swapped"
 
 
-@says(Happening.BAG_MESSAGE_MOVED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.BAG_MESSAGE_MOVED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     return f"{phrase(a)} was played {_times(a, b)}"
 
 
-@says(Happening.OTHER_BAG_MESSAGE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_BAG_MESSAGE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     values = next((field_text(m.fields, m.more_fields) for m in of.messages), "")
     return f"{_at(_one(of))} is different{f' ({values})' if values else ''}"
 
 
-@says(Happening.OTHER_FROM_OUTSIDE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_FROM_OUTSIDE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     return f"{_at(_one(of))} is different"
 
 
-@says(Happening.OTHER_DONE_OUTSIDE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_DONE_OUTSIDE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     return f"{_at(_one(of))} is different{what_differs(of.messages)}"
 
 
-@says(OtherInput)
-def _(what: OtherInput, of: Judgement) -> str:
+@says(DifferentInput)
+def _(what: DifferentInput, of: Judgement) -> str:
     return f"{_at(_one(of))} received a different {what.topic or 'input'}"
 
 
-@says(Happening.ONLY_ZERO_DELAYS)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.ONLY_ZERO_DELAYS)
+def _(what: DivergenceKind, of: Judgement) -> str:
     how = "did the same in both runs; one run adds delays of 0 ns, which have no effect"
     return f"{_at(_one(of))} {how}"
 
 
-@says(Happening.OTHER_SENDER)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_SENDER)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     text = f"{_at(a)} received equal inputs from different "
     if a.cause_event == b.cause_event:
@@ -282,8 +282,8 @@ _DRAWS: dict[Draw | None, str] = {
 }
 
 
-@says(OtherDraw)
-def _(what: OtherDraw, of: Judgement) -> str:
+@says(DifferentDraw)
+def _(what: DifferentDraw, of: Judgement) -> str:
     m = what.message
     same = "read a clock" if what.of_clock else "did the same in both runs"
     if not what.connected:
@@ -319,8 +319,8 @@ def _took(number: int | None, other: int | None) -> str:
     return durations_apart(took_ns, took_ns if other_ns is None else other_ns)[0]
 
 
-@says(Happening.THREAD_SWITCHED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.THREAD_SWITCHED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     met = next(m for m in of.messages if is_switch(m.hash_a or 0) or is_switch(m.hash_b or 0))
     in_a, in_b = (is_switch(number or 0) for number in (met.hash_a, met.hash_b))
     places = met.code or ("an unknown line",)
@@ -331,8 +331,8 @@ def _(what: Happening, of: Judgement) -> str:
     return f"{gave} in {one} but not in {other}"
 
 
-@says(OtherOutput)
-def _(what: OtherOutput, of: Judgement) -> str:
+@says(DifferentOutput)
+def _(what: DifferentOutput, of: Judgement) -> str:
     one, differs = _one(of), what_differs(of.messages)
     if what.slept is not None and what.only_slept:
         text = f"{_at(one)} {slept_text(what.slept)}{differs}"
@@ -342,8 +342,8 @@ def _(what: OtherOutput, of: Judgement) -> str:
     return text
 
 
-@says(Happening.OTHER_STATE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_STATE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     left = "sent the same outputs, but left its node in a different state"
     return f"{_received(_one(of), 'and')} {left}{state_text(of.state)}"
 
@@ -373,8 +373,8 @@ def _did(messages: Sequence[MessageDifference]) -> str:
     return f"behaved differently{what_differs(messages)}"
 
 
-@says(EndedBefore)
-def _(what: EndedBefore, of: Judgement) -> str:
+@says(EarlierEnd)
+def _(what: EarlierEnd, of: Judgement) -> str:
     over, other = what.over, what.other
     where = f" {at_time(over.end_ns)}" if over.has_events else ""
     how = f"ended{where} ({over.reason})"
@@ -389,8 +389,8 @@ def _(what: EndedBefore, of: Judgement) -> str:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-@says(EntitiesChanged)
-def _(changed: EntitiesChanged, of: object) -> str:
+@says(EntityChanges)
+def _(changed: EntityChanges, of: object) -> str:
     return joined([_change_text(change) for change in changed.changes])
 
 
@@ -418,19 +418,19 @@ def _policy(name: str, value: str | int | None) -> str:
 # -- what became of a message ----------------------------------------------------------------------
 
 
-@says(StillWaits)
-def _(loss: StillWaits, of: object) -> str:
+@says(UnfinishedCall)
+def _(loss: UnfinishedCall, of: object) -> str:
     since = seconds_text(loss.since_ns)
     return f"{shortened(loss.text, _WAITS_MAX)}, from {since} s to the end of {loss.run}"
 
 
-@says(QueueOverflowed)
-def _(loss: QueueOverflowed, of: object) -> str:
+@says(QueueOverflow)
+def _(loss: QueueOverflow, of: object) -> str:
     return f"its queue (depth {loss.depth}) overflowed in {loss.run}"
 
 
-@says(NothingArrives)
-def _(loss: NothingArrives, of: object) -> str:
+@says(NoMoreMessages)
+def _(loss: NoMoreMessages, of: object) -> str:
     return f"it receives nothing more in {loss.run}"
 
 
@@ -459,27 +459,27 @@ def failure_text(failed: RunEnd) -> str:
 
 
 _REASONS = {
-    Reason.DRIVEN_DIFFERENTLY: "the code that drives the simulation acted differently in the two runs",
-    Reason.BAGS_SWAPPED: "the played bags have these two messages in a different order",
-    Reason.BAGS_AT_OTHER_TIMES: "the played bags have this message at different times",
-    Reason.BAGS_DIFFER: "the played bags differ in this message",
-    Reason.OTHER_CONTENT_ARRIVED: "the same message was sent to it, but different content arrived",
-    Reason.SENDER_UNKNOWN: "the trace does not say where it came from",
-    Reason.DELAY_IN_ONE: "only one of the runs delays what it sent",
-    Reason.EQUAL_MESSAGES_SWAPPED: "two equal messages were delivered in a different order",
-    Reason.STREAM_MOVED: "job and seed are the same as far as the traces show, so the random "
+    CauseKind.DRIVEN_DIFFERENTLY: "the code that drives the simulation acted differently",
+    CauseKind.BAGS_SWAPPED: "the played bags have these two messages in a different order",
+    CauseKind.BAGS_AT_OTHER_TIMES: "the played bags have this message at different times",
+    CauseKind.BAGS_DIFFER: "the played bags differ in this message",
+    CauseKind.OTHER_CONTENT_ARRIVED: "the same message was sent, but different content arrived",
+    CauseKind.SENDER_UNKNOWN: "the trace does not say where it came from",
+    CauseKind.DELAY_IN_ONE: "only one of the runs delays what it sent",
+    CauseKind.EQUAL_MESSAGES_SWAPPED: "two equal messages were delivered in a different order",
+    CauseKind.STREAM_MOVED: "job and seed are the same as far as the traces show, so the random "
     "stream of this link was used a different number of times before",
-    Reason.POLICY_CHOSE: "the scheduling policy chose a different one of the ready callbacks",
+    CauseKind.POLICY_CHOSE: "the scheduling policy chose a different one of the ready callbacks",
 }
 
 
 @says(*_REASONS)
-def _(why: Reason, of: Judgement) -> str:
+def _(why: CauseKind, of: Judgement) -> str:
     return because_of(of.settings) or _REASONS[why]
 
 
-@says(Reason.CONSTRUCTOR)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.CONSTRUCTOR)
+def _(why: CauseKind, of: Judgement) -> str:
     which = "itself" if of.changed is None else f"of {of.changed.node}"
     return because_of(of.settings) or (
         f"job and environment are the same as far as the traces show: the constructor {which} is "
@@ -487,8 +487,8 @@ def _(why: Reason, of: Judgement) -> str:
     )
 
 
-@says(Reason.READY_AT_ONCE)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.READY_AT_ONCE)
+def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"both were ready at the same simulated time, and {because}"
     return (
@@ -497,23 +497,23 @@ def _(why: Reason, of: Judgement) -> str:
     )
 
 
-@says(Reason.ONLY_IN_ONE_BAG)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.ONLY_IN_ONE_BAG)
+def _(why: CauseKind, of: Judgement) -> str:
     return because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
 
 
-@says(Reason.DRIVEN_IN_ONE)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.DRIVEN_IN_ONE)
+def _(why: CauseKind, of: Judgement) -> str:
     return f"the code that drives the simulation did this only in {_has(of)[0]}"
 
 
-@says(Reason.FAULT_IN_ONE)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.FAULT_IN_ONE)
+def _(why: CauseKind, of: Judgement) -> str:
     return because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
 
 
-@says(Reason.NOTHING_MADE_IT_RUN)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.NOTHING_MADE_IT_RUN)
+def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"nothing before it differs, but {because}"
     one = _one(of)
@@ -523,9 +523,9 @@ def _(why: Reason, of: Judgement) -> str:
     return f"{text}: {who} is not deterministic" if who else text
 
 
-@says(Reason.NOT_CONNECTED)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, OtherDraw)
+@says(CauseKind.NOT_CONNECTED)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, DifferentDraw)
     has_not = "a" if of.what.message.presence is Presence.ONLY_B else "b"
     topic = of.what.message.topic
     gone = f"in {has_not} {topic} receives nothing: it is gone or not connected"
@@ -541,8 +541,8 @@ def _(why: ParameterFiles, of: Judgement) -> str:
     )
 
 
-@says(WaitedFor)
-def _(why: WaitedFor, of: Judgement) -> str:
+@says(WaitInOneRun)
+def _(why: WaitInOneRun, of: Judgement) -> str:
     has, has_not = _has(of)
     cause = f"{phrase(why.cause)} (event {why.cause.index})"
     doubt = because_of(of.settings) or f"{_itself(_one(of).entity.kind)} is not deterministic"
@@ -562,16 +562,16 @@ def _(why: NotDelivered, of: Judgement) -> str:
     return text
 
 
-@says(CameFrom)
-def _(why: CameFrom, of: Judgement) -> str:
+@says(DifferentSenders)
+def _(why: DifferentSenders, of: Judgement) -> str:
     return (
         f"in a it came from {phrase(why.a)} (event {why.a.index}), in b from "
         f"{phrase(why.b)} (event {why.b.index})"
     )
 
 
-@says(NothingBefore)
-def _(why: NothingBefore, of: Judgement) -> str:
+@says(NoEarlierDifference)
+def _(why: NoEarlierDifference, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"nothing before it differs, but {because}"
     doubt = "what sets its time" if why.doubt == "time" else _itself(why.doubt)
@@ -590,41 +590,41 @@ def _itself(kind: str) -> str:
     return f"the {kind if kind in NO_CALLBACKS else 'callback'} itself"
 
 
-@says(FollowsFrom)
-def _(why: FollowsFrom, of: Judgement) -> str:
+@says(Consequence)
+def _(why: Consequence, of: Judgement) -> str:
     return f"it follows from an earlier difference: {sentence(why.root.what, why.root)}"
 
 
-@says(CauseOf)
-def _(why: CauseOf, of: Judgement) -> str:
+@says(SameCause)
+def _(why: SameCause, of: Judgement) -> str:
     return cause_of(why.first)
 
 
-@says(Reason.CUT_OFF)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, EndedBefore)
+@says(CauseKind.CUT_OFF)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, EarlierEnd)
     return (
         f"the recording of {of.what.over.run} is truncated: the run was killed or is still going "
         "on, or the file is incomplete"
     )
 
 
-@says(Reason.STOPS_DIFFER)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.STOPS_DIFFER)
+def _(why: CauseKind, of: Judgement) -> str:
     stops = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in of.settings)
     return f"the runs are identical until then; their jobs set different stops: {stops}"
 
 
-@says(NothingLeft)
-def _(why: NothingLeft, of: Judgement) -> str:
+@says(NoEventsLeft)
+def _(why: NoEventsLeft, of: Judgement) -> str:
     alone = why.alone
     missing = f"{sentence(alone.what, alone)}; {cause_of(alone)}"
     return f"{why.run} had nothing left to do: {missing}"
 
 
-@says(Reason.ENDED)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, EndedBefore)
+@says(CauseKind.ENDED)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, EarlierEnd)
     over = of.what.over
     if over.error:
         how = f"{over.run} failed (exit code {over.exit_code}): {over.error}"
@@ -651,8 +651,8 @@ _CALLED = {
 }
 
 
-@says(OutsideAnswers)
-def _(cause: OutsideAnswers, of: object) -> str:
+@says(ExternalAnswers)
+def _(cause: ExternalAnswers, of: object) -> str:
     who = cause.subject or "the run"
     told = list(dict.fromkeys(call_text(call) for call in cause.calls))
     more = len(told) - NAMED_MAX
@@ -737,7 +737,7 @@ def effect_text(found: Judgement) -> str:
 def _done(message: MessageDifference) -> str:
     verb, on = _SENT[message.kind or OutputKind.MESSAGE]
     if message.fate is not None or message.presence is not Presence.BOTH:
-        what = fate_text(message) or IN_ONE[message.presence]
+        what = output_change_text(message) or IN_ONE[message.presence]
         return f"{verb} {on}{message.topic} {what}"
     fields = message.fields
     other = "message" if message.kind is OutputKind.MESSAGE else "content"

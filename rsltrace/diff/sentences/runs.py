@@ -8,37 +8,37 @@ from typing import Protocol
 from rsltrace.diff.facts.bags import (
     BagComparison,
     BagVerdict,
+    ExtraMessages,
     MessageDivergence,
     NativeComparison,
-    Tail,
     TopicDiff,
 )
 from rsltrace.diff.facts.causes import Judgement
 from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import (
-    AgreeUntilCut,
-    CannotRepeat,
-    ComparedAs,
-    ComparedByBytes,
+    DifferentEnd,
     DifferentJobs,
-    Diverged,
+    DifferentType,
     EndedByException,
+    EqualUntilTruncated,
     Identical,
-    Interrupted,
     JobChanged,
     LogTimesIgnored,
     MoreDivergences,
-    NativeCompared,
-    NothingAskedFor,
-    OtherEnd,
-    OtherType,
+    NativeRuns,
+    NoRecordCommand,
     Outcome,
+    ReaderNote,
     Remark,
+    RenamedProgram,
     RepeatedRun,
     Repeats,
-    ShownLater,
-    ShownPastTolerated,
-    Told,
+    RunsDiverge,
+    SelectionDivergesLater,
+    SelectionIsEqual,
+    StartIsTolerated,
+    TruncatedRecording,
+    UndecodedMessages,
 )
 from rsltrace.diff.sentences import says, sentence
 from rsltrace.diff.sentences.values import IN_ONE
@@ -50,7 +50,7 @@ _TEXT_MAX = 200
 ALL_HINT = "--all shows them"
 
 
-class Compared(Protocol):
+class RunComparison(Protocol):
     """What the answer for two runs is told by."""
 
     @property
@@ -70,7 +70,7 @@ class Compared(Protocol):
         """What is compared of native runs."""
 
 
-def answer(of: Compared) -> str:
+def answer(of: RunComparison) -> str:
     """Return the answer for two runs."""
     return sentence(of.outcome, of)
 
@@ -90,8 +90,8 @@ def _(outcome: Identical, of: object) -> str:
     return f"the two runs are identical{but}: {outcome.events} events{digest}"
 
 
-@says(AgreeUntilCut)
-def _(outcome: AgreeUntilCut, of: object) -> str:
+@says(EqualUntilTruncated)
+def _(outcome: EqualUntilTruncated, of: object) -> str:
     cut = outcome.cut
     are_cut = "both recordings are" if len(cut) == 2 else f"the recording of {cut[0]} is"
     if outcome.events:
@@ -108,8 +108,8 @@ def _(outcome: DifferentJobs, of: object) -> str:
     return f"these are runs of different jobs{which}, and {empty}"
 
 
-@says(Diverged)
-def _(outcome: Diverged, of: Compared) -> str:
+@says(RunsDiverge)
+def _(outcome: RunsDiverge, of: RunComparison) -> str:
     from rsltrace.diff.sentences.divergence import headline, sentence_of
 
     first = of.divergences[0]
@@ -121,8 +121,8 @@ def _(outcome: Diverged, of: Compared) -> str:
     return f"{unlike}: {sentence_of(first)}"
 
 
-@says(NativeCompared)
-def _(outcome: NativeCompared, of: Compared) -> str:
+@says(NativeRuns)
+def _(outcome: NativeRuns, of: RunComparison) -> str:
     found = of.native
     assert found is not None
     which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
@@ -157,7 +157,7 @@ def _where(found: NativeComparison) -> str:
     return text + (f"has a different {first.fields[0].path}" if first.fields else "differs")
 
 
-def tail_text(tail: Tail) -> str:
+def tail_text(tail: ExtraMessages) -> str:
     """Return ``/odom: 2 more messages at the end of a``."""
     more = f"{tail.more} more message{'' if tail.more == 1 else 's'}"
     return f"{tail.topic}: {more} at the end of {tail.run}"
@@ -205,7 +205,7 @@ def _nearly_equal(verdict: BagVerdict, topics: Sequence[TopicDiff], counted: str
 
 def _first_message(first: MessageDivergence) -> str:
     if first.moved:
-        return moved_text(first)
+        return order_text(first)
     if first.presence is Presence.ONLY_A:
         assert first.a is not None
         return f"message {first.a.index} of a is missing in b"
@@ -221,7 +221,7 @@ def _first_message(first: MessageDivergence) -> str:
     return text if differing == 1 else f"{text} (and {_number(differing - 1, 'other field')})"
 
 
-def moved_text(found: MessageDivergence) -> str:
+def order_text(found: MessageDivergence) -> str:
     """Say where a message is in each recording; "" if it is in the same place of both."""
     if not found.moved or found.a is None or found.b is None:
         return ""
@@ -237,13 +237,13 @@ def _number(count: int, noun: str) -> str:
 # -- what else to know -----------------------------------------------------------------------------
 
 
-@says(Told)
-def _(remark: Told, of: object) -> str:
+@says(ReaderNote)
+def _(remark: ReaderNote, of: object) -> str:
     return remark.text
 
 
-@says(Interrupted)
-def _(remark: Interrupted, of: object) -> str:
+@says(TruncatedRecording)
+def _(remark: TruncatedRecording, of: object) -> str:
     compared = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
     cut = f"the recording of {remark.run} ({remark.path}) is truncated"
     return f"{cut}: only its {compared} are compared"
@@ -255,13 +255,13 @@ def _(remark: EndedByException, of: object) -> str:
     return f"{remark.run} ended with an exception ({when}): {remark.reason}"
 
 
-@says(OtherEnd)
-def _(remark: OtherEnd, of: object) -> str:
+@says(DifferentEnd)
+def _(remark: DifferentEnd, of: object) -> str:
     return f"{remark.what}: {remark.a} in a, {remark.b} in b"
 
 
-@says(ComparedAs)
-def _(remark: ComparedAs, of: object) -> str:
+@says(RenamedProgram)
+def _(remark: RenamedProgram, of: object) -> str:
     return f"{printable(remark.a)} in a is compared with {printable(remark.b)} in b"
 
 
@@ -269,22 +269,22 @@ def _globs(globs: Sequence[str]) -> str:
     return printable(", ".join(globs))
 
 
-@says(NothingAskedFor)
-def _(remark: NothingAskedFor, of: object) -> str:
+@says(SelectionIsEqual)
+def _(remark: SelectionIsEqual, of: object) -> str:
     return (
         f"nothing selected ({_globs(remark.asked)}) differs in the aligned events; this report "
         "shows where the runs diverge"
     )
 
 
-@says(ShownLater)
-def _(remark: ShownLater, of: object) -> str:
+@says(SelectionDivergesLater)
+def _(remark: SelectionDivergesLater, of: object) -> str:
     shown = f"this report shows where {_globs(remark.asked)} differs"
     return f"the runs diverge at event {remark.start}; {shown}"
 
 
-@says(ShownPastTolerated)
-def _(remark: ShownPastTolerated, of: object) -> str:
+@says(StartIsTolerated)
+def _(remark: StartIsTolerated, of: object) -> str:
     covered = "but only in ignored fields or within tolerance"
     shown = "this report shows the first other difference"
     return f"the runs diverge at event {remark.start}, {covered}; {shown}"
@@ -296,8 +296,8 @@ def _(remark: MoreDivergences, of: object) -> str:
     return f"{remark.count} more independent divergences{hint}"
 
 
-@says(CannotRepeat)
-def _(remark: CannotRepeat, of: object) -> str:
+@says(NoRecordCommand)
+def _(remark: NoRecordCommand, of: object) -> str:
     if remark.job:
         job = _shown(remark.job)
         return f"no command to reproduce this: the job {job} of {remark.trace} is not here"
@@ -327,14 +327,14 @@ def _(remark: LogTimesIgnored, of: object) -> str:
     return "log times are not compared (--by stamp matches messages by them)"
 
 
-@says(OtherType)
-def _(remark: OtherType, of: object) -> str:
+@says(DifferentType)
+def _(remark: DifferentType, of: object) -> str:
     a, b = remark.a or "of unknown type", remark.b or "of unknown type"
     return f"{remark.topic} is {a} in a, {b} in b"
 
 
-@says(ComparedByBytes)
-def _(remark: ComparedByBytes, of: object) -> str:
+@says(UndecodedMessages)
+def _(remark: UndecodedMessages, of: object) -> str:
     return f"{remark.error}; compared byte by byte, padding included"
 
 

@@ -28,13 +28,13 @@ from rsltrace.diff.causes.propagation import (
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import (
-    ComparedAs,
-    Diverged,
     Identical,
     MoreDivergences,
-    NothingAskedFor,
-    ShownLater,
-    ShownPastTolerated,
+    RenamedProgram,
+    RunsDiverge,
+    SelectionDivergesLater,
+    SelectionIsEqual,
+    StartIsTolerated,
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff, Divergence, EntityCount
@@ -116,12 +116,12 @@ class _Comparison:
             real = first_real_difference(self._run_a, self._run_b, start)
             self._only_names = real is None
             self._start = start if real is None else real
-            self._remarks += [ComparedAs(*names) for names in self._matching.renamed]
+            self._remarks += [RenamedProgram(*names) for names in self._matching.renamed]
         self._counts = _EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
         self._searched_to: int | None = None
-        """See ``Diverged``."""
+        """See ``RunsDiverge``."""
 
     def run(self) -> Diff:
         """Return the answer."""
@@ -170,12 +170,12 @@ class _Comparison:
             return first
         return replace(first, failed=failed)
 
-    def _outcome(self) -> Diverged:
+    def _outcome(self) -> RunsDiverge:
         foreign = None
         if self._matching.different_jobs:
             jobs = (trace.job.get("name") for trace in (self._a, self._b))
             foreign = tuple(name for name in jobs if name)
-        return Diverged(self._searched_to, foreign)
+        return RunsDiverge(self._searched_to, foreign)
 
     def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
@@ -249,9 +249,9 @@ class _Comparison:
             chosen.sort(key=lambda found: (found.place_a, found.place_b))
         if not chosen:
             chosen = propagation.found[:1]
-            self._remarks.append(NothingAskedFor(self._asked))
+            self._remarks.append(SelectionIsEqual(self._asked))
         elif self._asked and propagation.found[0] is not chosen[0]:
-            self._remarks.append(ShownLater(self._start, self._asked))
+            self._remarks.append(SelectionDivergesLater(self._start, self._asked))
         most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
         if len(chosen) > most:
             more = MoreDivergences(len(chosen) - most, all_shown=self._options.everything)
@@ -273,7 +273,7 @@ class _Comparison:
         """Return what to show if the first divergence is ignored or within tolerance."""
         if search.found is None:
             return chosen  # what all messages say of that is told beside it
-        self._remarks.append(ShownPastTolerated(self._start))
+        self._remarks.append(StartIsTolerated(self._start))
         place = search.found.place_a
         return [search.found, *(found for found in chosen if found.place_a > place)]
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.facts.remarks import Interrupted, Remark
+from rsltrace.diff.facts.remarks import Remark, TruncatedRecording
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import Side
+from rsltrace.diff.result import ComparedRun
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
@@ -32,9 +32,9 @@ def stop_reason(trace: Trace) -> str:
     return trace.result.get("stop_reason") or "no reason given"
 
 
-def side(trace: Trace) -> Side:
+def side(trace: Trace) -> ComparedRun:
     """Return what there is to know of a run as a whole."""
-    return Side(
+    return ComparedRun(
         path=trace.name,
         digest="" if is_native(trace) else trace.digest,
         events=trace.event_count,
@@ -47,7 +47,7 @@ def side(trace: Trace) -> Side:
 def interruptions(a: Trace, b: Trace) -> list[Remark]:
     """Return a remark for each run whose recording was cut off."""
     return [
-        Interrupted(name, trace.name, trace.event_count, trace.end_ns)
+        TruncatedRecording(name, trace.name, trace.event_count, trace.end_ns)
         for name, trace in (("a", a), ("b", b))
         if not trace.complete
     ]

@@ -36,7 +36,7 @@ class Commit:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
+class GitOutput:
     """What a git command said, both streams, and its exit status."""
 
     exit_code: int
@@ -44,7 +44,7 @@ class Done:
     errors: str
 
 
-def git(folder: Path, *words: str, check: bool = True) -> Done:
+def git(folder: Path, *words: str, check: bool = True) -> GitOutput:
     """Run git in a folder, without hooks and in English.
 
     :raises SetupError: there is no git.
@@ -63,7 +63,7 @@ def git(folder: Path, *words: str, check: bool = True) -> Done:
     if check and done.returncode != 0:
         said = (done.stderr.strip() or done.stdout.strip()).replace("fatal: ", "")
         raise BisectError(f"git {words[0]} in {folder}: {said}")
-    return Done(done.returncode, done.stdout, done.stderr)
+    return GitOutput(done.returncode, done.stdout, done.stderr)
 
 
 @lru_cache

@@ -22,7 +22,7 @@ _TIMEOUT_MIN_S = 120.0
 _TIMEOUT_FACTOR = 30
 
 
-class Answer(Enum):
+class RevisionVerdict(Enum):
     """What a revision is, in git's words."""
 
     GOOD = "good"
@@ -36,7 +36,7 @@ class Tried:
 
     commit: Commit
     run: Recorded
-    answer: Answer
+    answer: RevisionVerdict
     why: str = ""
 
 
@@ -122,8 +122,8 @@ class Search:
         self._digest = good.outcome
         ends = []
         for commit, run, wanted in (
-            (self._good, good, Answer.GOOD),
-            (self._bad, bad, Answer.BAD),
+            (self._good, good, RevisionVerdict.GOOD),
+            (self._bad, bad, RevisionVerdict.BAD),
         ):
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
@@ -145,13 +145,13 @@ class Search:
             raise BisectError(f"the {name} revision ({commit}) does not run: {self._why(run)}")
         return run
 
-    def _expect(self, tried: Tried, wanted: Answer) -> None:
+    def _expect(self, tried: Tried, wanted: RevisionVerdict) -> None:
         if tried.answer is wanted:
             return
         assert self._check is not None
-        if tried.answer is Answer.SKIP:
+        if tried.answer is RevisionVerdict.SKIP:
             raise BisectError(f"{wanted.value} revision {tried.commit}: {tried.why}")
-        does = "fails" if wanted is Answer.GOOD else "holds"
+        does = "fails" if wanted is RevisionVerdict.GOOD else "holds"
         raise BisectError(
             f"{self._check.words!r} {does} at {tried.commit}, which is said to be {wanted.value}"
         )
@@ -168,22 +168,22 @@ class Search:
 
     def _judged(self, commit: Commit, run: Recorded) -> Tried:
         if not run.digest or (run.failure and not self._failure_counts):
-            return Tried(commit, run, Answer.SKIP, self._why(run))
+            return Tried(commit, run, RevisionVerdict.SKIP, self._why(run))
         if self._check is not None:
             try:
                 holds = self._check.judge(run.path, self._runner.folder)
             except BisectError as error:
-                return Tried(commit, run, Answer.SKIP, str(error))
-            return Tried(commit, run, Answer.GOOD if holds else Answer.BAD)
+                return Tried(commit, run, RevisionVerdict.SKIP, str(error))
+            return Tried(commit, run, RevisionVerdict.GOOD if holds else RevisionVerdict.BAD)
         if run.outcome == self._digest:
-            return Tried(commit, run, Answer.GOOD)
+            return Tried(commit, run, RevisionVerdict.GOOD)
         seen = any(run.outcome == known.run.outcome for known in self._tried.values())
         if not seen and commit != self._bad:
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
                 why = f"not deterministic: digests {run.digest} and {again.digest or '-'}"
-                return Tried(commit, run, Answer.SKIP, why)
-        return Tried(commit, run, Answer.BAD)
+                return Tried(commit, run, RevisionVerdict.SKIP, why)
+        return Tried(commit, run, RevisionVerdict.BAD)
 
     def _run(self, commit: Commit, more: str = "") -> Recorded:
         tree = self._runner.worktree
@@ -213,7 +213,7 @@ class Search:
     def _found(self, ids: list[str]) -> Found:
         candidates = self._runner.repository.in_order(ids, self._good, self._bad)
         first = candidates[0] if len(candidates) == 1 else None
-        known = [one for one in self._tried.values() if one.answer is Answer.BAD]
+        known = [one for one in self._tried.values() if one.answer is RevisionVerdict.BAD]
         after = next((one for one in known if one.commit.id in ids), known[0])
         return Found(
             first,
@@ -228,6 +228,6 @@ class Search:
         """Return the run to compare with: of the commit's parent, if that runs."""
         if first is not None:
             found = self._at(first.parents[0])
-            if found.answer is not Answer.SKIP:
+            if found.answer is not RevisionVerdict.SKIP:
                 return found
-        return [one for one in self._tried.values() if one.answer is Answer.GOOD][-1]
+        return [one for one in self._tried.values() if one.answer is RevisionVerdict.GOOD][-1]

@@ -23,7 +23,7 @@ from rsltrace._version import __version__
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job
 from rsltrace.search.explore.kept_traces import KeptTraces
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
 from rsltrace.search.explore.workers import Worker
 
@@ -194,7 +194,9 @@ class _Place(WorkerPlugin):  # type: ignore[misc]
         for folder in (self.folder, self.traces):
             shutil.rmtree(folder, ignore_errors=True)
 
-    def run(self, trial: Trial, wants: Wants, timeout_s: float | None, name: str) -> TrialResult:
+    def run(
+        self, trial: Trial, wants: TrialOptions, timeout_s: float | None, name: str
+    ) -> TrialResult:
         """Run a trial in a process that is idle, or a new one."""
         try:
             one = self._idle.get_nowait()
@@ -216,7 +218,7 @@ def _run(
     worker = get_worker()
     held: _Place = worker.plugins[place]
     name = f"{trial['number']:06d}.mcap"
-    found = held.run(Trial(**trial), Wants(**wants), timeout_s, name)
+    found = held.run(Trial(**trial), TrialOptions(**wants), timeout_s, name)
     return found.as_values(), str(worker.address)
 
 
@@ -310,7 +312,7 @@ class Cluster:
         return len(self._futures)
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         """Have a worker run a trial. One that dies meanwhile is replaced by another."""
         assert self._client is not None

@@ -24,7 +24,7 @@ from rsltrace.job import Job
 from rsltrace.run.process import kept_process, search_path
 from rsltrace.run.session import RunResult, Session
 from rsltrace.search.explore.behaviour import behaviours_of, final_state_of
-from rsltrace.search.explore.steps import Watch
+from rsltrace.search.explore.steps import TrialObserver
 from rsltrace.search.explore.trial import (
     CHECK,
     DEADLOCK,
@@ -46,7 +46,7 @@ _TEXT_MAX = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Wants:
+class TrialOptions:
     """What is asked for of a trial beside how it went.
 
     ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be held against
@@ -62,7 +62,7 @@ class Wants:
 
 
 def run_trial(
-    source: JobSource, trial: Trial, trace: Path, wants: Wants | None = None
+    source: JobSource, trial: Trial, trace: Path, wants: TrialOptions | None = None
 ) -> TrialResult:
     """Run a trial in this process; its trace at ``trace`` is there afterwards if it failed, or is
     wanted.
@@ -73,11 +73,11 @@ def run_trial(
     :raises JobError, SetupError, BagError, OutputError: the run could not start or be written.
     :raises CheckError: a check cannot be held against it, and ``wants`` is strict.
     """
-    wants = wants or Wants()
+    wants = wants or TrialOptions()
     began = time.perf_counter()
     job = source.job(trial)
     with kept_process(), Session(job, trace, force=True) as session:
-        watch = Watch(session, steps=wants.steps, fork_ns=wants.fork_ns)
+        watch = TrialObserver(session, steps=wants.steps, fork_ns=wants.fork_ns)
         session.begin()
         if not session.ended:
             session.go_on()
@@ -86,7 +86,12 @@ def run_trial(
 
 
 def result_of_run(
-    job: Job, trial: Trial, ran: RunResult, watch: Watch, wants: Wants, began_s: float
+    job: Job,
+    trial: Trial,
+    ran: RunResult,
+    watch: TrialObserver,
+    wants: TrialOptions,
+    began_s: float,
 ) -> TrialResult:
     """Return what came of a run that is over, which ``watch`` has seen. It began at ``began_s`` of
     ``time.perf_counter``. Its trace goes unless it failed, or is wanted."""
@@ -118,7 +123,7 @@ def result_of_run(
     return replace(found, trace=str(ran.path) if kept else None, wall_s=round(wall_s, 6))
 
 
-def _failure(job: Job, ran: RunResult, trace: Trace, wants: Wants) -> Failure | None:
+def _failure(job: Job, ran: RunResult, trace: Trace, wants: TrialOptions) -> Failure | None:
     """Return what is wrong with a run, the run's own failure before those of checks."""
     if ran.error is not None:
         return _of_error(job, ran.error, trace)
@@ -147,7 +152,7 @@ def _not_held(error: CheckError | JobError) -> Failure:
 
 
 def _metrics(
-    job: Job, trace: Trace, failure: Failure | None, wants: Wants
+    job: Job, trace: Trace, failure: Failure | None, wants: TrialOptions
 ) -> tuple[Failure | None, dict[str, float]]:
     """Return the run's metrics that have a value, and its failure, which may be one of them."""
     if not job.metrics:

@@ -28,8 +28,8 @@ from rsltrace.search.explore.trial import JobSource, Trial
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
-    from rsltrace.search.explore.outcome import Wants
-    from rsltrace.search.explore.steps import Watch
+    from rsltrace.search.explore.outcome import TrialOptions
+    from rsltrace.search.explore.steps import TrialObserver
 
 # What a copy of a worker's process does: it makes one run, answers, and ends.
 
@@ -202,14 +202,14 @@ class _Standing:
         from rsltrace.run.branching import run_up_to, why_never
         from rsltrace.run.process import end_with_run, kept_process
         from rsltrace.run.session import Session
-        from rsltrace.search.explore.outcome import Wants
-        from rsltrace.search.explore.steps import Watch
+        from rsltrace.search.explore.outcome import TrialOptions
+        from rsltrace.search.explore.steps import TrialObserver
         from rsltrace.trace.writer import TraceWriter
 
         end_with_run()
         self._stack = stack
         self._source = source_of(task)
-        wants = Wants(**task["wants"])
+        wants = TrialOptions(**task["wants"])
         job = self._source.job(Trial(0, overlay))
         self.why = why_never(job)
         writer = TraceWriter(None, force=True, events_per_segment=job.record.segment_events)
@@ -217,7 +217,9 @@ class _Standing:
         self.session: Session = Session(job, None, force=True, writer=writer)
         self.session.may_become = True
         stack.enter_context(self.session)
-        self._watch: Watch = Watch(self.session, steps=wants.steps, fork_ns=wants.fork_ns)
+        self._watch: TrialObserver = TrialObserver(
+            self.session, steps=wants.steps, fork_ns=wants.fork_ns
+        )
         if not self.why and not run_up_to(self.session, self.session.start_ns + wants.fork_ns):
             self.why = "the part in common ends before that"
         self._answer_at = -1
@@ -249,11 +251,11 @@ class _Standing:
 
     def make(self, task: dict[str, Any]) -> None:
         """Go on as the run of a trial, and end this process. Never returns."""
-        from rsltrace.search.explore.outcome import Wants
+        from rsltrace.search.explore.outcome import TrialOptions
 
-        answer_and_end(lambda: self._made(task, Wants(**task["wants"])), self._answer_at)
+        answer_and_end(lambda: self._made(task, TrialOptions(**task["wants"])), self._answer_at)
 
-    def _made(self, task: dict[str, Any], wants: Wants) -> dict[str, Any]:
+    def _made(self, task: dict[str, Any], wants: TrialOptions) -> dict[str, Any]:
         from rsltrace.run.branching import why_not as why_no_branch
         from rsltrace.search.explore.outcome import result_of_run
 

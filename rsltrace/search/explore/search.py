@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from rsltrace.job import Job
 from rsltrace.search.explore.kept_traces import KeptTraces
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.strategy import Strategy
 from rsltrace.search.explore.table import Table
 from rsltrace.search.explore.trial import Trial, TrialResult
@@ -42,7 +42,7 @@ class Pool(Protocol):
         """How many trials are under way."""
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         """Begin a trial."""
 
@@ -195,7 +195,7 @@ class Search:
         self._begin(found[0])
         self._keep(found[0], found[0], on_result)
 
-    def _submit(self, pool: Pool, trial: Trial, wants: Wants) -> None:
+    def _submit(self, pool: Pool, trial: Trial, wants: TrialOptions) -> None:
         self._under_way.add(trial.number)
         pool.submit(trial, self._table.trace_of(trial.number), wants, self._timeout_s)
 
@@ -228,9 +228,11 @@ class Search:
         self._done.add(self._number)
         return Trial(self._number, proposal.overlay, proposal.why)
 
-    def _wants(self) -> Wants:
+    def _wants(self) -> TrialOptions:
         strategy = self.strategy
-        return Wants(behaviours=strategy.behaviours, steps=strategy.steps, fork_ns=self._fork_ns)
+        return TrialOptions(
+            behaviours=strategy.behaviours, steps=strategy.steps, fork_ns=self._fork_ns
+        )
 
     def _take(self, result: TrialResult, on_result: Callable[[TrialResult], None]) -> None:
         self._keep(result, self.strategy.learn(result), on_result)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from rsltrace.run.session import Session
 from rsltrace.search.explore.behaviour import identities
-from rsltrace.search.explore.trial import Step
+from rsltrace.search.explore.trial import TrialStep
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.policy import Candidate, Moment
 from rsltrace.trace.chain import hash64
@@ -33,7 +33,7 @@ _Timers = tuple[tuple[str, int, bool], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
+class _PolicyChoice:
     """One asking of the policy: (entity id, kind, node, entity) of all that could run."""
 
     ready: tuple[tuple[int, str, str, str], ...]
@@ -43,7 +43,7 @@ class _Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class _Lull:
+class _PhaseEnd:
     """The end of a phase: how many events there were, when, and the timers then."""
 
     events: int
@@ -51,7 +51,7 @@ class _Lull:
     timers: _Timers
 
 
-class Watch:
+class TrialObserver:
     """Looks over the shoulder of a run's policy, from before it begins."""
 
     def __init__(self, session: Session, *, steps: bool, fork_ns: int = -1) -> None:
@@ -64,8 +64,8 @@ class Watch:
         """How many choices there have been up to ``fork_ns``."""
         self._fork_ns = fork_ns
         self._session = session
-        self._asked: list[_Asked] = []
-        self._lulls: list[_Lull] = []
+        self._asked: list[_PolicyChoice] = []
+        self._lulls: list[_PhaseEnd] = []
         loop = session.loop
         if isinstance(loop, OrderedLoop):
             loop.on_choice = self._note
@@ -82,7 +82,7 @@ class Watch:
         if not self._keeps:
             return
         what = tuple((one.entity_id, one.kind, one.node, one.entity) for one in ready)
-        self._asked.append(_Asked(what, chosen, len(self._lulls), moment.events))
+        self._asked.append(_PolicyChoice(what, chosen, len(self._lulls), moment.events))
 
     def _note_lull(self) -> None:
         domain, loop = self._session.world.domain, self._session.loop
@@ -91,16 +91,16 @@ class Watch:
             for node in domain.graph.nodes
             for timer in node.timers
         )
-        self._lulls.append(_Lull(loop.events, loop.now_ns, timers))
+        self._lulls.append(_PhaseEnd(loop.events, loop.now_ns, timers))
 
     # -- after the run ---------------------------------------------------------------------------
 
-    def steps(self, trace: Trace) -> tuple[Step, ...]:
+    def steps(self, trace: Trace) -> tuple[TrialStep, ...]:
         """Return the steps of the run, whose trace this is."""
         if not self._asked:
             return ()
         names = identities(trace)
-        touches = _Touches(trace, self._programs())
+        touches = _TouchedNames(trace, self._programs())
         states = _states(trace, self._lulls, self._may_merge(trace))
         counts: dict[str, int] = {}
         found = []
@@ -113,7 +113,7 @@ class Watch:
             ready = [_name(names, *what) for what in one.ready]
             chosen = ready[one.chosen]
             found.append(
-                Step(
+                TrialStep(
                     tuple(_numbered(ready, counts)),
                     one.chosen,
                     one.phase,
@@ -164,7 +164,7 @@ def _numbered(ready: list[str], counts: dict[str, int]) -> list[str]:
     return found
 
 
-class _Touches:
+class _TouchedNames:
     """What events touch: True for what they write."""
 
     def __init__(self, trace: Trace, programs: dict[str, str]) -> None:
@@ -207,7 +207,7 @@ class _Touches:
         return self._programs.get(node, node)
 
 
-def _states(trace: Trace, lulls: list[_Lull], may_merge: bool) -> list[str]:
+def _states(trace: Trace, lulls: list[_PhaseEnd], may_merge: bool) -> list[str]:
     """Return a hash of everything at the beginning of each phase.
 
     A node counts with the hash of its state where there is one and it says all, else with all that

@@ -106,7 +106,7 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class TrialStep:
     """What ran next at one asking of the policy, for a search that changes the order.
 
     ``ready`` are the names of all that could run, ``chosen`` is the index of the one that did; the
@@ -153,7 +153,7 @@ class TrialResult:
     final_state: str = ""
     behaviours: tuple[int, ...] = ()
     order: tuple[tuple[int, int], ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[TrialStep, ...] = ()
 
     def as_values(self) -> dict[str, Any]:
         """Return the result as JSON values."""
@@ -174,7 +174,7 @@ def result_of(values: Mapping[str, Any]) -> TrialResult:
     given["behaviours"] = tuple(given.get("behaviours", ()))
     given["order"] = tuple((one, two) for one, two in given.get("order", ()))
     given["steps"] = tuple(
-        Step(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
+        TrialStep(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
         for one in given.get("steps", ())
     )
     return TrialResult(**given)

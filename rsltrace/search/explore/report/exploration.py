@@ -70,7 +70,7 @@ class Exploration:
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class FailureCause:
     """Failures of one cause: a check, or a line where an exception is raised.
 
     ``first`` is the run with the lowest number, ``shortest`` that with the fewest events.
@@ -98,7 +98,7 @@ class Cause:
         return None if found is None else (found["file"], int(found["line"]))
 
 
-def causes(explored: Exploration) -> list[Cause]:
+def causes(explored: Exploration) -> list[FailureCause]:
     """Return the failures of a search by cause, the most frequent first."""
     groups: dict[str, list[TrialResult]] = {}
     for one in sorted(explored.failed, key=lambda one: one.trial.number):
@@ -108,7 +108,7 @@ def causes(explored: Exploration) -> list[Cause]:
     for key, runs in groups.items():
         failure = runs[0].failure
         assert failure is not None
-        found.append(Cause(key, failure, runs, explored.reduced.get(key)))
+        found.append(FailureCause(key, failure, runs, explored.reduced.get(key)))
     return sorted(found, key=lambda cause: (-len(cause.runs), cause.first.trial.number))
 
 
@@ -173,7 +173,7 @@ _SURE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Effect:
+class SettingEffect:
     """What a setting has to do with an outcome (a metric, or ``fails``).
 
     ``strength`` is the share of the ranks' variance that goes with it, 0 to 1; ``sign`` says
@@ -195,7 +195,7 @@ class Effect:
         return self.p < _SURE
 
 
-def effects(results: Sequence[TrialResult]) -> list[Effect]:
+def effects(results: Sequence[TrialResult]) -> list[SettingEffect]:
     """Return the effects of all settings, the surest first.
 
     :raises ExploreError: scipy is not installed.
@@ -231,7 +231,7 @@ def _pairs(
     return [pair for pair in pairs if pair[1] == pair[1]]  # NaN says nothing
 
 
-def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> Effect | None:
+def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> SettingEffect | None:
     values = {value for value, _ in pairs}
     if len(pairs) < _RUNS_MIN or len(values) < 2 or len({y for _, y in pairs}) < 2:
         return None
@@ -247,14 +247,14 @@ def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> Ef
         related = float(ranked.statistic)
         sign = (related > 0) - (related < 0)
         if len(values) > _FEW:
-            return Effect(name, outcome, related**2, sign, float(ranked.pvalue), len(pairs))
+            return SettingEffect(name, outcome, related**2, sign, float(ranked.pvalue), len(pairs))
     groups = [[y for x, y in pairs if x == value] for value in sorted(values, key=str)]
     tested = stats.kruskal(*groups)
     strength = min(float(tested.statistic) / (len(pairs) - 1), 1.0)
-    return Effect(name, outcome, strength, sign, float(tested.pvalue), len(pairs))
+    return SettingEffect(name, outcome, strength, sign, float(tested.pvalue), len(pairs))
 
 
-def _corrected(found: Sequence[Effect]) -> list[Effect]:
+def _corrected(found: Sequence[SettingEffect]) -> list[SettingEffect]:
     """Return effects, in order of p, with Holm's correction."""
     corrected, least = [], 0.0
     for index, effect in enumerate(found):

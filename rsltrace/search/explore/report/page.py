@@ -11,9 +11,9 @@ from rsltrace.errors import ExploreError
 from rsltrace.search.explore.report.charts import histogram, number, progress, scatter
 from rsltrace.search.explore.report.exploration import (
     FAILS,
-    Cause,
-    Effect,
     Exploration,
+    FailureCause,
+    SettingEffect,
     Value,
     causes,
     effects,
@@ -118,7 +118,7 @@ def _failures(body: Element, explored: Exploration) -> None:
         _cause(SubElement(body, "div", {"class": "cause"}), explored, cause)
 
 
-def _cause(box: Element, explored: Exploration, cause: Cause) -> None:
+def _cause(box: Element, explored: Exploration, cause: FailureCause) -> None:
     count, runs = len(cause.runs), len(explored.results)
     _add(box, "h3", f"{cause.failure.kind}: {cause.key}")
     first = cause.first
@@ -193,7 +193,7 @@ def _settings(body: Element, explored: Exploration) -> None:
 
 
 def _drawn(
-    explored: Exploration, varied: Sequence[dict[str, Value]], found: Sequence[Effect]
+    explored: Exploration, varied: Sequence[dict[str, Value]], found: Sequence[SettingEffect]
 ) -> Iterator[Element]:
     """Yield pictures of the effects on metrics, the surest first."""
     for effect in found[:_CHARTS_MAX]:

@@ -13,8 +13,8 @@ from typing import Any
 
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job, job_from_text, load_job
-from rsltrace.search.explore.outcome import Wants
-from rsltrace.search.explore.small.reduction import Parts, Reduced, Reduction
+from rsltrace.search.explore.outcome import TrialOptions
+from rsltrace.search.explore.small.reduction import OverlayParts, ReducedTrial, TrialReduction
 from rsltrace.search.explore.table import SMALL
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult, overrides_of
 from rsltrace.search.explore.workers import Worker
@@ -51,12 +51,14 @@ def test_module(failing: TrialResult) -> str:
     return _TEST.format(why=_one_line(failing).replace('"', "'"), digest=failing.digest)
 
 
-def readme(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> str:
+def readme(reduced: ReducedTrial, failing: TrialResult, passing: TrialResult | None) -> str:
     """Return what the folder is, how to see it fail, and what the failure needs."""
     return "\n".join(_lines(reduced, failing, passing)) + "\n"
 
 
-def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> Iterator[str]:
+def _lines(
+    reduced: ReducedTrial, failing: TrialResult, passing: TrialResult | None
+) -> Iterator[str]:
     yield "# A run that fails"
     yield ""
     assert failing.failure is not None
@@ -92,7 +94,7 @@ def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) 
     yield "sources that `job.yaml` names."
 
 
-def _needed(reduced: Reduced) -> Iterator[str]:
+def _needed(reduced: ReducedTrial) -> Iterator[str]:
     parts = reduced.parts
     if parts.seed is not None:
         yield f"- seed {parts.seed}"
@@ -123,7 +125,7 @@ _OF_FOLDER = re.compile(r"[^\s()]*/((?:failing|passing)\.mcap)")
 
 
 def write_small(
-    source: JobSource, reduced: Reduced, folder: Path, *, timeout_s: float | None = None
+    source: JobSource, reduced: ReducedTrial, folder: Path, *, timeout_s: float | None = None
 ) -> str:
     """Write a reduced trial to ``folder``, which is made; return in a sentence where it parts from
     the nearest run that passes, "" if there is none.
@@ -141,7 +143,7 @@ def write_small(
         raise ExploreError(f"{error.filename or folder}: {error.strerror}") from None
 
 
-def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float | None) -> str:
+def _write(source: JobSource, reduced: ReducedTrial, folder: Path, timeout_s: float | None) -> str:
     job = moved_job(source, reduced.parts, folder)
     _put(folder / JOB, job.to_yaml())
     failing = _recorded(JobSource(str(folder / JOB)), job, folder / FAILING, timeout_s)
@@ -164,7 +166,7 @@ def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float |
     return decides
 
 
-def moved_job(source: JobSource, parts: Parts, folder: Path) -> Job:
+def moved_job(source: JobSource, parts: OverlayParts, folder: Path) -> Job:
     """Return the job of a trial as one whose file is in ``folder``: paths in it start there.
 
     :raises JobError: it is wrong.
@@ -193,7 +195,7 @@ def _recorded(source: JobSource, job: Job, path: Path, timeout_s: float | None) 
     """Run the job of a file; its trace is at ``path`` afterwards."""
     path.unlink(missing_ok=True)
     with Worker(source, pins=job.guard.pins) as worker:
-        return worker.run(Trial(0, {}), path, Wants(keep=True), timeout_s)
+        return worker.run(Trial(0, {}), path, TrialOptions(keep=True), timeout_s)
 
 
 def _diff(folder: Path) -> tuple[str, str]:
@@ -247,7 +249,7 @@ def make_small(
                 tempfile.TemporaryDirectory(dir=folder) as scratch,
                 Worker(source, pins=pins) as worker,
             ):
-                reduced = Reduction(
+                reduced = TrialReduction(
                     source, result, worker, Path(scratch), timeout_s=timeout_s
                 ).reduce()
                 decides = write_small(source, reduced, place, timeout_s=timeout_s)

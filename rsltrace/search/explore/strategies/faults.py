@@ -36,7 +36,7 @@ _BEYOND_INTEGERS = 1e20
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
+class BagContents:
     """A topic that a bag plays: which of its messages may be disturbed, its fields, and how long
     the arrays of its first message are, by their names."""
 
@@ -77,7 +77,7 @@ class Played:
         return ("*", "0", "-1", str(draw.below(count)))[draw.below(4)]
 
 
-def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, Played]:
+def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, BagContents]:
     """Return what bags have played in a run, of those topics of which some messages may be
     disturbed."""
     found = {}
@@ -91,7 +91,7 @@ def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, Played]:
                 if first is not None:
                     lengths.update(_lengths(trace.decode(name, first[-1]), leaves))
             there = [leaf for leaf in leaves if _is_there(leaf, lengths)]
-            found[name] = Played(messages[name], there, lengths)
+            found[name] = BagContents(messages[name], there, lengths)
     return found
 
 
@@ -166,7 +166,7 @@ class FaultWalk:
         self._fork_ns = fork_ns
         self._topics: dict[str, range] = {}
         """Of each topic the messages that may be disturbed."""
-        self._played: dict[str, Played] = {}
+        self._played: dict[str, BagContents] = {}
         """Of each topic that a bag plays what it could play instead."""
         self._progress = job.progress
         self._nodes: dict[str, bool] = {}

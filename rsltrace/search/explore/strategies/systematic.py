@@ -22,17 +22,17 @@ from typing import Any
 
 from rsltrace.search.explore.steps import EVERYTHING
 from rsltrace.search.explore.strategies.strategy import Proposal, choices_left
-from rsltrace.search.explore.trial import Step, TrialResult
+from rsltrace.search.explore.trial import TrialResult, TrialStep
 
 Touches = Mapping[str, bool]
 _Departures = tuple[tuple[int, int], ...]
 
 
 @dataclass(slots=True)
-class _Node:
+class _OrderNode:
     """A place in the tree of orders of one phase: a step. ``departures`` lead there."""
 
-    parent: _Node | None
+    parent: _OrderNode | None
     departures: _Departures
     choice: int
     ready: tuple[str, ...]
@@ -40,7 +40,7 @@ class _Node:
     begun: set[str] = field(default_factory=set)
     tried: dict[str, Touches] = field(default_factory=dict)
 
-    def path(self) -> list[_Node]:
+    def path(self) -> list[_OrderNode]:
         """Return the places from the beginning of the phase up to this one."""
         found = [self]
         while found[-1].parent is not None:
@@ -56,10 +56,10 @@ class _Node:
 
 
 @dataclass(frozen=True, slots=True)
-class _Item:
+class _Order:
     """An order to be tried: at ``node`` this runs next. ``asleep`` was tried there before."""
 
-    node: _Node
+    node: _OrderNode
     key: str
     asleep: Mapping[str, Touches]
 
@@ -75,8 +75,8 @@ class Systematic:
         self._first = 0
         """The first choice that may be another one."""
         self._count = itertools.count()
-        self._waiting: list[tuple[int, int, _Node, str]] = []
-        self._under_way: dict[str, _Item] = {}
+        self._waiting: list[tuple[int, int, _OrderNode, str]] = []
+        self._under_way: dict[str, _Order] = {}
         self._again: list[Proposal] = []
         """What was under way when the search was left."""
         self._states: set[str] = set()
@@ -110,7 +110,7 @@ class Systematic:
                 continue
             overlay = {"policy": {"departures": [{"choice": c, "run": r} for c, r in taken]}}
             asleep = {**node.sleep, **node.tried}
-            self._under_way[_key(overlay)] = _Item(node, key, asleep)
+            self._under_way[_key(overlay)] = _Order(node, key, asleep)
             return Proposal(overlay, f"systematic, {len(taken)} departures")
         return None
 
@@ -156,7 +156,7 @@ class Systematic:
 
     # -- what is to be tried ---------------------------------------------------------------------
 
-    def _follow(self, steps: Sequence[Step], item: _Item | None) -> None:
+    def _follow(self, steps: Sequence[TrialStep], item: _Order | None) -> None:
         """Go through a run, from the phase of the item (None: from the beginning)."""
         self._estimate(steps)
         departures: list[tuple[int, int]] = []
@@ -185,7 +185,7 @@ class Systematic:
                 self._search(phase, nodes_before, first, None)
 
     def _search(
-        self, phase: Sequence[Step], departures: _Departures, choice: int, item: _Item | None
+        self, phase: Sequence[TrialStep], departures: _Departures, choice: int, item: _Order | None
     ) -> bool:
         """Follow a phase, and find where it could go otherwise; False: it is not new."""
         path, is_new = self._path(phase, departures, choice, item)
@@ -193,8 +193,8 @@ class Systematic:
         return is_new
 
     def _path(
-        self, phase: Sequence[Step], departures: _Departures, choice: int, item: _Item | None
-    ) -> tuple[list[_Node], bool]:
+        self, phase: Sequence[TrialStep], departures: _Departures, choice: int, item: _Order | None
+    ) -> tuple[list[_OrderNode], bool]:
         """Return the nodes of a phase, from that of the item on, up to what has been tried."""
         path = [] if item is None else item.node.path()
         known = len(path)
@@ -204,7 +204,7 @@ class Systematic:
             key = step.ready[step.chosen]
             if index >= known:
                 parent = path[-1] if path else None
-                node = _Node(parent, tuple(taken), choice, step.ready, sleep, {key})
+                node = _OrderNode(parent, tuple(taken), choice, step.ready, sleep, {key})
                 if key in sleep:
                     self.redundant += 1
                     self._instead(node)
@@ -220,20 +220,20 @@ class Systematic:
                 choice += 1
         return path, True
 
-    def _instead(self, node: _Node) -> None:
+    def _instead(self, node: _OrderNode) -> None:
         """Something runs that has been tried: try what has not, if there is anything."""
         others = [name for name in node.enabled() if name not in node.sleep]
         if others:
             self._try(node, others[0])
 
-    def _try(self, node: _Node, key: str) -> None:
+    def _try(self, node: _OrderNode, key: str) -> None:
         if key not in node.begun and len(node.ready) > 1 and node.choice >= self._first:
             node.begun.add(key)
             index = node.ready.index(key)
             count = len(node.departures) + (index > 0)
             heapq.heappush(self._waiting, (count, next(self._count), node, key))
 
-    def _reverse(self, steps: Sequence[Step], path: Sequence[_Node]) -> None:
+    def _reverse(self, steps: Sequence[TrialStep], path: Sequence[_OrderNode]) -> None:
         """Where two steps do not commute, see to it that the second is tried first, too."""
         after = _happens_after(steps)
         for second in range(len(steps)):
@@ -248,7 +248,7 @@ class Systematic:
                     for key in possible[:1] or node.enabled():
                         self._try(node, key)
 
-    def _estimate(self, steps: Sequence[Step]) -> None:
+    def _estimate(self, steps: Sequence[TrialStep]) -> None:
         log10 = sum(math.log10(len({_entity(name) for name in step.ready})) for step in steps)
         self.orders_log10 = max(self.orders_log10, log10)
 
@@ -262,7 +262,7 @@ def commute(one: Touches, other: Touches) -> bool:
     return not any(place in other and (writes or other[place]) for place, writes in one.items())
 
 
-def _happens_after(steps: Sequence[Step]) -> list[set[int]]:
+def _happens_after(steps: Sequence[TrialStep]) -> list[set[int]]:
     """Return, for each step of a phase, those before that it cannot come before."""
     after: list[set[int]] = []
     for index, step in enumerate(steps):
@@ -275,7 +275,7 @@ def _happens_after(steps: Sequence[Step]) -> list[set[int]]:
     return after
 
 
-def _races(steps: Sequence[Step], after: Sequence[set[int]], second: int) -> Iterator[int]:
+def _races(steps: Sequence[TrialStep], after: Sequence[set[int]], second: int) -> Iterator[int]:
     """Yield the steps that do not commute with ``second``, with nothing between them."""
     entity = _entity(_ran(steps[second]))
     for first in after[second]:
@@ -286,19 +286,19 @@ def _races(steps: Sequence[Step], after: Sequence[set[int]], second: int) -> Ite
 
 
 def _initials(
-    steps: Sequence[Step], after: Sequence[set[int]], chosen: Sequence[int]
+    steps: Sequence[TrialStep], after: Sequence[set[int]], chosen: Sequence[int]
 ) -> frozenset[str]:
     """Return the steps among ``chosen`` that no other of them has to come before."""
     there = set(chosen)
     return frozenset(_ran(steps[k]) for k in chosen if not after[k] & there)
 
 
-def _phases(steps: Sequence[Step]) -> Iterator[list[Step]]:
+def _phases(steps: Sequence[TrialStep]) -> Iterator[list[TrialStep]]:
     for _, phase in itertools.groupby(steps, key=lambda step: step.phase):
         yield list(phase)
 
 
-def _ran(step: Step) -> str:
+def _ran(step: TrialStep) -> str:
     return step.ready[step.chosen]
 
 
