@@ -102,7 +102,7 @@ def test_strategies_leave_the_beginning_as_it_is(alike: Worker, tmp_path: Path) 
         assert number > 3
     with pytest.raises(ExploreError, match="no choice of what runs next after that time"):
         choices_left(replace(plain, choices_before=plain.choices))
-    with pytest.raises(ExploreError, match="ends before runs would be forked"):
+    with pytest.raises(ExploreError, match="ends before the time of --fork-after"):
         FaultWalk(job, fork_ns=10**9).begin(plain)
     with pytest.raises(ExploreError, match="runs with other settings differ"):
         strategy_named("vary", job, fork_after=("1s", 10**9))
@@ -125,7 +125,7 @@ def test_a_search_forks_and_what_it_finds_is_repeated_from_the_beginning(
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
     assert repeated.returncode == 1
     refused = command("explore", job, "--resume", "--fork-after", "0.5s", "-o", tmp_path / "found")
-    assert "its search was another one (fork after differs)" in refused.stderr
+    assert "has a different search (fork after differs)" in refused.stderr
 
 
 BEYOND = {

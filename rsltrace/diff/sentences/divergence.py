@@ -45,7 +45,7 @@ from rsltrace.diff.facts.evidence import (
     Setting,
     SettingKind,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.diff.sentences.values import (
     IN_ONE,
     NAMED_MAX,
@@ -131,11 +131,6 @@ def _(what: DivergenceKind, of: Judgement) -> str:
 def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     return f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
-
-
-@says(DivergenceKind.CONSTRUCTION_ORDER)
-def _(what: DivergenceKind, of: Judgement) -> str:
-    return "the nodes are constructed in a different order"
 
 
 @says(DivergenceKind.OTHER_ENTITIES)
@@ -237,21 +232,6 @@ def _(what: DivergenceKind, of: Judgement) -> str:
 def _(what: DivergenceKind, of: Judgement) -> str:
     values = next((field_text(m.fields, m.more_fields) for m in of.messages), "")
     return f"{_at(_one(of))} is different{f' ({values})' if values else ''}"
-
-
-@says(DivergenceKind.OTHER_FROM_OUTSIDE)
-def _(what: DivergenceKind, of: Judgement) -> str:
-    return f"{_at(_one(of))} is different"
-
-
-@says(DivergenceKind.OTHER_DONE_OUTSIDE)
-def _(what: DivergenceKind, of: Judgement) -> str:
-    return f"{_at(_one(of))} is different{what_differs(of.messages)}"
-
-
-@says(DifferentInput)
-def _(what: DifferentInput, of: Judgement) -> str:
-    return f"{_at(_one(of))} received a different {what.topic or 'input'}"
 
 
 @says(DivergenceKind.ONLY_ZERO_DELAYS)
@@ -389,11 +369,6 @@ def _(what: EarlierEnd, of: Judgement) -> str:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-@says(EntityChanges)
-def _(changed: EntityChanges, of: object) -> str:
-    return joined([_change_text(change) for change in changed.changes])
-
-
 def _change_text(change: EntityChange) -> str:
     entity = change.entity
     values = ", ".join(_property_text(*value) for value in change.values)
@@ -422,16 +397,6 @@ def _policy(name: str, value: str | int | None) -> str:
 def _(loss: UnfinishedCall, of: object) -> str:
     since = seconds_text(loss.since_ns)
     return f"{shortened(loss.text, _WAITS_MAX)}, from {since} s to the end of {loss.run}"
-
-
-@says(QueueOverflow)
-def _(loss: QueueOverflow, of: object) -> str:
-    return f"its queue (depth {loss.depth}) overflowed in {loss.run}"
-
-
-@says(NoMoreMessages)
-def _(loss: NoMoreMessages, of: object) -> str:
-    return f"it receives nothing more in {loss.run}"
 
 
 # -- why -------------------------------------------------------------------------------------------
@@ -497,21 +462,6 @@ def _(why: CauseKind, of: Judgement) -> str:
     )
 
 
-@says(CauseKind.ONLY_IN_ONE_BAG)
-def _(why: CauseKind, of: Judgement) -> str:
-    return because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
-
-
-@says(CauseKind.DRIVEN_IN_ONE)
-def _(why: CauseKind, of: Judgement) -> str:
-    return f"the code that drives the simulation did this only in {_has(of)[0]}"
-
-
-@says(CauseKind.FAULT_IN_ONE)
-def _(why: CauseKind, of: Judgement) -> str:
-    return because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
-
-
 @says(CauseKind.NOTHING_MADE_IT_RUN)
 def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
@@ -531,14 +481,6 @@ def _(why: CauseKind, of: Judgement) -> str:
     gone = f"in {has_not} {topic} receives nothing: it is gone or not connected"
     because = because_of(of.settings)
     return f"{gone}; {because}" if because else gone
-
-
-@says(ParameterFiles)
-def _(why: ParameterFiles, of: Judgement) -> str:
-    return because_of(of.settings) or (
-        f"parameter {listed(why.parameters)}: a parameter file ({listed(why.files)}) or the "
-        "constructor sets a different value"
-    )
 
 
 @says(WaitInOneRun)
@@ -562,14 +504,6 @@ def _(why: NotDelivered, of: Judgement) -> str:
     return text
 
 
-@says(DifferentSenders)
-def _(why: DifferentSenders, of: Judgement) -> str:
-    return (
-        f"in a it came from {phrase(why.a)} (event {why.a.index}), in b from "
-        f"{phrase(why.b)} (event {why.b.index})"
-    )
-
-
 @says(NoEarlierDifference)
 def _(why: NoEarlierDifference, of: Judgement) -> str:
     if because := because_of(of.settings):
@@ -588,16 +522,6 @@ def _(why: NoEarlierDifference, of: Judgement) -> str:
 
 def _itself(kind: str) -> str:
     return f"the {kind if kind in NO_CALLBACKS else 'callback'} itself"
-
-
-@says(Consequence)
-def _(why: Consequence, of: Judgement) -> str:
-    return f"it follows from an earlier difference: {sentence(why.root.what, why.root)}"
-
-
-@says(SameCause)
-def _(why: SameCause, of: Judgement) -> str:
-    return cause_of(why.first)
 
 
 @says(CauseKind.CUT_OFF)
@@ -673,11 +597,6 @@ def call_text(call: CallDifference) -> str:
 def _(cause: SetOrder, of: object) -> str:
     more = f" (and {cause.more} more)" if cause.more else ""
     return f"the {cause.what} at {cause.place}{more}"
-
-
-@says(UnrecordedAnswer)
-def _(cause: UnrecordedAnswer, of: object) -> str:
-    return f"the result of {cause.call} at {cause.place}"
 
 
 # -- the headline ----------------------------------------------------------------------------------
@@ -771,3 +690,47 @@ def _setting(setting: Setting) -> str:
     if len(values) == 2:
         return f"{name} {pair_text(setting.a, setting.b)}{place}"
     return f"{name} {printable(''.join(values))} {only}{place}"
+
+
+SENTENCES.update(
+    {
+        DivergenceKind.CONSTRUCTION_ORDER: lambda fact, of: (
+            "the nodes are constructed in a different order"
+        ),
+        DivergenceKind.OTHER_FROM_OUTSIDE: lambda fact, of: f"{_at(_one(of))} is different",
+        DivergenceKind.OTHER_DONE_OUTSIDE: lambda fact, of: (
+            f"{_at(_one(of))} is different{what_differs(of.messages)}"
+        ),
+        DifferentInput: lambda fact, of: (
+            f"{_at(_one(of))} received a different {fact.topic or 'input'}"
+        ),
+        EntityChanges: lambda fact, of: joined([_change_text(change) for change in fact.changes]),
+        QueueOverflow: lambda fact, of: f"its queue (depth {fact.depth}) overflowed in {fact.run}",
+        NoMoreMessages: lambda fact, of: f"it receives nothing more in {fact.run}",
+        CauseKind.ONLY_IN_ONE_BAG: lambda fact, of: (
+            because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
+        ),
+        CauseKind.DRIVEN_IN_ONE: lambda fact, of: (
+            f"the code that drives the simulation did this only in {_has(of)[0]}"
+        ),
+        CauseKind.FAULT_IN_ONE: lambda fact, of: (
+            because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
+        ),
+        ParameterFiles: lambda fact, of: (
+            because_of(of.settings)
+            or (
+                f"parameter {listed(fact.parameters)}: a parameter file ({listed(fact.files)}) or "
+                "the constructor sets a different value"
+            )
+        ),
+        DifferentSenders: lambda fact, of: (
+            f"in a it came from {phrase(fact.a)} (event {fact.a.index}), in b from "
+            f"{phrase(fact.b)} (event {fact.b.index})"
+        ),
+        Consequence: lambda fact, of: (
+            f"it follows from an earlier difference: {sentence(fact.root.what, fact.root)}"
+        ),
+        SameCause: lambda fact, of: cause_of(fact.first),
+        UnrecordedAnswer: lambda fact, of: f"the result of {fact.call} at {fact.place}",
+    }
+)

@@ -40,7 +40,7 @@ from rsltrace.diff.facts.remarks import (
     TruncatedRecording,
     UndecodedMessages,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.diff.sentences.values import IN_ONE
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.phrases import seconds_text
@@ -237,11 +237,6 @@ def _number(count: int, noun: str) -> str:
 # -- what else to know -----------------------------------------------------------------------------
 
 
-@says(ReaderNote)
-def _(remark: ReaderNote, of: object) -> str:
-    return remark.text
-
-
 @says(TruncatedRecording)
 def _(remark: TruncatedRecording, of: object) -> str:
     compared = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
@@ -255,26 +250,8 @@ def _(remark: EndedByException, of: object) -> str:
     return f"{remark.run} ended with an exception ({when}): {remark.reason}"
 
 
-@says(DifferentEnd)
-def _(remark: DifferentEnd, of: object) -> str:
-    return f"{remark.what}: {remark.a} in a, {remark.b} in b"
-
-
-@says(RenamedProgram)
-def _(remark: RenamedProgram, of: object) -> str:
-    return f"{printable(remark.a)} in a is compared with {printable(remark.b)} in b"
-
-
 def _globs(globs: Sequence[str]) -> str:
     return printable(", ".join(globs))
-
-
-@says(SelectionIsEqual)
-def _(remark: SelectionIsEqual, of: object) -> str:
-    return (
-        f"nothing selected ({_globs(remark.asked)}) differs in the aligned events; this report "
-        "shows where the runs diverge"
-    )
 
 
 @says(SelectionDivergesLater)
@@ -314,28 +291,10 @@ def _shown(text: str) -> str:
     return shortened(printable(text), _TEXT_MAX)
 
 
-@says(JobChanged)
-def _(remark: JobChanged, of: object) -> str:
-    return (
-        f"{remark.job} has changed since {remark.trace} was recorded, or the trace is of another "
-        "job"
-    )
-
-
-@says(LogTimesIgnored)
-def _(remark: LogTimesIgnored, of: object) -> str:
-    return "log times are not compared (--by stamp matches messages by them)"
-
-
 @says(DifferentType)
 def _(remark: DifferentType, of: object) -> str:
     a, b = remark.a or "of unknown type", remark.b or "of unknown type"
     return f"{remark.topic} is {a} in a, {b} in b"
-
-
-@says(UndecodedMessages)
-def _(remark: UndecodedMessages, of: object) -> str:
-    return f"{remark.error}; compared byte by byte, padding included"
 
 
 def reproduction_text(of: RepeatedRun) -> str:
@@ -352,3 +311,28 @@ def reproduction_text(of: RepeatedRun) -> str:
         f"{third} is a third result: it differs from a at event {of.from_a} and from b at event "
         f"{of.from_b}; a and b diverge at event {of.place}"
     )
+
+
+SENTENCES.update(
+    {
+        ReaderNote: lambda fact, of: fact.text,
+        DifferentEnd: lambda fact, of: f"{fact.what}: {fact.a} in a, {fact.b} in b",
+        RenamedProgram: lambda fact, of: (
+            f"{printable(fact.a)} in a is compared with {printable(fact.b)} in b"
+        ),
+        SelectionIsEqual: lambda fact, of: (
+            f"nothing selected ({_globs(fact.asked)}) differs in the aligned events; this report "
+            "shows where the runs diverge"
+        ),
+        JobChanged: lambda fact, of: (
+            f"{fact.job} has changed since {fact.trace} was recorded, or the trace is of another "
+            "job"
+        ),
+        LogTimesIgnored: lambda fact, of: (
+            "log times are not compared (--by stamp matches messages by them)"
+        ),
+        UndecodedMessages: lambda fact, of: (
+            f"{fact.error}; compared byte by byte, padding included"
+        ),
+    }
+)

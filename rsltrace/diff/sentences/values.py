@@ -26,7 +26,7 @@ from rsltrace.diff.facts.evidence import (
     TimerCancellation,
     TimerPeriod,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import (
     durations_apart,
@@ -218,25 +218,10 @@ def _label(message: MessageDifference) -> str:
     return f"{_LABELS.get(message.kind, '') if message.kind else ''}{message.topic}"
 
 
-@says(OutputOrder)
-def _(fate: OutputOrder, of: object) -> str:
-    return "in a different order"
-
-
 @says(SendCount)
 def _(fate: SendCount, of: object) -> str:
     times = {(1, 2): "twice in b", (2, 1): "twice in a"}
     return times.get((fate.a, fate.b), f"{fate.a} times in a, {fate.b} times in b")
-
-
-@says(SendDelay)
-def _(fate: SendDelay, of: object) -> str:
-    return f"{format_duration(fate.by_ns)} later in {fate.run}"
-
-
-@says(TimerCancellation)
-def _(fate: TimerCancellation, of: object) -> str:
-    return f"cancelled in {fate.run}"
 
 
 @says(TimerPeriod)
@@ -244,16 +229,6 @@ def _(fate: TimerPeriod, of: object) -> str:
     if fate.before_ns is None:
         return f"set to a period of {format_duration(fate.after_ns)} in {fate.run}"
     return f"period {durations(fate.before_ns, fate.after_ns)} in {fate.run}"
-
-
-@says(ParameterValues)
-def _(fate: ParameterValues, of: object) -> str:
-    return ", ".join(f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fate.values)
-
-
-@says(ParameterChanges)
-def _(fate: ParameterChanges, of: object) -> str:
-    return ", ".join(f"{name} {pair_text(a, b)}" for name, a, b in fate.values)
 
 
 def output_change_text(message: MessageDifference) -> str:
@@ -290,3 +265,18 @@ def link_text(link: CauseLink) -> str:
     if link.kind is LinkKind.MORE_STEPS:
         return f"led, in {link.steps} more steps, to"
     return f"{_LINKS.get(link.kind, '')} {link.name}".strip()
+
+
+SENTENCES.update(
+    {
+        OutputOrder: lambda fact, of: "in a different order",
+        SendDelay: lambda fact, of: f"{format_duration(fact.by_ns)} later in {fact.run}",
+        TimerCancellation: lambda fact, of: f"cancelled in {fact.run}",
+        ParameterValues: lambda fact, of: ", ".join(
+            f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fact.values
+        ),
+        ParameterChanges: lambda fact, of: ", ".join(
+            f"{name} {pair_text(a, b)}" for name, a, b in fact.values
+        ),
+    }
+)

@@ -1,4 +1,4 @@
-"""The search: both ends first, then the revisions between them that ``git bisect`` chooses."""
+"""Bisect: run both ends, then the revisions between them that ``git bisect`` chooses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TIMEOUT_FACTOR = 30
 
 
 class RevisionVerdict(Enum):
-    """What a revision is, in git's words."""
+    """A revision's verdict, in git's words."""
 
     GOOD = "good"
     BAD = "bad"
@@ -42,11 +42,11 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search found.
+    """The result of a search.
 
     ``first`` is the first changed commit; None if it is one of ``candidates``, of which all but the
-    last were skipped. ``before`` and ``after`` are the runs to compare: of the revision before the
-    change and of the first one that has it. ``tried`` is all that was run, in order.
+    last were skipped. ``before`` and ``after`` are the runs before and after the change, ``tried``
+    all revisions that were run, in order.
     """
 
     first: Commit | None
@@ -60,7 +60,7 @@ class Found:
 class Search:
     """A search between two commits. ``check`` None: by the digest.
 
-    ``on_try`` is told each revision that was run, ``on_note`` what else there is to know.
+    ``on_try`` receives each revision that was run, ``on_note`` further notes.
     """
 
     def __init__(
@@ -82,13 +82,12 @@ class Search:
         self._tried: dict[str, Tried] = {}
         self._notes: list[str] = []
         self._failure_counts = False
-        """Whether a run in which a node raises is one like others: so it is at an end."""
+        """Whether a run in which a node raises is judged, not skipped: one end raises, too."""
 
     def find(self) -> Found:
         """Search.
 
-        :raises BisectError: an end does not run or is not what it is said to be, or a job is not
-            deterministic there.
+        :raises BisectError: an end does not run, is not good or bad, or is nondeterministic.
         """
         good, bad = self._ends()
         tree = self._runner.worktree
@@ -115,9 +114,9 @@ class Search:
         self._failure_counts = bool(good.failure or bad.failure)
         if self._check is None and good.outcome == bad.outcome:
             raise BisectError(
-                f"{self._good.short} and {self._bad.short} do the same ({good.events} events, "
-                f"digest {good.digest}): there is no change between them to be found; a change "
-                "that no digest shows may be found with --check or --run"
+                f"{self._good.short} and {self._bad.short} have the same run ({good.events} "
+                f"events, digest {good.digest}): there is no change to find; for a change that "
+                "the digest does not show, use --check or --run"
             )
         self._digest = good.outcome
         ends = []
@@ -128,8 +127,8 @@ class Search:
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
                 raise BisectError(
-                    f"the job is not deterministic at {commit}: two runs of it have the digests "
-                    f"{run.digest or '-'} and {again.digest or '-'}; rsltrace verify there says why"
+                    f"the job is not deterministic at {commit}: two runs have the digests "
+                    f"{run.digest or '-'} and {again.digest or '-'}; run rsltrace verify there"
                 )
             ends.append(self._tell(self._judged(commit, run)))
             self._expect(ends[-1], wanted)
@@ -153,13 +152,13 @@ class Search:
             raise BisectError(f"{wanted.value} revision {tried.commit}: {tried.why}")
         does = "fails" if wanted is RevisionVerdict.GOOD else "holds"
         raise BisectError(
-            f"{self._check.words!r} {does} at {tried.commit}, which is said to be {wanted.value}"
+            f"{self._check.words!r} {does} at {tried.commit}, the {wanted.value} revision"
         )
 
     # -- one revision ----------------------------------------------------------------------------
 
     def _at(self, commit_id: str) -> Tried:
-        """Run and judge the revision that is in the worktree, unless that has been done."""
+        """Run and judge the revision in the worktree, once."""
         if commit_id in self._tried:
             return self._tried[commit_id]
         commit = self._runner.repository.commit(commit_id)
@@ -198,7 +197,7 @@ class Search:
         return tried
 
     def _why(self, run: Recorded) -> str:
-        """Return why a run is none, in the words of whoever knows it best."""
+        """Return why a run failed: its error message, if it printed one."""
         said = [line for line in run.errors.splitlines() if line.startswith(_ERROR)]
         why = run.failure if run.digest or not said else said[-1].removeprefix(_ERROR)
         return why.replace(f"{self._runner.worktree.tree}/", "")

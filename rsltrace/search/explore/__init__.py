@@ -1,15 +1,15 @@
 """Searching orders, faults and settings for the run that fails.
 
-trial       what sets one run of a search apart, and what came of it
+trial       the changes and the result of one run of a search
 outcome     one run: its trace, its checks, what is new in it
 workers     processes that run one trial after another, each in a copy of themselves
 worker      the program of such a process
-prefix      processes that have made what runs begin alike with, and are copied for each
+prefix      processes that have run a common prefix and are forked for each run
 copies      what a copy of such a process does
 bundle      what a job needs on another machine
 cluster     trials on the workers of a Dask cluster
 report      what was found: a page, and formats for machines
-steps       what a run chose from, and what each thing that ran has touched
+steps       the choices of a run, and what each callback touched
 behaviour   what a run did, as hashes that others can be compared with
 table       the folder with a row for each run
 strategies  what is tried next

@@ -1,4 +1,4 @@
-"""One run of a search, in the process that makes it: its trace, its checks, what is new in it."""
+"""Run one trial of a search: its trace, its checks and metrics, what is new in it."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ _TEXT_MAX = 1000
 
 @dataclass(frozen=True, slots=True)
 class TrialOptions:
-    """What is asked for of a trial beside how it went.
+    """What a trial records.
 
-    ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be held against
-    the run is an error, not a failure of the run. ``fork_ns``: how much of the run, in simulated
-    time, is that of the job as it is, so that it may be forked from that (-1: nothing).
+    ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be evaluated is an
+    error, not a failure of the run. ``fork_ns``: up to which simulated time the run equals the
+    plain one and may be forked from it (-1: not at all).
     """
 
     keep: bool = False
@@ -64,14 +64,12 @@ class TrialOptions:
 def run_trial(
     source: JobSource, trial: Trial, trace: Path, wants: TrialOptions | None = None
 ) -> TrialResult:
-    """Run a trial in this process; its trace at ``trace`` is there afterwards if it failed, or is
-    wanted.
+    """Run a trial in this process; its trace stays at ``trace`` if it failed, or is wanted.
 
-    For a process that makes one trial: modules and numbers of objects are then those of a run
-    that ``rsltrace record`` makes. See ``workers`` for whoever wants many.
+    For a process that runs one trial, as ``rsltrace record`` does. ``workers`` runs many.
 
     :raises JobError, SetupError, BagError, OutputError: the run could not start or be written.
-    :raises CheckError: a check cannot be held against it, and ``wants`` is strict.
+    :raises CheckError: a check cannot be evaluated, and ``wants`` is strict.
     """
     wants = wants or TrialOptions()
     began = time.perf_counter()
@@ -93,8 +91,8 @@ def result_of_run(
     wants: TrialOptions,
     began_s: float,
 ) -> TrialResult:
-    """Return what came of a run that is over, which ``watch`` has seen. It began at ``began_s`` of
-    ``time.perf_counter``. Its trace goes unless it failed, or is wanted."""
+    """Return the result of a finished run. It began at ``began_s`` of ``time.perf_counter``. Its
+    trace is deleted unless it failed, or is wanted."""
     assert ran.path is not None, "it has been recorded"
     with Trace.open(ran.path) as opened:
         failure = _failure(job, ran, opened, wants)
@@ -124,7 +122,7 @@ def result_of_run(
 
 
 def _failure(job: Job, ran: RunResult, trace: Trace, wants: TrialOptions) -> Failure | None:
-    """Return what is wrong with a run, the run's own failure before those of checks."""
+    """Return the failure of a run, its own before those of checks."""
     if ran.error is not None:
         return _of_error(job, ran.error, trace)
     try:
@@ -146,7 +144,7 @@ def _failure(job: Job, ran: RunResult, trace: Trace, wants: TrialOptions) -> Fai
 
 
 def _not_held(error: CheckError | JobError) -> Failure:
-    """Return the failure of a run that a check or metric cannot be held against."""
+    """Return the failure of a run for which a check or metric cannot be evaluated."""
     text = str(error)
     return Failure(ERROR, shortened(text, _TEXT_MAX), f"a check: {text.splitlines()[0]}")
 
@@ -209,7 +207,7 @@ def _last_line(job: Job, text: str) -> str:
 
 
 def _relative(job: Job, file: str) -> str:
-    """Return a path as seen from the job, the same wherever both lie."""
+    """Return a path relative to the job's folder."""
     if not os.path.isabs(file):
         return file
     return os.path.relpath(file, job.base_dir)

@@ -1,9 +1,8 @@
-"""What a run had to choose from, what it chose, and what each thing that ran has touched.
+"""The choices of a run, and what each step touched.
 
 A search that changes the order of a run needs to know which changes could matter. Two steps commute
-unless one of them writes what the other reads or writes: a node (its own callbacks), a topic or
-service (a message that arrives, in the queue of its subscription), or everything (an entity is made
-or destroyed, an exception ends the run).
+unless one writes what the other reads or writes: a node (its own callbacks), a topic or service
+(the queue of its subscription), or everything (an entity is created or destroyed, an exception).
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _Timers = tuple[tuple[str, int, bool], ...]
 
 @dataclass(frozen=True, slots=True)
 class _PolicyChoice:
-    """One asking of the policy: (entity id, kind, node, entity) of all that could run."""
+    """One choice of the policy: (entity id, kind, node, entity) of all that could run."""
 
     ready: tuple[tuple[int, str, str, str], ...]
     chosen: int
@@ -44,7 +43,7 @@ class _PolicyChoice:
 
 @dataclass(frozen=True, slots=True)
 class _PhaseEnd:
-    """The end of a phase: how many events there were, when, and the timers then."""
+    """The end of a phase: number of events, time, and state of the timers."""
 
     events: int
     now_ns: int
@@ -52,14 +51,14 @@ class _PhaseEnd:
 
 
 class TrialObserver:
-    """Looks over the shoulder of a run's policy, from before it begins."""
+    """Observes the choices of a run's policy, from before it begins."""
 
     def __init__(self, session: Session, *, steps: bool, fork_ns: int = -1) -> None:
         """``fork_ns``: since the start of the run, when others are forked from it (-1: never)."""
         self.order: list[tuple[int, int]] = []
         """Of each choice, which of how many was taken."""
         self.entities: set[tuple[int, int]] = set()
-        """Whatever could run at some time: entities, and which of their callbacks under way."""
+        """All that could run at some time: entity and thread."""
         self.choices_before = 0
         """How many choices there have been up to ``fork_ns``."""
         self._fork_ns = fork_ns
@@ -137,10 +136,10 @@ class TrialObserver:
         }
 
     def _may_merge(self, trace: Trace) -> bool:
-        """Say whether the hashes of nodes' states tell all that a node goes on from."""
+        """Whether the hashes of nodes' states cover all that later behaviour depends on."""
         job = self._session.job
         if job.delay is not None or job.execution is not None or job.executors is not None:
-            return False  # messages may be on their way, workers busy
+            return False  # messages may be in transit, workers busy
         if any(entity.kind in _COMES_AND_GOES for entity in trace.entities.values()):
             return False
         return not any(met.source is Source.RANDOM for met in trace.guarded)
@@ -150,12 +149,11 @@ def _name(names: dict[int, str], entity_id: int, kind: str, node: str, entity: s
     named = names.get(entity_id) if entity_id else None
     if named is None:
         return f"{node} {kind} {entity}"
-    return f"{named}, which goes on" if kind == "resume" else named
+    return f"{named}, resumed" if kind == "resume" else named
 
 
 def _numbered(ready: list[str], counts: dict[str, int]) -> list[str]:
-    """Say which event of its entity each is: a second message of one topic comes after the
-    first."""
+    """Number the events of each entity: a second message of a topic comes after the first."""
     here: dict[str, int] = {}
     found = []
     for name in ready:
@@ -165,7 +163,7 @@ def _numbered(ready: list[str], counts: dict[str, int]) -> list[str]:
 
 
 class _TouchedNames:
-    """What events touch: True for what they write."""
+    """The names that events touch: True for those they write."""
 
     def __init__(self, trace: Trace, programs: dict[str, str]) -> None:
         self._trace = trace
@@ -210,8 +208,8 @@ class _TouchedNames:
 def _states(trace: Trace, lulls: list[_PhaseEnd], may_merge: bool) -> list[str]:
     """Return a hash of everything at the beginning of each phase.
 
-    A node counts with the hash of its state where there is one and it says all, else with all that
-    it has done; what was published on a topic that keeps messages for late ones counts, too.
+    A node counts with its state hash if that covers everything, else with all its events; what was
+    published on transient-local topics counts, too.
     """
     done: dict[int, int] = {}
     states = [hash64(b"begin")]

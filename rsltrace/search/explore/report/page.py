@@ -1,4 +1,4 @@
-"""A search as a page of HTML that needs nothing beside it: no network, no scripts."""
+"""A search as a self-contained page of HTML: no network, no scripts."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def _numbers(body: Element, explored: Exploration) -> None:
         (f"{runs:,}", "runs"),
         (f"{failed:,}", "failed"),
         (f"{len(causes(explored)):,}", "causes"),
-        (f"{explored.digests:,}", "different runs (digests)"),
+        (f"{explored.digests:,}", "different digests"),
         (format_duration(round(explored.wall_s * 1e9)), "of real time"),
         (f"{rate:.1f}", "runs per second"),
         (explored.strategy or "-", "strategy"),
@@ -129,7 +129,7 @@ def _cause(box: Element, explored: Exploration, cause: FailureCause) -> None:
     if cause.reduced is not None:
         if cause.reduced.decides:
             _add(box, "p", cause.reduced.decides, "decides")
-        _add(box, "p", f"Made small in {cause.reduced.folder}:")
+        _add(box, "p", f"Reduced in {cause.reduced.folder}:")
     shown = cause.shortest
     lines = [line for line in (repeat_command(explored, shown), view_command(shown)) if line]
     if cause.reduced is not None:
@@ -159,7 +159,7 @@ def _metrics(body: Element, explored: Exploration) -> None:
         named = _with_unit(explored, name)
         rows.append((named, f"{len(values):,}", *map(number, cells)))
         drawn.append(histogram(values, named))
-    _table(body, ("metric", "runs", "least", "median", "mean", "most"), rows)
+    _table(body, ("metric", "runs", "min", "median", "mean", "max"), rows)
     _charts(body, drawn)
 
 
@@ -178,7 +178,7 @@ def _settings(body: Element, explored: Exploration) -> None:
             one.setting,
             one.outcome,
             f"{one.strength:.0%}",
-            {1: "more with more", -1: "less with more", 0: ""}[one.sign],
+            {1: "increases", -1: "decreases", 0: ""}[one.sign],
             "< 0.0001" if one.p < 0.0001 else f"{one.p:.4f}",
             f"{one.runs:,}",
         )
@@ -189,13 +189,13 @@ def _settings(body: Element, explored: Exploration) -> None:
         _table(body, head, rows)
         _charts(body, _drawn(explored, varied, found))
     else:
-        _add(body, "p", "Nothing varied, or all runs came out alike.")
+        _add(body, "p", "No setting varied, or all runs had the same outcome.")
 
 
 def _drawn(
     explored: Exploration, varied: Sequence[dict[str, Value]], found: Sequence[SettingEffect]
 ) -> Iterator[Element]:
-    """Yield pictures of the effects on metrics, the surest first."""
+    """Yield charts of the effects on metrics, the surest first."""
     for effect in found[:_CHARTS_MAX]:
         if effect.outcome == FAILS:
             continue
@@ -224,7 +224,7 @@ def _coverage(body: Element, explored: Exploration) -> None:
     for sentence in explored.coverage:
         _add(body, "p", sentence)
     if new:
-        _key(body, "runs that did what none had done", "runs that failed")
+        _key(body, "new runs", "runs that failed")
         _charts(body, [progress(new, [one.failure is not None for one in explored.results])])
 
 
@@ -252,7 +252,7 @@ def _row(result: TrialResult) -> tuple[str, ...]:
 
 
 def _add(parent: Element, tag: str, text: str, kind: str = "") -> Element:
-    """Add an element with a text that may be anybody's."""
+    """Add an element with untrusted text."""
     one = SubElement(parent, tag, {"class": kind} if kind else {})
     one.text = printable_lines(text)
     return one

@@ -1,4 +1,4 @@
-"""Reducing a trial that fails: whatever can be left out of it while it fails for the same cause."""
+"""Reduce a failing trial: leave out all that it does not need to fail for the same cause."""
 
 from __future__ import annotations
 
@@ -17,18 +17,15 @@ from rsltrace.search.explore.workers import Worker
 from rsltrace.simulation.loop.policy import decoded
 from rsltrace.trace.reader import Trace
 
-# Delta debugging (Zeller and Hildebrandt, 2002): which of many things does a failure need?
-
 T = TypeVar("T")
 
 
 def ddmin(items: Sequence[T], fails: Callable[[list[T]], bool]) -> list[T]:
-    """Return some of ``items``, in their order, with which ``fails`` says that it still does, and
-    of which none can be left out alone (or none at all, if it fails without any).
+    """Return a minimal selection of ``items``, in their order, for which ``fails`` is true: none of
+    it can be left out alone (delta debugging: Zeller and Hildebrandt, 2002).
 
-    All of them have to fail; they are not asked again. ``fails`` need not be monotonic: what fails
-    with few things may pass with more. It is asked about each selection once, at most about
-    n^2 + 3n, and about 2 log2(n) if one thing is to blame.
+    ``fails`` must be true for all items and need not be monotonic. It is called once for each
+    selection: at most about n^2 + 3n times, about 2 log2(n) if a single item is the cause.
     """
     known: dict[tuple[int, ...], bool] = {tuple(range(len(items))): True}
 
@@ -71,9 +68,9 @@ _PASSING_TRIED = 16
 
 @dataclass(frozen=True, slots=True)
 class OverlayParts:
-    """What sets a failing trial apart from its job, part by part.
+    """The overlay of a failing trial, part by part.
 
-    ``departures`` is None where the job's own policy stays; ``without`` are the places of the
+    ``departures`` is None where the job's own policy stays; ``without`` are the indexes of the
     entries of ``nodes`` that are left out, ``until_ns`` is a simulated time.
     """
 
@@ -101,7 +98,7 @@ class OverlayParts:
         return found
 
     def one_fewer(self) -> list[tuple[str, OverlayParts]]:
-        """Return, with its words, each that has one departure, fault or setting less."""
+        """Return (description, parts) of each that has one departure, fault or setting less."""
         found = []
         for key, word in (
             ("departures", "departure"),
@@ -118,10 +115,10 @@ class OverlayParts:
 
 @dataclass(frozen=True, slots=True)
 class ReducedTrial:
-    """A trial made small: ``result`` is its run. ``runs`` have been made for it; ``is_minimal``
-    says that nothing more can be left out alone. ``passing`` are the parts of the nearest run that
-    passes, None if there is none, and ``passing_words`` what is different in it. ``chosen`` says
-    of each departure what runs and what would have, ``left_out`` which entries of ``nodes`` are.
+    """A reduced trial: ``result`` is its run, found in ``runs`` runs; ``is_minimal`` says that
+    nothing more can be left out alone. ``passing`` are the parts of the nearest passing run, None
+    if there is none; ``passing_words`` says what differs in it. ``chosen`` says for each departure
+    what runs before what, ``left_out`` names the entries of ``nodes`` that are.
     """
 
     parts: OverlayParts
@@ -135,10 +132,9 @@ class ReducedTrial:
 
 
 class TrialReduction:
-    """Reduces ``result``, a trial of ``source`` that has failed. If its trace is not there, its run
-    is made once more.
+    """Reduces ``result``, a failed trial of ``source``. If its trace is missing, it is run again.
 
-    ``scratch`` is a folder for traces, ``runs_max`` how many runs may be made.
+    ``scratch`` is a folder for traces, ``runs_max`` limits the runs.
     """
 
     def __init__(
@@ -172,9 +168,8 @@ class TrialReduction:
         if not self._is_same(first):
             got = "nothing fails" if first.failure is None else first.failure.text
             raise ExploreError(
-                f"trial {self._given.trial.number} does not fail once more with its order written "
-                f"down ({got}): what makes it fail is not in the simulation; rsltrace verify says "
-                "what runs of this job have not in common"
+                f"trial {self._given.trial.number} does not fail again in the same order ({got}): "
+                "the job is not deterministic; run rsltrace verify to see why"
             )
         while True:
             before = parts
@@ -259,9 +254,9 @@ class TrialReduction:
         return with_some(ddmin(present, fails))
 
     def _fails_for_its_parts(self, parts: OverlayParts) -> bool:
-        """Whether a trial fails for the same cause, and the same nodes pass in the same time
-        without what sets it apart. Where they do not, it fails because a node is missing, or
-        because it ends too soon, which is something else."""
+        """Whether a trial fails for the same cause, while the same nodes pass in the same time
+        without its changes. Else it fails because a node is missing, or because it ends too soon.
+        """
         if not self._fails(parts):
             return False
         if parts.seed is None and not parts.one_fewer():
@@ -270,8 +265,7 @@ class TrialReduction:
         return self._run(plain).failure is None
 
     def _shorter(self, parts: OverlayParts) -> OverlayParts:
-        """Let the run end as soon as it may: at the event that fails, or as early as halving the
-        time finds."""
+        """End the run as early as possible: at the failing event, or by bisection of the time."""
         result = self._run(parts, keep=True)
         if not self._is_same(result) or result.trace is None or result.failure is None:
             return parts
@@ -296,8 +290,8 @@ class TrialReduction:
     def _nearest_passing(
         self, parts: OverlayParts, failing: TrialResult
     ) -> tuple[OverlayParts | None, str]:
-        """Return the one that agrees longest with the failing run of those that pass with one part
-        less, or else the plain run."""
+        """Return the run with one part less (or the plain run) that passes and agrees longest with
+        the failing run."""
         from rsltrace.diff import diff_files
 
         best: tuple[int, OverlayParts, str] | None = None
@@ -312,7 +306,7 @@ class TrialReduction:
         return (None, "") if best is None else best[1:]
 
     def _fails(self, parts: OverlayParts) -> bool:
-        """Whether a trial fails for the same cause; if no more runs may be made, it does not."""
+        """Whether a trial fails for the same cause; False if no more runs are allowed."""
         if self._left <= 0:
             return False
         self._left -= 1
@@ -323,7 +317,7 @@ class TrialReduction:
         return found is not None and (found.kind, found.key) == (wanted.kind, wanted.key)
 
     def _run(self, parts: OverlayParts, *, keep: bool = False, steps: bool = False) -> TrialResult:
-        """Run a trial; one that cannot be made at all fails for a cause of its own."""
+        """Run a trial; one that cannot start counts as a failure of another cause."""
         number = next(self._numbers)
         trial = Trial(number, parts.overlay(), "made smaller")
         trace = self._scratch / f"{number}.mcap"

@@ -1,14 +1,13 @@
 """All orders that could matter, each once: dynamic partial-order reduction over phases of a run.
 
-A phase is a stretch of a run at whose end nothing is left that could run: nothing can change places
-with what is in another phase. So the phases are searched one by one. Of a phase that begins in a
-state that has been met before nothing new can come, and it is left out.
+A phase ends when nothing is left to run: steps of different phases cannot swap. So the phases are
+searched one by one, and a phase that begins in a known state is skipped.
 
 Within a phase, two orders that differ only in neighbours that commute (see ``steps``) end in the
-same state, and one of them is run. Which others have to be is found as by Abdulla et al. (Optimal
-dynamic partial order reduction, POPL 2014): where two steps of a run that do not commute could have
-come the other way round, what has to come first for that is tried there (source sets), and what
-has been tried before is not tried again after what it commutes with (sleep sets).
+same state, and one of them is run. Which others to run is decided as by Abdulla et al. (Optimal
+dynamic partial order reduction, POPL 2014): where two steps that do not commute could be swapped,
+the step that must come first for that is tried (source sets), and what has been tried before is
+not tried again after steps that it commutes with (sleep sets).
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ _Departures = tuple[tuple[int, int], ...]
 
 @dataclass(slots=True)
 class _OrderNode:
-    """A place in the tree of orders of one phase: a step. ``departures`` lead there."""
+    """A step in the tree of orders of one phase. ``departures`` lead to it."""
 
     parent: _OrderNode | None
     departures: _Departures
@@ -41,7 +40,7 @@ class _OrderNode:
     tried: dict[str, Touches] = field(default_factory=dict)
 
     def path(self) -> list[_OrderNode]:
-        """Return the places from the beginning of the phase up to this one."""
+        """Return the nodes from the beginning of the phase up to this one."""
         found = [self]
         while found[-1].parent is not None:
             found.append(found[-1].parent)
@@ -57,7 +56,7 @@ class _OrderNode:
 
 @dataclass(frozen=True, slots=True)
 class _Order:
-    """An order to be tried: at ``node`` this runs next. ``asleep`` was tried there before."""
+    """An order to try: at ``node``, ``key`` runs next. ``asleep`` was tried there before."""
 
     node: _OrderNode
     key: str
@@ -65,7 +64,7 @@ class _Order:
 
 
 class Systematic:
-    """Runs orders with few departures from the plain one first, with up to ``departures_max``."""
+    """Tries orders with the fewest departures from the plain one first, up to ``departures_max``."""
 
     behaviours = False
     steps = True
@@ -73,7 +72,7 @@ class Systematic:
     def __init__(self, departures_max: int | None = None) -> None:
         self._max = departures_max
         self._first = 0
-        """The first choice that may be another one."""
+        """The first choice that may be changed."""
         self._count = itertools.count()
         self._waiting: list[tuple[int, int, _OrderNode, str]] = []
         self._under_way: dict[str, _Order] = {}
@@ -88,7 +87,7 @@ class Systematic:
     # -- the interface ---------------------------------------------------------------------------
 
     def begin(self, plain: TrialResult) -> None:
-        """Find in the plain run what is to be tried."""
+        """Find the orders to try in the plain run."""
         choices_left(plain)
         self._first = plain.choices_before
         self.runs += 1
@@ -143,12 +142,12 @@ class Systematic:
         all_orders = all_orders or f"about {10**self.orders_log10:.0f}"
         lines = [
             f"systematic: {self.runs} runs stand for {all_orders} orders, {len(self.finals)} "
-            f"different ends; {self.merged} phases began as one before, {self.redundant} runs "
-            "were another order of one before"
+            f"different ends; {self.merged} phases began in a known state, {self.redundant} runs "
+            "repeated one before in an equivalent order"
         ]
         left = len(self._waiting) + len(self._under_way)
         if self._first:
-            lines.append(f"not covered: other orders of the first {self._first} choices")
+            lines.append(f"not covered: orders that change the first {self._first} choices")
         if self.beyond:
             lines.append(f"not covered: {self.beyond} orders with more than {self._max} departures")
         lines.append(f"not covered: {left} orders yet to try" if left else "covered: all others")
@@ -187,7 +186,7 @@ class Systematic:
     def _search(
         self, phase: Sequence[TrialStep], departures: _Departures, choice: int, item: _Order | None
     ) -> bool:
-        """Follow a phase, and find where it could go otherwise; False: it is not new."""
+        """Follow a phase, and find where it could continue differently; False: it is not new."""
         path, is_new = self._path(phase, departures, choice, item)
         self._reverse(phase[: len(path)], path)
         return is_new
@@ -221,7 +220,7 @@ class Systematic:
         return path, True
 
     def _instead(self, node: _OrderNode) -> None:
-        """Something runs that has been tried: try what has not, if there is anything."""
+        """What runs has been tried: try a step that has not, if there is one."""
         others = [name for name in node.enabled() if name not in node.sleep]
         if others:
             self._try(node, others[0])
@@ -234,7 +233,7 @@ class Systematic:
             heapq.heappush(self._waiting, (count, next(self._count), node, key))
 
     def _reverse(self, steps: Sequence[TrialStep], path: Sequence[_OrderNode]) -> None:
-        """Where two steps do not commute, see to it that the second is tried first, too."""
+        """Where two steps do not commute, also try the second one first."""
         after = _happens_after(steps)
         for second in range(len(steps)):
             for first in _races(steps, after, second):
@@ -254,7 +253,7 @@ class Systematic:
 
 
 def commute(one: Touches, other: Touches) -> bool:
-    """Say whether two steps can change places: neither writes what the other touches."""
+    """Whether two steps can swap: neither writes what the other touches."""
     if EVERYTHING in one or EVERYTHING in other:
         return False
     if len(other) < len(one):
@@ -263,7 +262,7 @@ def commute(one: Touches, other: Touches) -> bool:
 
 
 def _happens_after(steps: Sequence[TrialStep]) -> list[set[int]]:
-    """Return, for each step of a phase, those before that it cannot come before."""
+    """Return, for each step of a phase, the earlier ones that must stay before it."""
     after: list[set[int]] = []
     for index, step in enumerate(steps):
         before: set[int] = set()
@@ -288,7 +287,7 @@ def _races(steps: Sequence[TrialStep], after: Sequence[set[int]], second: int) -
 def _initials(
     steps: Sequence[TrialStep], after: Sequence[set[int]], chosen: Sequence[int]
 ) -> frozenset[str]:
-    """Return the steps among ``chosen`` that no other of them has to come before."""
+    """Return the steps among ``chosen`` that none of the others must precede."""
     there = set(chosen)
     return frozenset(_ran(steps[k]) for k in chosen if not after[k] & there)
 
