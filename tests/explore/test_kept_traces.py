@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from rsltrace.search.explore.kept_traces import KeptTraces
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.search import Budget, Search
 from rsltrace.search.explore.small.causes import make_small
 from rsltrace.search.explore.strategies.named import RandomWalk
 from rsltrace.search.explore.table import Table, rows
-from rsltrace.search.explore.trial import CHECK, Failure, JobSource, Trial, TrialResult
+from rsltrace.search.explore.trial import CHECK, Failure, JobSource, KeptTraces, Trial, TrialResult
 
 _TRIALS = 8
 

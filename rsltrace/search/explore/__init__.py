@@ -9,8 +9,7 @@ copies      what a copy of such a process does
 bundle      what a job needs on another machine
 cluster     trials on the workers of a Dask cluster
 report      what was found: a page, and formats for machines
-steps       the choices of a run, and what each callback touched
-behaviour   what a run did, as hashes that others can be compared with
+steps       the choices of a run, what each step touched, and hashes of what happened
 table       the folder with a row for each run
 strategies  what is tried next
 search      the strategy's trials are run, until the budget is used up

@@ -22,9 +22,16 @@ import xxhash
 from rsltrace._version import __version__
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job
-from rsltrace.search.explore.kept_traces import KeptTraces
 from rsltrace.search.explore.outcome import TrialOptions
-from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
+from rsltrace.search.explore.trial import (
+    CRASH,
+    Failure,
+    JobSource,
+    KeptTraces,
+    Trial,
+    TrialResult,
+    result_of,
+)
 from rsltrace.search.explore.workers import Worker
 
 SHIPPED_MAX = 256 << 20

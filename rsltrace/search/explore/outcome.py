@@ -23,8 +23,7 @@ from rsltrace.errors import (
 from rsltrace.job import Job
 from rsltrace.run.process import kept_process, search_path
 from rsltrace.run.session import RunResult, Session
-from rsltrace.search.explore.behaviour import behaviours_of, final_state_of
-from rsltrace.search.explore.steps import TrialObserver
+from rsltrace.search.explore.steps import TrialObserver, behaviours_of, final_state_of
 from rsltrace.search.explore.trial import (
     CHECK,
     DEADLOCK,

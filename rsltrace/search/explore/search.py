@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rsltrace.job import Job
-from rsltrace.search.explore.kept_traces import KeptTraces
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.strategy import Strategy
 from rsltrace.search.explore.table import Table
-from rsltrace.search.explore.trial import Trial, TrialResult
+from rsltrace.search.explore.trial import KeptTraces, Trial, TrialResult
 from rsltrace.trace.mcap.sink import unfinished
 
 _TIMEOUT_MIN_S = 60.0

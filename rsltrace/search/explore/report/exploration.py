@@ -174,8 +174,8 @@ class SettingEffect:
     """The effect of a setting on an outcome (a metric, or ``fails``).
 
     ``strength`` is the share of the ranks' variance that it explains, 0 to 1; ``sign`` says whether
-    a larger value gives more (1) or less (-1), 0 for texts. ``p`` is the corrected p-value, ``runs``
-    the number of runs compared.
+    a larger value gives more (1) or less (-1), 0 for texts. ``p`` is the corrected p-value,
+    ``runs`` the number of runs compared.
     """
 
     setting: str

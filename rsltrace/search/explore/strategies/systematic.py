@@ -64,7 +64,7 @@ class _Order:
 
 
 class Systematic:
-    """Tries orders with the fewest departures from the plain one first, up to ``departures_max``."""
+    """Tries orders with the fewest departures from the plain one first (``departures_max``)."""
 
     behaviours = False
     steps = True
