@@ -1,7 +1,7 @@
 """The answers: what a diff found, with its sentences. A report needs no file for them any more.
 
 ``a`` is always the first file given, ``b`` the second. Stamps are simulated nanoseconds, hashes
-unsigned 64-bit. Sentences are made when they are asked for; nothing is decided by them.
+unsigned 64-bit. Sentences are made on demand; nothing is decided by them.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class BagDiff(BagComparison):
 
     @property
     def sentence(self) -> str:
-        """What a person wants to know."""
+        """The answer."""
         from rsltrace.diff.sentences.runs import recordings_sentence
 
         return recordings_sentence(self)
@@ -141,7 +141,7 @@ class Diff:
     remarks: tuple[Remark, ...] = ()
     tolerance: BagDiff | None = None
     allow_truncated: bool = False
-    """Whether it is enough that they agree as far as they go."""
+    """Whether truncated recordings are accepted."""
 
     effect: Divergence | None = None
 
@@ -151,7 +151,7 @@ class Diff:
 
     @property
     def sentence(self) -> str:
-        """What a person wants to know: the settings that are to blame, and what they did."""
+        """The answer: the settings that can be the cause, and their effect."""
         from rsltrace.diff.sentences.runs import answer
 
         return answer(self)
@@ -197,7 +197,7 @@ class Diff:
     def exit_code(self) -> int:
         """0 identical, 1 diverged or cut, 3 equal within tolerance; trouble is raised instead.
 
-        Where one recording has no event at all there is nothing that agrees, whatever was asked.
+        Where one recording has no event at all nothing agrees, whatever the options.
         """
         if self.identical:
             return 0

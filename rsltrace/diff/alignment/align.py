@@ -1,7 +1,7 @@
 """Which event of one run is which of the other, once they have diverged.
 
 Events are matched within one kind of one entity only (see ``match``): the same input at the same
-time from the same cause is surest, "the one that stands in its place" is weakest. What is left over
+time from the same cause is surest, the same position is weakest. What is left over
 is in one run only.
 """
 
@@ -81,7 +81,7 @@ def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair
 
 
 def _same_ends(a: EventSequence, b: EventSequence) -> tuple[int, int]:
-    """Return how many events at the beginning and at the end are pairs beyond doubt."""
+    """Return how many events at the beginning and at the end are certainly pairs."""
     most = min(len(a), len(b))
     begin = 0
     while begin < most and _surely(a, b, begin, begin):
@@ -262,7 +262,7 @@ def _can_be(a: When, b: When, limit: int) -> bool:
 
 @dataclass
 class EventPairs:
-    """Who belongs to whom, by place in the two ``EventColumns`` (-1: nobody)."""
+    """The partner of each event, by place in the two ``EventColumns`` (-1: none)."""
 
     a: list[int]
     b: list[int]
@@ -311,7 +311,7 @@ def align(
     groups = _groups(a, b, taken_a, taken_b)
     pairs = EventPairs([], [])
     # The partner of an event's cause is a strong sign, and known only when causes are matched: so
-    # what is certain without it comes first, and then everything is matched anew with it.
+    # what is certain without it comes first, and then everything is matched again with it.
     for surest_only in (True, False, False):
         causes_a, causes_b = _causes(a, b, pairs, past)
         pairs = EventPairs([-1] * len(a), [-1] * len(b))

@@ -149,7 +149,7 @@ class AlignedBlocks:
             end_a, end_b = _cuts(rows_a, rows_b, events)
             if end_a > 0 or end_b > 0 or not (len(rows_a) or len(rows_b)):
                 break
-            events *= 4  # everything at one time: look further, or there would be no progress
+            events *= 4  # all at one time: read more, or there would be no progress
         pairs = align(rows_a, rows_b, past, taken_a, taken_b)
         items = _items(rows_a, rows_b, pairs, end_a, end_b, taken_a, taken_b)
         block = AlignedBlock(rows_a, rows_b, items, first_a + end_a, first_b + end_b)
@@ -277,7 +277,7 @@ def _mark_inversions(block: AlignedBlock) -> None:
     for item in block.items:
         if item.a >= 0 and item.b >= 0:
             i, j = item.a - a.first, item.b - b.first
-            # What only stands in another's place, with another input, has no order of its own.
+            # A pair with different inputs matches by position only: its order says nothing.
             if a.stamp[i] == b.stamp[j] and a.input[i] == b.input[j]:
                 moments.setdefault(a.stamp[i], []).append(item)
     for items in moments.values():
@@ -285,7 +285,7 @@ def _mark_inversions(block: AlignedBlock) -> None:
 
 
 def mark_inverted(items: list[EventPair]) -> None:
-    """Set ``inverted`` of pairs of one time that stand in another order in b than in a."""
+    """Set ``inverted`` of pairs at one time that are in a different order in b."""
     items.sort(key=lambda item: item.a)
     order = [item.b for item in items]
     if all(early < late for early, late in itertools.pairwise(order)):
@@ -302,7 +302,7 @@ def mark_inverted(items: list[EventPair]) -> None:
 
 def _mark_beyond(block: AlignedBlock) -> None:
     """Mark what one run did after the other had ended. Shutting nodes down is not doing, and a
-    run that goes on to a later time without an event has not ended."""
+    run that continues to a later time without an event has not ended."""
     for rows, other, end, of_b in (
         (block.rows_a, block.rows_b, block.end_b, False),
         (block.rows_b, block.rows_a, block.end_a, True),

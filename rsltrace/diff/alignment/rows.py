@@ -1,7 +1,7 @@
 """A block of one run as plain columns, in terms that mean the same in both runs.
 
-Entities are numbers (see ``entity_matching``), and an event's *content* stands for its outputs: the
-trace's own output hash, or one made anew where the ids in it differ between the runs.
+Entities are numbers (see ``entity_matching``), and an event's *content* represents its outputs: the
+trace's own output hash, or a new one where the ids in it differ between the runs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import Draw, EventKind, OutputKind, encode_draw
 from rsltrace.trace.reader import Trace
 
-# Where two runs diverge: a binary search over chain hashes, which stand for all that came before.
+# Where two runs diverge: a binary search over chain hashes, which cover all events before.
 #
 # Both files carry the chain hash at the end of each segment. Where they end a segment at the same
 # event, as two recordings of one job do, no event is read until the one segment is found that

@@ -95,7 +95,7 @@ class FetchedMessages:
 
 
 class _Side:
-    """The messages of one topic of one recording, asked for in about their order."""
+    """The messages of one topic of one recording, read in about their order."""
 
     def __init__(
         self,
@@ -115,7 +115,7 @@ class _Side:
         self._next = 0
 
     def get(self, index: int) -> object | None:
-        """Return a decoded message, or None if it is not at hand. Raises TraceError."""
+        """Return a decoded message, or None if it is not available. Raises TraceError."""
         while self._stream is not None and self._next <= index:
             data = next(self._stream, None)
             if data is None:

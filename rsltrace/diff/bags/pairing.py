@@ -1,4 +1,4 @@
-"""Which messages of a gap belong together: told by what they say, where their keys differ."""
+"""Which messages of a gap belong together: decided by content, where their keys differ."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LOOKAHEAD = 16
 """How many surplus messages in a row are looked past for the counterpart of one."""
 
 Get = Callable[[int], object | None]
-"""Gives the decoded message of an index, None if it is not at hand; may raise TraceError."""
+"""Gives the decoded message of an index, None if it is not available; may raise TraceError."""
 
 
 class MessagePair(NamedTuple):
@@ -135,7 +135,7 @@ class Pairing:
     def _alike(self, in_a: int, in_b: int) -> bool:
         """Whether two messages are of one moment: equal within tolerance, or of one header stamp.
 
-        Not if one of them is not at hand, or cannot be decoded.
+        False if one of them is not available or cannot be decoded.
         """
         try:
             one, other = self.get_a(in_a), self.get_b(in_b)

@@ -1,6 +1,6 @@
 """From two differing events to a verdict: what happened, and why.
 
-The rules stand in the order in which they are asked: what is seen first in ``_judge`` wins.
+The first rule in ``_judge`` that applies wins.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ def entity_changes(
     """Return which entities of both runs have another QoS, of some topics and services, or are in
     another callback group, of some nodes; None if there are none.
 
-    A depth is not told: it shows in another way.
+    Depths are not included: they show as overflows.
     """
     alone = {*run_a.matching.only_a, *run_a.matching.only_b}
     found = []
@@ -186,7 +186,7 @@ def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> S
 
 
 def _slept_ns(run: Run, view: EventView) -> int | None:
-    """Return how long a callback slept after an event, or before one with which it went on."""
+    """Return how long a callback slept after an event, or before one that resumed it."""
     number = run.matching.by_key[view.entity]
     if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
         rows = load_rows(run, max(view.index - _LOOKED_AT_MAX, 0), view.index)

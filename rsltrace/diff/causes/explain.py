@@ -56,10 +56,10 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import seconds_text
 
 ANCESTORS_MAX = 5
-"""Events told that led to a root: both runs have them, they only say how it came to run."""
+"""Events shown that led to a root. Both runs have them."""
 
 STEPS_MAX = 16
-"""Steps told between a root and its consequence; of a longer way, the last ones."""
+"""Steps shown between a root and its consequence; of more, the last ones."""
 
 
 @dataclass
@@ -81,7 +81,7 @@ class Explainer:
         """What to know before one runs a ``next_step``."""
 
     def explain(self, found: FoundDivergence) -> Divergence:
-        """Return everything about a root, or about a consequence that was asked for."""
+        """Return everything about a root, or about a selected consequence."""
         a, b, messages = self._differing(found)
         judgement = self._judge(found, a, b, messages)
         if found.origin.previous is not None:
@@ -89,7 +89,7 @@ class Explainer:
         return self._divergence(found, judgement)
 
     def explain_effect(self, found: FoundDivergence, first: Divergence) -> Divergence:
-        """Return everything about the first effect of a node that was set up otherwise."""
+        """Return everything about the first effect of a node that was set up differently."""
         effect = self.explain(found)
         root = self._root_judgement(found.origin.root)
         return replace(
@@ -377,7 +377,7 @@ _SHARED = {
 }
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
-"""What recording the job once more tells more about: which of the two runs is the usual one."""
+"""Verdicts where recording the job again helps: it shows which run is the usual one."""
 
 _LINKS: dict[int, LinkKind] = {
     OutputKind.MESSAGE: LinkKind.PUBLISHED,

@@ -1,4 +1,4 @@
-"""What is likely behind a divergence: who got which answer from outside, or the order of a set."""
+"""The likely cause of a divergence: different external answers, or the order of a set."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def likely_cause(
     relevance: Relevance,
 ) -> LikelyCause | None:
     """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
-    shows, entities with other properties. If nothing does, the answer that nobody kept.
+    shows, entities with other properties. Else an unrecorded answer.
     """
     run_a, run_b = runs
     run = run_b if judgement.a is None else run_a

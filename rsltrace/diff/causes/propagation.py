@@ -241,7 +241,7 @@ class Propagation:
 
     def _consequence(self, item: EventPair, why: str | None, previous: DivergenceOrigin) -> None:
         depth = previous.depth + 1
-        if depth > _DEPTH_MAX:  # lets go of what lies further back
+        if depth > _DEPTH_MAX:  # forgets what is further back
             why, previous, depth = None, self.found[previous.root].origin, 1
         origin = DivergenceOrigin(item, previous.root, why, previous, depth)
         self._remember(item, origin)
@@ -303,7 +303,7 @@ class Propagation:
         mark_inverted(copies)
         still = {copy.a: copy.b for copy in copies if copy.inverted}
         swapped = self._entities([origin.item for origin in moment if origin.item.a in still])
-        # What decides between two that are due at once decides every time: that is one divergence.
+        # A tie that is broken differently once is so every time: that is one divergence.
         root = next((found for found in self.found if swapped and swapped <= found.swapped), None)
         for origin in moment:
             item = origin.item
@@ -385,12 +385,12 @@ class Propagation:
     # -- what follows ----------------------------------------------------------------------------
 
     def _spread(self, item: EventPair, origin: DivergenceOrigin) -> None:
-        """Note whom a differing event reaches: its node, and the topics of what it sent."""
+        """Note what a differing event affects: its node, and the topics of what it sent."""
         rows, index = self._rows(item)
         place = index - rows.first
         owner = rows.owner[place]
         if item.same:
-            # Changed places: its node notices only if it got two things in another order.
+            # Only reordered: its node notices only if it received two inputs in a different order.
             self._inverted_in[owner] = self._inverted_in.get(owner, 0) + 1
             if self._inverted_in[owner] >= 2:
                 self._taint(owner, origin)
@@ -399,7 +399,7 @@ class Propagation:
         nodes, number = rows.run.matching.nodes, rows.number[place]
         ran_alone = item.a < 0 or item.b < 0
         if ran_alone or not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
-            # What chance decides on the way leaves the sender as it was; its own clock does not.
+            # A draw for a link does not change the sender; one for its clock does.
             self._taint(owner, origin)
         if any(o[0] == _DRAW for o in outputs):
             self._drawn = self._drawn or origin

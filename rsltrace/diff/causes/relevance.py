@@ -1,7 +1,7 @@
 """Which of the settings that differ can be why two runs diverge at a place.
 
 A key that only says what is recorded, a delay of a topic that is not there, the code of another
-node: they differ, and explain nothing. To blame them hides what is not deterministic.
+node: they differ, and explain nothing. Naming them would hide what is nondeterministic.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class DivergenceSite:
     """Where two runs diverge, as far as it matters for what can be the cause.
 
     ``nodes`` are the full names of those involved; ``constructing`` says that a node is being made,
-    ``inside`` that a callback got the same at the same time, ``drawn`` that chance decided.
+    ``inside`` that a callback got the same at the same time, ``drawn`` that a random draw differs.
     """
 
     nodes: frozenset[str]

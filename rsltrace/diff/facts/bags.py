@@ -24,7 +24,7 @@ class BagVerdict(Enum):
     EQUAL = "equal"
     WITHIN_TOLERANCE = "equal-within-tolerance"
     AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
-    """One of them is cut, and until there they agree (or are equal within tolerance)."""
+    """One of them is truncated, and they agree until then (or are equal within tolerance)."""
     DIFFERENT = "different"
 
 
@@ -84,7 +84,7 @@ class TopicDiff:
     """How the messages of one topic compare; ``first`` is None if nothing but tolerance is between.
 
     ``equal`` messages are the same bit for bit in every field that is compared, ``tolerated`` ones
-    within tolerance, ``ignored`` ones but for fields that are not compared, ``moved`` ones the same
+    within tolerance, ``ignored`` ones except for ignored fields, ``moved`` ones the same
     but in another order. The other counts never include these. ``type_b`` differs from ``type_a``
     only where the recordings disagree about the topic's type.
     """
@@ -108,7 +108,7 @@ class TopicDiff:
 
     @property
     def agreeing(self) -> int:
-        """How many messages are equal, or are so within tolerance and but for what is ignored."""
+        """How many messages are equal, or are so within tolerance and except for ignored fields."""
         return self.equal + self.tolerated + self.ignored
 
 
@@ -141,7 +141,7 @@ class BagComparison:
     next_step: str = ""
     remarks: tuple[Remark, ...] = ()
     allow_truncated: bool = False
-    """Whether it is enough that they agree as far as they go."""
+    """Whether truncated recordings are accepted."""
 
     @property
     def identical(self) -> bool:
@@ -178,7 +178,7 @@ class BagComparison:
 
     @property
     def _is_enough(self) -> bool:
-        """Whether agreeing as far as they go was asked for, and something agrees."""
+        """Whether truncated recordings are accepted, and something agrees."""
         return self.allow_truncated and any(t.agreeing for t in self.topics)
 
 

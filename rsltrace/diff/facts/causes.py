@@ -25,7 +25,7 @@ class Verdict(Enum):
 
     IDENTICAL = "identical"
     AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
-    """One of the recordings is cut, and until there they agree: nobody knows what came after."""
+    """One of the recordings is truncated, and they agree until then."""
     DIFFERENT_JOBS = "different-jobs"
     """One of the runs has no event to compare, and their jobs or graphs are others."""
     SAME_INPUT_DIFFERENT_OUTPUT = "same-input-different-output"
@@ -38,11 +38,11 @@ class Verdict(Enum):
     RAN_LONGER = "ran-longer"
     EXCEPTION = "exception"
     DRAW = "draw"
-    """What chance decided about a message: its delay, whether it is lost."""
+    """A random draw for a message: its delay, whether it is lost."""
     GRAPH = "graph"
     ENVIRONMENT = "environment"
     SAME_CONTENT = "same-content"
-    """A run is native, and all messages say the same but for times: what differs is timing, and
+    """A run is native, and all messages are the same except for times: what differs is timing, and
     perhaps the order of callbacks."""
     OTHER_CONTENT = "other-content"
     """A run is native, and messages say something else, or are missing."""
@@ -138,7 +138,7 @@ class DifferentOrder(Fact):
 
 @dataclass(frozen=True, slots=True)
 class EventInOneRun(Fact):
-    """An event that only one run has; ``instead`` is what the other went on with."""
+    """An event that only one run has; ``instead`` is what the other continued with."""
 
     instead: EventView | None = None
     loss: Loss | None = None
@@ -170,8 +170,8 @@ class DifferentInput(Fact):
 
 @dataclass(frozen=True, slots=True)
 class DifferentDraw(Fact):
-    """Chance decided otherwise about ``message``, and about ``more``. ``connected`` is False where
-    one run has nothing to draw for: what it sends reaches nobody there."""
+    """A random draw for ``message`` differs, and ``more``. ``connected`` is False where
+    one run has nothing to draw for: its output has no receiver there."""
 
     message: MessageDifference
     more: int
@@ -205,7 +205,7 @@ class RunEnd:
 
 @dataclass(frozen=True, slots=True)
 class EarlierEnd(Fact):
-    """One run was over, the other did the same until then and went on."""
+    """One run ended; the other was identical until then and continued."""
 
     over: RunEnd
     other: RunEnd
@@ -335,7 +335,7 @@ CauseFact = (
 
 @dataclass(frozen=True, slots=True)
 class ExternalAnswers(Fact):
-    """``subject`` (a node or main, or nobody) asked the outside and got other answers."""
+    """``subject`` (a node or main, or empty) got different external answers."""
 
     subject: str
     calls: tuple[CallDifference, ...]
@@ -353,7 +353,7 @@ class SetOrder(Fact):
 
 @dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
-    """An answer from outside that nobody kept: it may be behind it. ``source`` is the key of
+    """An unrecorded external answer: a possible cause. ``source`` is the key of
     ``guard:`` that keeps it."""
 
     call: str

@@ -120,7 +120,7 @@ def node_of(entity: EntityKey) -> str:
 # -- fields ------------------------------------------------------------------------------------
 
 ULP_SHOWN_MAX = 1_000_000
-"""Reports tell smaller distances in units in the last place: larger ones are no rounding."""
+"""Up to this, reports show a distance in units in the last place."""
 
 
 class FieldNoteKind(Enum):
@@ -223,7 +223,7 @@ class TimerCancellation(Fact):
 
 @dataclass(frozen=True, slots=True)
 class TimerPeriod(Fact):
-    """A timer got another period, in one run; ``before_ns`` is None where nobody knows the old."""
+    """A timer got another period, in one run; ``before_ns`` is None if the old one is unknown."""
 
     before_ns: int | None
     after_ns: int
@@ -357,7 +357,7 @@ class CallDifference:
     """A call whose answer came from outside, in a diverging event or (``event_*``) before it.
 
     ``a`` and ``b`` are what it gave, as text; None where a run did not make the call. ``subject``
-    is what it asked for (``MOTOR_SEED``, ``gains.yaml``), ``short`` what tells both answers apart.
+    is what it asked for (``MOTOR_SEED``, ``gains.yaml``), ``short`` what distinguishes the answers.
     ``only_touched``: nothing of a file differs but when it was written.
     """
 

@@ -10,7 +10,7 @@ from rsltrace.diff.facts.evidence import Fact
 
 @dataclass(frozen=True, slots=True)
 class ReaderNote(Fact):
-    """What a reader of recordings has said."""
+    """A note of the reader of a recording."""
 
     text: str
 
@@ -54,14 +54,14 @@ class RenamedProgram(Fact):
 
 @dataclass(frozen=True, slots=True)
 class SelectionIsEqual(Fact):
-    """No difference among what was asked for (globs)."""
+    """No difference among the selected names (globs)."""
 
     asked: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
 class SelectionDivergesLater(Fact):
-    """The runs diverge at event ``start``; shown is where what was asked for differs."""
+    """The runs diverge at event ``start``; shown is where a selected name differs."""
 
     start: int
     asked: tuple[str, ...]
@@ -84,7 +84,7 @@ class MoreDivergences(Fact):
 
 @dataclass(frozen=True, slots=True)
 class NoRecordCommand(Fact):
-    """There is no command to record a trace once more: it takes ``options`` that could run code, or
+    """There is no command to record a trace again: it takes ``options`` that could run code, or
     the ``job`` is not here."""
 
     trace: str
@@ -144,7 +144,7 @@ Remark = (
 
 @dataclass(frozen=True, slots=True)
 class Identical(Fact):
-    """All events are the same; ``names_differ``: but for names of programs."""
+    """All events are the same; ``names_differ``: except for program names."""
 
     events: int
     digest: str = ""

@@ -53,7 +53,7 @@ _RARE = ("ignored", "moved")
 def bag_report(
     diff: BagDiff, options: DiffOptions, width: int = 100, height: int = HEIGHT
 ) -> list[Line]:
-    """Return the report of two recordings, at most ``height`` lines unless all is asked for."""
+    """Return the report of two recordings: ``height`` lines at most, or ``options.everything``."""
     good = not diff.failed
     verdict = f"{diff.verdict.value}; messages matched by {diff.by}"
     sides = [_facts(side) for side in (diff.a, diff.b)]

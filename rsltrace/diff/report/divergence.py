@@ -26,7 +26,7 @@ from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.phrases import event_title, seconds_text
 
 CONTEXT = 5
-"""Events before a divergence that are shown unless another number is asked for."""
+"""Events before a divergence that are shown by default."""
 _DEPTH_MAX = 6
 _SIDE_BY_SIDE = 100
 """Columns of a screen in which two lists of events stand side by side."""
@@ -157,7 +157,7 @@ def _calls(found: Divergence, width: int) -> Section:
                 for name, style, value in (("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)):
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
         rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
-    if len(rows) == 2:  # one call, with its answers beside it, and where it was made
+    if len(rows) == 2:  # one call on one line, and its place
         rows[0] = cut(line(("external call: ", Style.TITLE), *rows[0][1:]), width)
         return Section((), rows, 2, "", least=1, rank=rank)
     title = "external calls"
@@ -324,7 +324,7 @@ def event_cells(event: EventView) -> list[Piece]:
 
 
 def event_key(event: EventView) -> tuple[object, ...]:
-    """Return what is equal for events that are the same but for their place in the run."""
+    """Return what is equal for events that are the same except for their place in the run."""
     return (
         event.entity,
         event.stamp_ns,

@@ -610,7 +610,7 @@ _SENT = {
 
 
 def headline(first: Judgement, effect: Judgement | None, searched_to: int | None) -> str:
-    """Return what a person wants to know of two runs that diverge: the settings that are to blame,
+    """Return the headline of two runs that diverge: the settings that can be the cause,
     and the first effect they had.
 
     ``searched_to`` is up to which event no effect was found (-1: to the end), None if it was not
@@ -670,7 +670,7 @@ def _done(message: MessageDifference) -> str:
 
 
 def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
-    """Return the keys of the job that are to blame, with their lines; of what a constructor did,
+    """Return the keys of the job that can be the cause, with their lines; for a constructor,
     the code, too."""
     of_job = [_setting(setting) for setting in settings if setting.key]
     if not of_job and set_up:

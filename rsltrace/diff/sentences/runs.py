@@ -51,7 +51,7 @@ ALL_HINT = "--all shows them"
 
 
 class RunComparison(Protocol):
-    """What the answer for two runs is told by."""
+    """What the answer for two runs needs."""
 
     @property
     def outcome(self) -> Outcome:

@@ -92,14 +92,14 @@ def pair_text(a: str | None, b: str | None, nothing: str = "nothing") -> str:
 
 
 def listed(things: Sequence[str]) -> str:
-    """Return the first things with commas, each once, and how many more there are."""
+    """Return the first texts with commas, each once, and how many more there are."""
     unique = list(dict.fromkeys(things))
     more = len(unique) - NAMED_MAX
     return ", ".join(unique[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
 def joined(things: Sequence[str]) -> str:
-    """Return things with commas and an ``and`` before the last."""
+    """Return texts with commas and an ``and`` before the last."""
     unique = list(dict.fromkeys(things))
     if len(unique) > NAMED_MAX:
         return listed(unique)

@@ -52,10 +52,10 @@ from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10
-"""Independent divergences told unless everything is asked for."""
+"""Independent divergences shown unless ``everything`` is set."""
 
 EVERY_DIVERGENCE_MAX = 1000
-"""Told even then; each takes some milliseconds and some lines."""
+"""The limit even then; each takes some milliseconds and some lines."""
 
 EFFECT_WITHIN = 100_000
 """Events after the first divergence among which its first effect is looked for."""
@@ -74,7 +74,7 @@ _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 def compare(a: Trace, b: Trace, start: int, options: DiffOptions) -> Diff:
     """Return the diff of two runs that differ from event ``start`` on.
 
-    Raises TraceError if neither run has a node or topic that is asked for.
+    Raises TraceError if neither run has a selected node or topic.
     """
     _check_names(a, b, options)
     return _Comparison(a, b, start, options).run()
@@ -111,7 +111,7 @@ class _Comparison:
         self._environment = environment_settings(a, b)
         self._remarks = list(interruptions(a, b))
         self._only_names = False
-        """Whether the runs are the same but for names of programs."""
+        """Whether the runs are the same except for program names."""
         if self._matching.renamed:
             real = first_real_difference(self._run_a, self._run_b, start)
             self._only_names = real is None
@@ -272,7 +272,7 @@ class _Comparison:
     ) -> list[FoundDivergence]:
         """Return what to show if the first divergence is ignored or within tolerance."""
         if search.found is None:
-            return chosen  # what all messages say of that is told beside it
+            return chosen  # ``tolerance`` of the diff covers it
         self._remarks.append(StartIsTolerated(self._start))
         place = search.found.place_a
         return [search.found, *(found for found in chosen if found.place_a > place)]
@@ -282,7 +282,7 @@ class _Comparison:
         return (*self._options.nodes, *self._options.topics)
 
     def _wanted(self, item: EventPair, block: AlignedBlock) -> bool:
-        """Whether an item is of a node and touches a topic that was asked for."""
+        """Whether an item is of a node and touches a topic that is selected."""
         options, keys = self._options, self._matching.keys
         a, b = block.rows_a, block.rows_b
         rows, index = (a, item.a) if item.a >= 0 else (b, item.b)

@@ -3,7 +3,7 @@
     first difference -> entities matched -> blocks aligned -> roots and consequences -> Diff
 
 Nothing is read of two identical runs but the ends of their files, and of others only what lies
-around the divergence, unless everything is asked for.
+around the divergence, unless ``everything`` is set.
 """
 
 from __future__ import annotations

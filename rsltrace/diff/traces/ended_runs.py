@@ -1,4 +1,4 @@
-"""Runs of which one is over where the other goes on, and did the same until then."""
+"""Runs of which one ends where the other continues."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ TIMES = ("stamp", "*.stamp")
 """Fields that are not compared: what they hold is real time, or was simulated."""
 
 _PARAMETERS = "/parameter_events"
-"""Nodes that are made at once mix there, with the times of it in their messages."""
+"""Nodes that are created at once mix there, in any order."""
 
 _CALLBACKS = tuple(
     int(kind)

@@ -63,7 +63,7 @@ _AT_ONCE = 4096
 def messages_within(a: Trace, b: Trace, start: int, options: DiffOptions) -> BagDiff | None:
     """Compare all messages of two runs that diverge at event ``start``.
 
-    Return None if no tolerance is asked for, or if more than the contents of messages differs:
+    Return None if no tolerance is given, or if more than the contents of messages differs:
     events, their order and times, outputs that are no messages or were not recorded.
     """
     if not (options.tolerant or options.ignore) or not _alike_but_for_messages(a, b, start):
