@@ -153,23 +153,23 @@ def diff_bags(
     """
     options = options or DiffOptions()
     with open_source(a) as source_a, open_source(b) as source_b:
-        return _Comparison(source_a, source_b, options).run()
+        return _BagComparison(source_a, source_b, options).run()
 
 
 def compare_messages(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
     """Compare all messages, requests and responses of two traces; those of one time belong
     together. Reads all of both. Raises TraceError where they are damaged."""
     options = replace(options, by=BY_STAMP, topics=(), nodes=())
-    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+    return _BagComparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
 def compare_content(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
     """Compare all messages, requests and responses of two traces, topic by topic and in the order
     of each, whatever their times. Reads all of both. Raises TraceError where they are damaged."""
-    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+    return _BagComparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
-class _Comparison:
+class _BagComparison:
     def __init__(self, a: RecordingSource, b: RecordingSource, options: DiffOptions) -> None:
         self._a, self._b = a, b
         self._options = options

@@ -10,8 +10,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from rsltrace.diff.bags.pairing import LOOKAHEAD, MessagePair, Pairing
-from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
+from rsltrace.diff.bags.sequences import LOOKAHEAD, Gap, Keys, MessagePair, Pairing, moved_messages
 from rsltrace.diff.bags.source import RecordingSource, SourceTopic
 from rsltrace.diff.facts.bags import BagMessage, MessageDivergence, TopicDiff
 from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
@@ -81,20 +80,20 @@ class FetchedMessages:
             elif place >= last and all(seen[n] >= end for n, (_, end) in ranges.items()):
                 return
 
-    def sides(self, pair: TopicPair) -> tuple[_Side, _Side]:
+    def sides(self, pair: TopicPair) -> tuple[_TopicMessages, _TopicMessages]:
         """Return access to the messages of a topic in a and in b."""
         made = []
         for side, source, number in ((0, self._a, pair.number_a), (1, self._b, pair.number_b)):
             collected = self._collected[side].get(number)
             if collected is not None:
-                made.append(_Side(source, number, known=collected))
+                made.append(_TopicMessages(source, number, known=collected))
             else:
                 stream = (data for _, _, data in source.read({number}))
-                made.append(_Side(source, number, stream=stream, keep=self._context))
+                made.append(_TopicMessages(source, number, stream=stream, keep=self._context))
         return made[0], made[1]
 
 
-class _Side:
+class _TopicMessages:
     """The messages of one topic of one recording, read in about their order."""
 
     def __init__(
@@ -255,7 +254,7 @@ def _ignored(pair: TopicPair, *, outside: bool) -> int:
     return count
 
 
-def _covered(a: _Side, b: _Side, one: MessagePair, rules: FieldRules) -> bool:
+def _covered(a: _TopicMessages, b: _TopicMessages, one: MessagePair, rules: FieldRules) -> bool:
     if one.a < 0 or one.b < 0:
         return False
     try:
@@ -268,8 +267,8 @@ def _covered(a: _Side, b: _Side, one: MessagePair, rules: FieldRules) -> bool:
 def _divergence(
     pair: TopicPair,
     one: MessagePair,
-    a: _Side,
-    b: _Side,
+    a: _TopicMessages,
+    b: _TopicMessages,
     starts: tuple[int, int],
     options: DiffOptions,
 ) -> MessageDivergence:
@@ -310,8 +309,8 @@ def _moved(
     pair: TopicPair,
     one: MessagePair,
     whole: MessagePair,
-    a: _Side,
-    b: _Side,
+    a: _TopicMessages,
+    b: _TopicMessages,
     starts: tuple[int, int],
     options: DiffOptions,
 ) -> MessageDivergence:

@@ -77,7 +77,7 @@ def compare(a: Trace, b: Trace, start: int, options: DiffOptions) -> Diff:
     Raises TraceError if neither run has a selected node or topic.
     """
     _check_names(a, b, options)
-    return _Comparison(a, b, start, options).run()
+    return _TraceComparison(a, b, start, options).run()
 
 
 def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
@@ -95,7 +95,7 @@ def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
                 )
 
 
-class _Comparison:
+class _TraceComparison:
     """Of two runs that differ from event ``start`` on."""
 
     def __init__(self, a: Trace, b: Trace, start: int, options: DiffOptions) -> None:
