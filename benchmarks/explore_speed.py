@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rsltrace.job.values.times import parse_time
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import JobSource, Trial
 from rsltrace.search.explore.workers import Worker
 
@@ -104,7 +104,7 @@ def fork(runs: int) -> None:
             both, digests = {}, {}
             for fork_ns in (-1, 30 * 10**9):
                 with Worker(JobSource(str(folder / "job.yaml"))) as worker:
-                    wants = Wants(fork_ns=fork_ns)
+                    wants = TrialOptions(fork_ns=fork_ns)
                     seen = []
                     # The first run loads what runs need, the second one makes the prefix.
                     for number in range(2 + runs):
@@ -132,7 +132,7 @@ def memory(runs: int, job: Path, fork_after: str | None) -> None:
     if ``fork_after`` says when."""
     fork_ns = -1 if fork_after is None else parse_time(fork_after)
     order = {"order": "permutation", **({} if fork_after is None else {"after": fork_after})}
-    wants = Wants(behaviours=True, fork_ns=fork_ns)
+    wants = TrialOptions(behaviours=True, fork_ns=fork_ns)
     with tempfile.TemporaryDirectory() as folder, Worker(JobSource(str(job))) as worker:
         began_s = time.monotonic()
         for number in range(1, runs + 1):

@@ -181,7 +181,7 @@ def diff(
         absolute=absolute,
         relative=relative,
         by=by,
-        as_far_as_they_go=allow_truncated,
+        allow_truncated=allow_truncated,
     )
     return _diff(golden, others, form, options, output, check=check)
 

@@ -37,21 +37,21 @@ def diff_files(
     relative: Tolerances = (),
     window: int = 2000,
     by: str = "order",
-    as_far_as_they_go: bool = False,
+    allow_truncated: bool = False,
     check: bool = False,
 ) -> Diff | Any:
     """Compare two traces: paths, or addresses such as ``https://…`` given as strings. Or two
     recordings: folders with metadata.yaml, ``.mcap`` or ``.db3`` files; one may be a trace.
 
-    ``context`` is the number of events told before a divergence. ``everything`` looks at both runs
+    ``context`` is the number of events shown before a divergence. ``everything`` looks at both runs
     to their ends and tells every independent divergence; else ``window`` events after the first
     one are aligned. ``nodes`` and ``topics`` are globs of what to tell about.
 
     ``ignore`` are globs of fields that are not compared (``header.stamp``, ``/odom:twist``).
     ``absolute`` and ``relative`` give tolerances by such globs: ``{"pose.*": 1e-6}``, or pairs.
 
-    A trace that is cut is never identical to another; with ``as_far_as_they_go`` it passes if it
-    agrees until there. ``check`` reads both traces first and verifies their hashes. ``by`` says how
+    A truncated trace is never identical to another; with ``allow_truncated`` it passes if it
+    agrees up to its end. ``check`` first verifies the hashes of both traces. ``by`` says how
     the messages of recordings are matched: ``order`` or ``stamp``.
 
     Returns a ``rsltrace.Diff``, or a ``rsltrace.BagDiff`` of recordings; ``identical``, ``verdict``
@@ -77,7 +77,7 @@ def diff_files(
         relative=_pairs(relative),
         window=window,
         by=by,
-        as_far_as_they_go=as_far_as_they_go,
+        allow_truncated=allow_truncated,
     )
     if is_recording(a) or is_recording(b):
         from rsltrace.diff.bags.comparison import diff_bags

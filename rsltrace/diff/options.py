@@ -1,4 +1,4 @@
-"""What a comparison is asked for: one value that the engine, the bags and the reports read."""
+"""The options of a comparison, for the engine, the bags and the reports."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class DiffOptions:
     begin with a glob of topics and a colon (``/odom:header.stamp``); it then holds for these only.
 
     ``by`` says how the messages of two bags are matched: ``order`` or ``stamp`` (the log time).
-    ``as_far_as_they_go``: recordings that are cut pass if they agree until there.
+    ``allow_truncated``: truncated recordings pass if they agree up to their end.
     Raises TraceError for values that make no sense.
     """
 
@@ -40,7 +40,7 @@ class DiffOptions:
     relative: tuple[tuple[str, float], ...] = ()
     window: int = 2000
     by: str = BY_ORDER
-    as_far_as_they_go: bool = False
+    allow_truncated: bool = False
 
     def __post_init__(self) -> None:
         """Check the values."""

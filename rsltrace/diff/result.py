@@ -1,7 +1,7 @@
 """The answers: what a diff found, with its sentences. A report needs no file for them any more.
 
 ``a`` is always the first file given, ``b`` the second. Stamps are simulated nanoseconds, hashes
-unsigned 64-bit. Sentences are made when they are asked for; nothing is decided by them.
+unsigned 64-bit. Sentences are made on demand; nothing is decided by them.
 """
 
 from __future__ import annotations
@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
 from rsltrace.diff.facts.causes import Judgement, UnrecordedAnswer, Verdict
-from rsltrace.diff.facts.evidence import CallDifference, CauseStep, EventView, Reach, Setting
+from rsltrace.diff.facts.evidence import (
+    AffectedTopic,
+    CallDifference,
+    CauseStep,
+    EventView,
+    Setting,
+)
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
 
 if TYPE_CHECKING:
@@ -32,7 +38,7 @@ class Divergence(Judgement):
     before_b: tuple[EventView, ...] = ()
     same_node_a: tuple[EventView, ...] = ()
     same_node_b: tuple[EventView, ...] = ()
-    reaches: tuple[Reach, ...] = ()
+    reaches: tuple[AffectedTopic, ...] = ()
     next_step: str = ""
     calls: tuple[CallDifference, ...] = ()
 
@@ -66,7 +72,7 @@ class BagDiff(BagComparison):
 
     @property
     def sentence(self) -> str:
-        """What a person wants to know."""
+        """The answer."""
         from rsltrace.diff.sentences.runs import recordings_sentence
 
         return recordings_sentence(self)
@@ -95,7 +101,7 @@ class EntityCount:
 
 
 @dataclass(frozen=True, slots=True)
-class Side:
+class ComparedRun:
     """One of the two files."""
 
     path: str
@@ -121,8 +127,8 @@ class Diff:
     missing, extra or at another time; else it is None.
     """
 
-    a: Side
-    b: Side
+    a: ComparedRun
+    b: ComparedRun
     verdict: Verdict
     outcome: Outcome
     agreeing: int
@@ -134,8 +140,8 @@ class Diff:
     bytes_read: int = 0
     remarks: tuple[Remark, ...] = ()
     tolerance: BagDiff | None = None
-    as_far_as_they_go: bool = False
-    """Whether it is enough that they agree as far as they go."""
+    allow_truncated: bool = False
+    """Whether truncated recordings are accepted."""
 
     effect: Divergence | None = None
 
@@ -145,7 +151,7 @@ class Diff:
 
     @property
     def sentence(self) -> str:
-        """What a person wants to know: the settings that are to blame, and what they did."""
+        """The answer: the settings that can be the cause, and their effect."""
         from rsltrace.diff.sentences.runs import answer
 
         return answer(self)
@@ -168,7 +174,7 @@ class Diff:
     @property
     def agrees_until_cut(self) -> bool:
         """Whether a recording is cut, and the runs agree as far as both go."""
-        return self.verdict is Verdict.AS_FAR_AS_THEY_GO
+        return self.verdict is Verdict.AGREE_UNTIL_TRUNCATED
 
     @property
     def within_tolerance(self) -> bool:
@@ -191,13 +197,13 @@ class Diff:
     def exit_code(self) -> int:
         """0 identical, 1 diverged or cut, 3 equal within tolerance; trouble is raised instead.
 
-        Where one recording has no event at all there is nothing that agrees, whatever was asked.
+        Where one recording has no event at all nothing agrees, whatever the options.
         """
         if self.identical:
             return 0
         if self.agrees_until_cut:
             agrees = self.agreeing or (self.native is not None and self.native.compared)
-            return 0 if self.as_far_as_they_go and agrees else EXIT_DIVERGED
+            return 0 if self.allow_truncated and agrees else EXIT_DIVERGED
         return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED
 
     def _repr_html_(self) -> str:

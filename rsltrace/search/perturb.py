@@ -1,7 +1,7 @@
-"""Recording a job in a process of its own whose surroundings are unlike those of any other.
+"""Record a job in a process with a perturbed environment.
 
-Whatever may differ from run to run and machine to machine without anybody noticing is made to
-differ: a job whose digest stays the same does not depend on it.
+Everything that may silently differ between runs and machines is made to differ: a job whose
+digest stays the same does not depend on it.
 """
 
 from __future__ import annotations
@@ -56,8 +56,7 @@ _KERNELS = {"sse3": "Nehalem", "avx": "Sandybridge", "avx2": "Haswell", "avx512f
 _RESULT_MAX = 1 << 20
 """How far from the end of what a run has printed its result can begin."""
 
-# What a process does to its heap before anything else, so that fresh memory is never zero and
-# addresses are others.
+# Fills the heap first, so that fresh memory is never zero and addresses differ.
 _NOISE = """
 import sys
 del sys.path[0]
@@ -70,7 +69,7 @@ sys.argv = ['rsltrace'] + sys.argv[1:]
 runpy.run_module('rsltrace', run_name='__main__')
 """
 
-# Starts without the present folder among those that Python looks for modules in.
+# Starts without the working directory on Python's path.
 _PLAIN = """
 import sys
 del sys.path[0]
@@ -79,7 +78,7 @@ sys.argv[0] = 'rsltrace'
 runpy.run_module('rsltrace', run_name='__main__')
 """
 
-# Keeps a processor busy as long as whoever started it is there.
+# Keeps a CPU busy for as long as the parent process lives.
 _BUSY = """
 import os
 parent = os.getppid()
@@ -91,15 +90,15 @@ while os.getppid() == parent:
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """How one process is set up; ``values`` has a text for every kind that is perturbed."""
+    """The perturbed environment of one process; ``values`` has a text for each perturbed kind."""
 
     number: int
     values: Mapping[str, str]
     alone: str = ""
-    """What sets a run apart from others of its number: the only kind that is perturbed."""
+    """The only perturbed kind, for a run with just one."""
 
     def only(self, kind: str) -> Surroundings:
-        """Return these surroundings with nothing but one kind perturbed."""
+        """Return the same with only one kind perturbed."""
         return Surroundings(self.number, {kind: self.values[kind]}, kind)
 
     def __str__(self) -> str:
@@ -110,11 +109,11 @@ class Surroundings:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What came of one run.
+    """The result of one run.
 
-    ``digest`` is empty if the process did not get to the end of a trace. ``failure`` says what went
-    wrong, if anything did; ``errors`` is all that it wrote to stderr. ``states`` are the samples of
-    nodes' states that its trace has, as JSON.
+    ``digest`` is empty if the process did not finish a trace. ``failure`` says what went wrong, if
+    anything did; ``errors`` is its stderr. ``states`` are the samples of nodes' states that its
+    trace has, as JSON.
     """
 
     surroundings: Surroundings
@@ -138,10 +137,10 @@ class Recorded:
 
 
 def surroundings(number: int, seed: int = 0) -> Surroundings:
-    """Return the surroundings of run ``number``; run 0 has nothing perturbed.
+    """Return the perturbation of run ``number``; run 0 has none.
 
-    What differs between any two processes (hash seed, address space) is fixed where it is not
-    perturbed, so that a difference has a cause.
+    Hash seed and address space are fixed where they are not perturbed, so that a difference has a
+    cause.
     """
     if number == 0:
         return Surroundings(0, {})
@@ -158,7 +157,7 @@ def surroundings(number: int, seed: int = 0) -> Surroundings:
     if can_fix_addresses():
         values[ADDRESSES] = "random"
     kernels = core_types()
-    if len(kernels) > 1 and not os.environ.get(CORE_TYPE):  # else the user has chosen one
+    if len(kernels) > 1 and not os.environ.get(CORE_TYPE):  # unless the user has chosen one
         values[KERNEL] = chance.choice(kernels)
     return Surroundings(number, values)
 
@@ -175,7 +174,7 @@ def core_types() -> tuple[str, ...]:
 
 @lru_cache
 def can_fix_addresses() -> bool:
-    """Return whether a program can be started with fixed addresses; containers may forbid it."""
+    """Return whether a process can start with fixed addresses; containers may forbid it."""
     setarch = shutil.which("setarch")
     if setarch is None:
         return False
@@ -192,10 +191,9 @@ def record_in(
     processes: Processes | None = None,
     timeout_s: float | None = None,
 ) -> Recorded:
-    """Record in a process with these surroundings; ``arguments`` are those of ``rsltrace record``.
+    """Record in a perturbed process; ``arguments`` are those of ``record``, paths absolute.
 
-    The trace goes to ``path``, or below ``folder`` under a name of its own. Paths in ``arguments``
-    must be absolute.
+    The trace goes to ``path``, or to a new file in ``folder``.
     """
     path = path or folder / f"{_name(around)}.mcap"
     words = record_words([*arguments, "--sample-states"], path)
@@ -211,7 +209,7 @@ def run_in(
     processes: Processes | None = None,
     timeout_s: float | None = None,
 ) -> Done:
-    """Run ``rsltrace`` in a process with these surroundings. Paths in ``words`` are absolute."""
+    """Run ``rsltrace`` in a perturbed process. Paths in ``words`` are absolute."""
     values = around.values
     cwd = _working_folder(folder / f"{_name(around)}.cwd", values.get(FOLDER))
     home = folder / f"{_name(around)}.home"
@@ -230,10 +228,9 @@ def run_in(
 
 
 def _working_folder(place: Path, name: str | None) -> Path:
-    """Make a folder in which relative paths lead where they lead in the present one.
+    """Make a working directory in ``place`` in which the same relative paths work.
 
-    It is in ``place``. What lies in the present folder and in the one above is there as links;
-    files that a run makes beside them are its own.
+    The entries of the real one and of its parent are linked; new files of a run stay here.
     """
     here = Path.cwd()
     cwd = place / (name or here.name or "here")
@@ -256,12 +253,12 @@ def record_words(arguments: Sequence[str], path: Path) -> list[str]:
 
 
 def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
-    """Return what came of a run, from what its process has printed."""
+    """Return the result of a run, from what its process has printed."""
     result = _result_in(done.output)
     try:
         digest, events = str(result["digest"]), int(result["events"])
         failure = str(result["error"] or "")
-        path = Path(result["path"])  # a trace that was there stays if no run comes about
+        path = Path(result["path"])  # an existing trace stays if the run cannot start
     except (ValueError, KeyError, TypeError):
         digest, events, failure = "", 0, ""
     if done.timed_out:
@@ -280,8 +277,8 @@ def _states_in(path: Path) -> str:
 
 
 def _result_in(output: str) -> dict[str, Any]:
-    """Return the JSON object that ``record --json`` has printed, which may stand in the middle of a
-    line: nodes print there, too (a prompt, say)."""
+    """Return the JSON object that ``record --json`` has printed. It may be in the middle of a line:
+    nodes print to stdout, too."""
     end = output[-_RESULT_MAX:]
     for found in reversed(list(re.finditer(r'\{"', end))):
         try:

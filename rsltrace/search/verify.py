@@ -1,4 +1,4 @@
-"""Recording a job many times in unlike surroundings: is there one digest, and if not, why?"""
+"""Run a job many times under perturbed environments and compare the digests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rsltrace.search.perturb import KINDS, Recorded, Surroundings, record_in, su
 _TIMEOUT_MIN_S = 120.0
 _TIMEOUT_FACTOR = 30
 _NARROWING_S = 120.0
-"""Runs with one perturbation at a time are made as long as they do not take longer than this."""
+"""Each perturbation is tried alone only if that takes no longer than this."""
 
 OnRun = Callable[[Recorded], None]
 
@@ -40,13 +40,12 @@ class HiddenDifference:
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What was tried and what came of it.
+    """The runs and their result.
 
-    ``other`` is the run, of those that did something else than ``first``, with the lowest number.
-    ``provoked_by`` are the perturbations of it that make a difference on their own; ``narrowed``
-    says whether that was tried. ``by_itself``: a second run without perturbations differs, too.
-    ``hidden`` is of runs whose events agree.
-    ``trouble`` is a run that came to no end, which is no answer.
+    ``other`` is the first run (by number) that differs from ``first``. ``provoked_by`` are its
+    perturbations that make a difference alone; ``narrowed`` says whether that was tried.
+    ``by_itself``: a second unperturbed run differs, too. ``hidden`` is of runs whose events agree.
+    ``trouble`` is a run that did not finish.
     """
 
     first: Recorded
@@ -62,14 +61,14 @@ class Verified:
 
     @property
     def agrees(self) -> bool:
-        """Whether every run came to its end, and all did the same."""
+        """Whether all runs finished with the same result."""
         return self.other is None and self.trouble is None
 
 
 class Verification:
-    """A series of runs of one job. ``arguments`` are those of ``rsltrace record``, paths absolute.
+    """Runs one job many times. ``arguments`` are those of ``rsltrace record``, paths absolute.
 
-    ``folder`` takes the traces; those that agree with the first one are deleted unless ``keep``.
+    Traces go to ``folder``; those equal to the first one are deleted unless ``keep``.
     """
 
     def __init__(
@@ -91,7 +90,7 @@ class Verification:
         self._processes = Processes()
 
     def verify(self, runs: int, on_run: OnRun = lambda recorded: None) -> Verified:
-        """Record ``runs`` times, until two runs differ or one comes to no end."""
+        """Record ``runs`` times, until two runs differ or one does not finish."""
         begin = time.monotonic()
         with self._ending():
             first = self._record(surroundings(0))
@@ -162,12 +161,12 @@ class Verification:
         )
 
     def _others(self, first: Recorded, runs: int, on_run: OnRun) -> list[Recorded]:
-        """Return the other runs, in the order of their numbers, up to what differs."""
+        """Return the other runs by number; no new ones begin after a difference."""
         differs = threading.Event()
 
         def next_one(around: Surroundings) -> Recorded | None:
             if differs.is_set():
-                return None  # those under way come to their end, the others do not begin
+                return None
             recorded = self._record(around)
             if recorded.outcome != first.outcome:
                 differs.set()
@@ -204,7 +203,7 @@ class Verification:
             recorded.path.unlink(missing_ok=True)
 
     def _narrowed(self, found: Verified, took_s: float) -> Verified:
-        """Try a second run without perturbations, then each perturbation alone."""
+        """Try a second unperturbed run, then each perturbation alone."""
         first, other = found.first, found.other
         assert other is not None
         again = self._record(Surroundings(0, {}, "again"))

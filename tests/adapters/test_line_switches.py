@@ -127,7 +127,7 @@ def test_one_departure_is_one_switch_and_cat_and_diff_name_its_line(
     words = " ".join(text.split())
     assert status == 1
     assert "verdict: schedule" in words
-    assert f"gave way to another thread before {place} in b; in a it went on" in words
+    assert f"switched to another thread before {place} in b but not in a" in words
 
 
 class Sides(Node):  # type: ignore[misc]

@@ -124,12 +124,14 @@ def test_qos_that_fits_no_more(
         assert diff.identical
         return
     who = (
-        "/source made publisher /signal" if end == "OFFERED" else "/sink made subscription /signal"
+        "/source created publisher /signal"
+        if end == "OFFERED"
+        else "/sink created subscription /signal"
     )
     name, old, _, *new = told.split(" ")
     backwards = f"{name} {' '.join(new)} → {old}"
     for found, values in ((diff, told), (back, backwards)):
-        assert f"{who} with another QoS: {values}" in found.sentence
+        assert f"{who} with a different QoS: {values}" in found.sentence
         assert_blames(found, who.split()[0])
 
 
@@ -181,7 +183,7 @@ def test_qos_that_is_offered_no_more(
     a = recorded(tmp_path, "a.mcap", monkeypatch, **same)
     b = recorded(tmp_path, "b.mcap", monkeypatch, **{**same, end: offered})
     diff = rsltrace.diff(a, b)
-    assert f"/source made publisher /signal with another QoS: {told}" in diff.sentence
+    assert f"/source created publisher /signal with a different QoS: {told}" in diff.sentence
     assert_blames(diff, "/source")
 
 
@@ -218,4 +220,4 @@ def test_another_callback_group(
         for name, group in zip("ab", groups, strict=True)
     )
     diff = rsltrace.diff(a, b)
-    assert f"/busy made timer Busy.more with another callback group: {told}" in diff.sentence
+    assert f"/busy created timer Busy.more with a different callback group: {told}" in diff.sentence

@@ -126,7 +126,7 @@ def test_a_parameter_without_effect(recorded: Callable[..., Path]) -> None:
     diff = rsltrace.diff(recorded(), recorded(unused="2"))
     assert diff.effect is None
     assert diff.sentence == (
-        "parameter unused 1 → 2 (job.yaml:8); no effect but on /parameter_events, by the "
+        "parameter unused 1 → 2 (job.yaml:8); no effect except on /parameter_events, by the "
         "constructor of /follower"
     )
     assert diff.shown is diff.divergences[0]
@@ -142,8 +142,10 @@ def test_what_is_ignored_or_tolerated_does_not_lead(recorded: Callable[..., Path
     ignored = ["/parameter_events:*", "/rosout:*", "angular.z"]
     diff = rsltrace.diff(a, b, ignore=ignored)
     assert "/cmd_vel (linear.x 2.0 → 3.0)" in diff.sentence
-    assert any("only in what is ignored or within tolerance" in note for note in diff.notes)
-    assert not any("shown is where" in note for note in diff.notes), "no topic was asked for"
+    assert any("but only in ignored fields or within tolerance" in note for note in diff.notes)
+    assert not any("this report shows where" in note for note in diff.notes), (
+        "no topic was asked for"
+    )
     assert diff.agreeing == 1
 
 

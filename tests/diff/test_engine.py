@@ -188,7 +188,7 @@ def test_a_consequence_that_was_asked_for_leads_back_to_its_root(tmp_path: Path)
     assert link_text(first.chain[-2].link) == "published /l"
     assert first.messages[0].position == -1
     assert [field.path for field in first.messages[0].fields] == ["data"]
-    assert any("shown is where /sum differs" in note for note in diff.notes)
+    assert any("this report shows where /sum differs" in note for note in diff.notes)
 
 
 def test_state_is_a_way_to_the_root_too(tmp_path: Path) -> None:
@@ -208,7 +208,7 @@ def test_asking_for_what_does_not_differ(tmp_path: Path) -> None:
     assert not diff.identical
     assert diff.divergences[0].a is not None
     assert diff.divergences[0].a.entity.node == "/left"
-    assert any("nothing that was asked for (/odd) differs" in note for note in diff.notes)
+    assert any("nothing selected (/odd) differs" in note for note in diff.notes)
 
 
 # -- what is outside of the events ---------------------------------------------------------------
@@ -266,7 +266,7 @@ def test_a_node_more_shifts_all_ids_and_nothing_else(tmp_path: Path) -> None:
     more = replace(PLAN, nodes=(NodePlan("/more", timers=((10 * MS, ()),)), *PLAN.nodes))
     diff = compare(tmp_path, b=more, everything=True)
     assert diff.verdict is Verdict.GRAPH
-    assert "/more is constructed in b and not in a" in diff.sentence
+    assert "/more is constructed in b but not in a" in diff.sentence
     assert len(diff.divergences) == 1
     by_node: dict[str, int] = {}
     for count in diff.counts:
@@ -313,16 +313,16 @@ def test_an_interrupted_run_agrees_only_as_far_as_it_goes(tmp_path: Path) -> Non
     Simulation(PLAN, tmp_path / "b.mcap", storage=Storage(50, close=False)).run()
     _cut(tmp_path / "b.mcap", (tmp_path / "b.mcap").stat().st_size // 2)
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
+    assert diff.verdict is Verdict.AGREE_UNTIL_TRUNCATED
     assert not diff.b.complete
     assert diff.b.stop_reason == "interrupted"
     assert diff.agreeing == diff.b.events > 100
     assert diff.sentence == (
-        f"the two runs agree as far as they go, {diff.b.events} events: the recording of b is cut"
+        f"the two runs agree in the first {diff.b.events} events; the recording of b is truncated"
     )
     assert "the recording of b" in diff.notes[0]
     assert (diff.identical, diff.diverged, diff.failed, diff.exit_code) == (False, False, True, 1)
-    accepted = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    accepted = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", allow_truncated=True)
     assert (accepted.identical, accepted.failed, accepted.exit_code) == (False, False, 0)
 
 
@@ -330,8 +330,8 @@ def test_two_runs_that_were_both_interrupted_are_not_identical(tmp_path: Path) -
     for name in ("a.mcap", "b.mcap"):
         Simulation(PLAN, tmp_path / name, storage=Storage(50, close=False)).run()
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
-    assert diff.sentence.endswith("events: both recordings are cut")
+    assert diff.verdict is Verdict.AGREE_UNTIL_TRUNCATED
+    assert diff.sentence.endswith("events; both recordings are truncated")
     assert diff.exit_code == 1
 
 
@@ -346,14 +346,14 @@ def test_a_trace_is_not_identical_to_its_own_beginning(tmp_path: Path) -> None:
             diff = rsltrace.diff(tmp_path / f"{a}.mcap", tmp_path / f"{b}.mcap")
             verdicts.add(diff.verdict)
             assert diff.exit_code == 1, size
-    assert verdicts == {Verdict.AS_FAR_AS_THEY_GO}
+    assert verdicts == {Verdict.AGREE_UNTIL_TRUNCATED}
 
 
 def test_a_cut_run_still_diverges_where_it_does_something_else(tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     fault = Fault("bit", step(20, 1))
     Simulation(PLAN, tmp_path / "b.mcap", (fault,), storage=Storage(50, close=False)).run()
-    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", allow_truncated=True)
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     assert diff.exit_code == 1
 
@@ -377,20 +377,20 @@ def test_runs_without_an_event_are_not_equal_if_their_jobs_are_not(
     )
     for path in (a, b, c):
         _cut(path, size) if size else None
-    for options in ({}, {"as_far_as_they_go": True}):
+    for options in ({}, {"allow_truncated": True}):
         diff = rsltrace.diff(a, b, **options)
         assert diff.verdict is Verdict.DIFFERENT_JOBS
         assert diff.exit_code == 1
         assert '("x", "y")' in diff.sentence
         same = rsltrace.diff(a, c, **options)
-        assert same.verdict is (Verdict.AS_FAR_AS_THEY_GO if size else Verdict.IDENTICAL)
+        assert same.verdict is (Verdict.AGREE_UNTIL_TRUNCATED if size else Verdict.IDENTICAL)
         assert same.exit_code == (1 if size else 0)
 
 
 def test_an_exception_in_one_run(tmp_path: Path) -> None:
     diff = compare(tmp_path, Fault("raise", step(20, 3)))
     assert (diff.verdict, diff.divergences[0].root) == (Verdict.EXCEPTION, Root.EXCEPTION)
-    assert "raised ValueError: planted in b and not in a" in diff.sentence
+    assert "raised an exception only in b: ValueError: planted" in diff.sentence
     (first,) = diff.divergences
     exception = [m for m in first.messages if m.kind is OutputKind.EXCEPTION]
     assert exception[0].preview == "ValueError: planted"
@@ -465,7 +465,7 @@ def test_equal_messages_from_other_senders(tmp_path: Path) -> None:
     diff = compare(tmp_path, Fault("swap", ear.index, 1), a=plan)
     assert (diff.verdict, diff.divergences[0].root) == (Verdict.SCHEDULE, Root.SCHEDULE)
     assert diff.agreeing == ear.index
-    assert "took two inputs the other way round" in diff.sentence
+    assert "received two inputs in swapped order" in diff.sentence
 
 
 def test_the_same_swap_again_and_again_is_one_divergence(tmp_path: Path) -> None:
@@ -526,7 +526,9 @@ def test_options_in_the_shapes_that_come_to_mind(tmp_path: Path) -> None:
     pairs = compare(tmp_path, fault, topics=["/l"], absolute=[("data", 1.0)], ignore="none")
     mapping = compare(tmp_path, fault, topics="/l", absolute={"data": 1.0}, ignore=("none",))
     assert pairs == mapping
-    assert [note.partition(": ")[2] for note in pairs.notes] == ["its job job.yaml is not here"]
+    assert [note.partition(" of ")[0] for note in pairs.notes] == [
+        "no command to reproduce this: the job job.yaml"
+    ]
 
 
 def test_options_that_make_no_sense(tmp_path: Path) -> None:

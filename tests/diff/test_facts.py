@@ -115,9 +115,9 @@ def test_planted_faults_are_decided_by_facts(part: int, tmp_path: Path) -> None:
 def all_facts() -> Iterator[Any]:
     """Yield whatever a sentence can be asked for."""
     for union in (
-        evidence.Fate,
-        causes.What,
-        causes.Why,
+        evidence.OutputFate,
+        causes.DivergenceFact,
+        causes.CauseFact,
         causes.Loss,
         causes.LikelyCause,
         remarks.Remark,
@@ -125,7 +125,7 @@ def all_facts() -> Iterator[Any]:
     ):
         for kind in get_args(union):
             yield from kind if issubclass(kind, Enum) else (kind,)
-    yield from evidence.NoFields
+    yield from evidence.NoFieldsReason
 
 
 def test_every_fact_has_its_sentence() -> None:

@@ -153,7 +153,7 @@ def nan_of(bits: int) -> float:
 def test_nan_equals_a_nan_of_the_same_bits_only() -> None:
     assert diff_messages(message(double=math.nan), message(double=math.nan), ONLY) == ((), 0)
     found = only(message(double=math.nan), message(double=nan_of(0x7FF8000000000001)))
-    assert notes_text(found) == "NaN with another payload"
+    assert notes_text(found) == "NaN with a different payload"
     assert (found.a, found.b) == ("nan", "nan(0x7ff8000000000001)")
     array = np.full(4, np.nan, dtype=np.float32)
     assert diff_messages(message(ranges=array), message(ranges=array), ONLY) == ((), 0)

@@ -8,7 +8,7 @@ import pytest
 
 from rsltrace.diff.causes.calls import call_difference
 from rsltrace.diff.causes.likely_cause import telling_calls
-from rsltrace.diff.facts.causes import OutsideAnswers
+from rsltrace.diff.facts.causes import ExternalAnswers
 from rsltrace.diff.facts.evidence import (
     CallDifference,
     FieldDifference,
@@ -28,7 +28,7 @@ def call(
 
 
 def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str:
-    return sentence(OutsideAnswers("/picker", telling_calls(calls, messages)))
+    return sentence(ExternalAnswers("/picker", telling_calls(calls, messages)))
 
 
 @pytest.mark.parametrize(
@@ -36,31 +36,31 @@ def told(calls: tuple[CallDifference, ...], *messages: MessageDifference) -> str
     [
         (
             call("environment", "os.environ['MOTOR_SEED']", "'6'", "'4'"),
-            "/picker read MOTOR_SEED, 6 in a and 4 in b, at picker.py:24",
+            "/picker read MOTOR_SEED (6 in a, 4 in b) at picker.py:24",
         ),
         (
             call("environment", "os.environ['NOTE']", "not set", "'a, b'"),
-            "/picker read NOTE, not set in a and 'a, b' in b, at picker.py:24",
+            "/picker read NOTE (not set in a, 'a, b' in b) at picker.py:24",
         ),
         (
             call("file", "open('/x/gains.yaml')", "4 bytes, SHA-256 ab", "4 bytes, SHA-256 cd"),
-            "/picker read gains.yaml, SHA-256 ab in a and SHA-256 cd in b, at picker.py:24",
+            "/picker read gains.yaml (SHA-256 ab in a, SHA-256 cd in b) at picker.py:24",
         ),
         (
             call("file", "os.stat(PosixPath('/x/gains.yaml'))", None, "4 bytes"),
-            "/picker read gains.yaml only in b, at picker.py:24",
+            "/picker read gains.yaml only in b at picker.py:24",
         ),
         (
             call("directory", "os.listdir('/x/models')", "1 name (a)", "2 names (a, b)"),
-            "/picker listed models, 1 name (a) in a and 2 names (a, b) in b, at picker.py:24",
+            "/picker listed models (1 name (a) in a, 2 names (a, b) in b) at picker.py:24",
         ),
         (
             call("random", "random.random()", "0.25", "0.5"),
-            "/picker drew random.random(), 0.25 in a and 0.5 in b, at picker.py:24",
+            "/picker drew random.random() (0.25 in a, 0.5 in b) at picker.py:24",
         ),
         (
             call("process", "subprocess.run\x1b[2J", "'1'", None),
-            "/picker called subprocess.run\\x1b[2J only in a, at picker.py:24",
+            "/picker called subprocess.run\\x1b[2J only in a at picker.py:24",
         ),
     ],
 )
@@ -75,12 +75,12 @@ def test_of_several_answers_those_that_show_are_told() -> None:
     calls = (unused, unused, same, topic)
     name = EntityKey("/picker", "publisher", "/one", "")
     made = message("new publisher /one", Presence.ONLY_A, entity=name)
-    one = "/picker read TOPIC, /one in a and /other in b, at picker.py:24"
+    one = "/picker read TOPIC (/one in a, /other in b) at picker.py:24"
     assert told(calls, made) == one
     field = FieldDifference("data", '"x"', '"/other"')
     assert told(calls, message("/t", Presence.BOTH, fields=(field,))) == one
     assert told(calls) == (
-        "/picker read UNUSED, 1 in a and 2 in b, at picker.py:8; " + one.removeprefix("/picker ")
+        "/picker read UNUSED (1 in a, 2 in b) at picker.py:8; " + one.removeprefix("/picker ")
     )
 
 

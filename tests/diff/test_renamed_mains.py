@@ -61,7 +61,7 @@ def test_the_difference_is_that_of_the_programs(compared: Any, second: str) -> N
     new = {second: ("talk", "count // 3 * 3 + count % 3"), "other.py": ("other", "0")}
     same = compared(old, new)
     assert same.identical
-    assert same.sentence.startswith("the two runs are identical but for names of programs: ")
+    assert same.sentence.startswith("the two runs are identical except for program names: ")
     assert same.notes == (f"{Path('old/talk.py')} in a is compared with {second} in b",)
     new[second] = ("talk", "count if count < 5 else -count")
     found = compared(old, new)

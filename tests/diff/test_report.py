@@ -21,45 +21,45 @@ from hypothesis import strategies as st
 from rsltrace.diff.facts.bags import (
     BagMessage,
     BagVerdict,
+    ComparedRecording,
     LoneTopic,
     MessageDivergence,
-    Recording,
     TopicDiff,
 )
 from rsltrace.diff.facts.causes import (
-    NothingBefore,
-    OnlyInOne,
-    OtherOutput,
-    RaisedInOne,
+    DifferentOutput,
+    EventInOneRun,
+    ExceptionInOneRun,
+    NoEarlierDifference,
     Root,
     Verdict,
 )
 from rsltrace.diff.facts.evidence import (
+    AffectedTopic,
+    CauseLink,
     CauseStep,
     EventView,
     FieldDifference,
     FieldNote,
     FieldNoteKind,
-    Link,
     LinkKind,
     MessageDifference,
-    NoFields,
+    NoFieldsReason,
     Presence,
-    Reach,
     Setting,
     SettingKind,
 )
 from rsltrace.diff.facts.remarks import (
-    AgreeUntilCut,
-    Diverged,
+    EqualUntilTruncated,
     Identical,
-    Interrupted,
     LogTimesIgnored,
-    Told,
+    ReaderNote,
+    RunsDiverge,
+    TruncatedRecording,
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import FORMATS, render
-from rsltrace.diff.result import BagDiff, Diff, Divergence, EntityCount, Side
+from rsltrace.diff.result import BagDiff, ComparedRun, Diff, Divergence, EntityCount
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.words.entities import EntityKey
@@ -127,8 +127,10 @@ def event(
     return dataclasses.replace(made, **changes)
 
 
-def side(name: str, digest: str, **changes: Any) -> Side:
-    made = Side(f"runs/{name}.mcap", digest, 5210, 10_000 * MS, True, "duration of 10.000000000 s")
+def side(name: str, digest: str, **changes: Any) -> ComparedRun:
+    made = ComparedRun(
+        f"runs/{name}.mcap", digest, 5210, 10_000 * MS, True, "duration of 10.000000000 s"
+    )
     return dataclasses.replace(made, **changes)
 
 
@@ -162,23 +164,23 @@ def nondeterministic() -> Diff:
     found = Divergence(
         Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
         Root.CALLBACK,
-        OtherOutput(),
-        NothingBefore("callback", state_unknown=False, guard_is_off=False),
+        DifferentOutput(),
+        NoEarlierDifference("callback", state_unknown=False, guard_is_off=False),
         a,
         b,
         messages=(message, log),
-        chain=(CauseStep(tick, tick, Link(LinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
+        chain=(CauseStep(tick, tick, CauseLink(LinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
         before_a=before,
         before_b=before,
         same_node_a=(event(100, 1200),),
         same_node_b=(event(100, 1200),),
-        reaches=(Reach("/points", 0, 3), Reach("/cmd_vel", 50 * MS, 2)),
+        reaches=(AffectedTopic("/points", 0, 3), AffectedTopic("/cmd_vel", 50 * MS, 2)),
         next_step="rsltrace cat runs/run1.mcap --node /scan_filter --from 1.35 --to 1.35",
     )
     later = dataclasses.replace(
         found,
         verdict=Verdict.EXCEPTION,
-        what=RaisedInOne("ValueError: no plan"),
+        what=ExceptionInOneRun("ValueError: no plan"),
         a=event(200, 2000, PLAN),
         b=event(201, 2000, PLAN, flags=EventFlag.RAISED, summary="exception"),
         chain=(),
@@ -189,7 +191,7 @@ def nondeterministic() -> Diff:
         side("run1", "0123456789abcdef"),
         side("run2", "fedcba9876543210", events=5208),
         found.verdict,
-        Diverged(),
+        RunsDiverge(),
         123,
         (found, later),
         (
@@ -200,7 +202,7 @@ def nondeterministic() -> Diff:
         (200, 199),
         (2123, 2122),
         4096,
-        (Told("run2.mcap was recorded on another machine"),),
+        (ReaderNote("run2.mcap was recorded on another machine"),),
     )
 
 
@@ -211,7 +213,7 @@ def missing() -> Diff:
     found = Divergence(
         Verdict.MISSING,
         Root.MISSING,
-        OnlyInOne(instead),
+        EventInOneRun(instead),
         None,
         gone,
         None,
@@ -224,7 +226,7 @@ def missing() -> Diff:
                 Presence.ONLY_A,
                 77,
                 None,
-                no_fields=NoFields.NOT_RECORDED_IN_A,
+                no_fields=NoFieldsReason.NOT_RECORDED_IN_A,
             ),
         ),
         before_a=(event(38, 880, TICK, EventKind.TIMER), event(39, 890)),
@@ -235,7 +237,7 @@ def missing() -> Diff:
         side("run1", "0123456789abcdef"),
         side("run2", "fedcba9876543210", complete=False, stop_reason=""),
         found.verdict,
-        Diverged(),
+        RunsDiverge(),
         40,
         (found,),
     )
@@ -274,8 +276,10 @@ def recordings() -> BagDiff:
         17_000 * MS,
     )
     return BagDiff(
-        Recording("bags/monday", "mcap", 4, 1207, 112 * 1000 * MS, 203 * 1000 * MS),
-        Recording("bags/tuesday", "sqlite3", 3, 1199, 212 * 1000 * MS, 303 * 1000 * MS, False),
+        ComparedRecording("bags/monday", "mcap", 4, 1207, 112 * 1000 * MS, 203 * 1000 * MS),
+        ComparedRecording(
+            "bags/tuesday", "sqlite3", 3, 1199, 212 * 1000 * MS, 303 * 1000 * MS, False
+        ),
         BagVerdict.DIFFERENT,
         "order",
         (
@@ -310,10 +314,10 @@ def cut() -> Diff:
     return Diff(
         sides[0],
         dataclasses.replace(sides[1], complete=False, stop_reason="interrupted"),
-        Verdict.AS_FAR_AS_THEY_GO,
-        AgreeUntilCut(4096, ("b",)),
+        Verdict.AGREE_UNTIL_TRUNCATED,
+        EqualUntilTruncated(4096, ("b",)),
         4096,
-        remarks=(Interrupted("b", "runs/run2.mcap", 4096, 10_000 * MS),),
+        remarks=(TruncatedRecording("b", "runs/run2.mcap", 4096, 10_000 * MS),),
     )
 
 
@@ -321,7 +325,7 @@ def cut_recording() -> BagDiff:
     return dataclasses.replace(
         equal_within_tolerance(),
         b=dataclasses.replace(recordings().b, complete=False),
-        verdict=BagVerdict.AS_FAR_AS_THEY_GO,
+        verdict=BagVerdict.AGREE_UNTIL_TRUNCATED,
         topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 0, 0, 0, 0),),
     )
 
@@ -376,14 +380,14 @@ def test_a_cut_recording_is_green_nowhere_unless_that_is_enough(
     assert 'failures="1"' in render(diff, "junit")
     assert render(diff, "github").startswith("::error ")
     assert "identical" not in render(diff, "markdown")
-    assert json.loads(render(diff, "json"))["verdict"] == "agree-as-far-as-they-go"
+    assert json.loads(render(diff, "json"))["verdict"] == "agree-until-truncated"
     assert "agree" in render(diff).splitlines()[0]
-    enough = dataclasses.replace(diff, as_far_as_they_go=True)
+    enough = dataclasses.replace(diff, allow_truncated=True)
     assert (enough.identical, enough.failed, enough.exit_code) == (False, False, 0)
     assert 'failures="0"' in render(enough, "junit")
     assert render(enough, "github").startswith("::notice ")
     assert json.loads(render(enough, "json"))["failed"] is False
-    assert "1 of 2 runs agrees only as far as the recordings go." in render([diff, enough])
+    assert "1 of 2 runs agrees only up to where a recording is truncated." in render([diff, enough])
     assert "agree with runs" in render([enough, enough]) or "agree with bags" in render(
         [enough] * 2
     )
@@ -402,7 +406,7 @@ def test_a_report_fits_a_screen_whatever_there_is_to_say(width: int) -> None:
     lines = render(crowded, "text", width=width).splitlines()
     assert len(lines) <= 40
     text = "\n".join(lines)
-    for needed in ("ranges[17]", "<- h", "before it", "reaches", "next: ", "job.yaml"):
+    for needed in ("ranges[17]", "<- h", "before it", "affects", "next: ", "job.yaml"):
         assert needed in text, needed
     # only what names the two files (a digest must not be cut) and commands may be wider
     wide = [row for row in lines if len(row) > width]
@@ -418,7 +422,7 @@ def crowd(diff: Diff) -> Diff:
     others = tuple(event(i, i, PLAN) for i in range(61, 81))
     found = dataclasses.replace(
         found,
-        what=RaisedInOne("no " * 200),
+        what=ExceptionInOneRun("no " * 200),
         chain=(step,) * 15 + found.chain[1:],
         messages=found.messages * 6,
         before_a=events,
@@ -495,7 +499,9 @@ def test_what_a_file_says_cannot_steer_a_terminal_or_a_build(case: str, form: st
 def test_junit_is_well_formed_whatever_the_sentence(sentence: str) -> None:
     plain, told = (
         ElementTree.fromstring(
-            render(dataclasses.replace(missing(), outcome=Diverged(None, (each, "ab c"))), "junit")
+            render(
+                dataclasses.replace(missing(), outcome=RunsDiverge(None, (each, "ab c"))), "junit"
+            )
         )
         for each in ("x", sentence or "x")
     )

@@ -24,7 +24,7 @@ from rsltrace.run.plans.faults import (  # noqa: E402
     changer,
     check_changes,
 )
-from rsltrace.search.explore.outcome import Wants  # noqa: E402
+from rsltrace.search.explore.outcome import TrialOptions  # noqa: E402
 from rsltrace.search.explore.strategies.faults import FaultWalk  # noqa: E402
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult  # noqa: E402
 from rsltrace.search.explore.workers import Worker  # noqa: E402
@@ -89,7 +89,7 @@ def test_forked_runs_of_bags_that_change_are_those_from_the_beginning(tmp_path: 
     source = JobSource(str(BUGS / "bags" / "nan_poisons_average" / "job.yaml"))
     change = {"change": "/range", "field": "range", "value": "nan"}
     with Worker(source) as worker:
-        worker.run(Trial(0, {}), tmp_path / "plain.mcap", Wants(), 300)
+        worker.run(Trial(0, {}), tmp_path / "plain.mcap", TrialOptions(), 300)
         for number, (fault, is_forked) in enumerate(
             [
                 ({**change, "message": 30}, True),
@@ -101,7 +101,7 @@ def test_forked_runs_of_bags_that_change_are_those_from_the_beginning(tmp_path: 
         ):
             trial = Trial(number, {"faults": [fault]})
             forked, whole = (tmp_path / f"{name}{number}.mcap" for name in ("forked", "whole"))
-            found = worker.run(trial, forked, Wants(keep=True, fork_ns=1_000_000_000), 300)
+            found = worker.run(trial, forked, TrialOptions(keep=True, fork_ns=1_000_000_000), 300)
             assert found.is_forked == is_forked, found.why_not_forked
-            worker.run(trial, whole, Wants(keep=True), 300)
+            worker.run(trial, whole, TrialOptions(keep=True), 300)
             assert forked.read_bytes() == whole.read_bytes()

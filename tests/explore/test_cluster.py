@@ -15,7 +15,7 @@ import pytest
 
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.cluster import bundle_of
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 
 pytest.importorskip("distributed", reason="needs Dask: pip install 'rsltrace[explore]'")
@@ -180,7 +180,7 @@ def test_workers_that_die_lose_nothing_and_runs_are_those_of_this_machine(
             assert time.monotonic() < end
             while waiting and cluster.idle > 0:
                 trial = waiting.pop()
-                cluster.submit(trial, tmp_path / f"{trial.number}.mcap", Wants())
+                cluster.submit(trial, tmp_path / f"{trial.number}.mcap", TrialOptions())
             for one in cluster.results(5):
                 assert one.trial.number not in found
                 found[one.trial.number] = one
@@ -191,7 +191,7 @@ def test_workers_that_die_lose_nothing_and_runs_are_those_of_this_machine(
     assert not list(tmp_path.glob("dask/**/rsltrace-*/*")) or dask.workers[0].poll() is not None
     with Worker(source) as here:
         for trial in asked[:6]:
-            local = here.run(trial, tmp_path / "local.mcap", Wants())
+            local = here.run(trial, tmp_path / "local.mcap", TrialOptions())
             there = found[trial.number]
             assert there.digest == local.digest
             assert there.failure == local.failure

@@ -49,9 +49,9 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     assert json.loads(shown.stdout)["causes"][0]["key"] == "the second comes last"
     refused = command("explore", job, "--budget", 60, "-o", folder)
     assert refused.returncode == 2
-    assert "--resume goes on with it" in refused.stderr
+    assert "--resume continues it" in refused.stderr
     other = command("explore", job, "--resume", "--strategy", "pct", "-o", folder)
-    assert "its search was another one (strategy differs)" in other.stderr
+    assert "has a different search (strategy differs)" in other.stderr
     (folder / "mine.txt").touch()
     words = ["--set", "checks=[]", "--budget", 1, "--force"]
     replaced = command("explore", job, *words, "-o", folder)

@@ -9,13 +9,12 @@ from typing import Any
 
 import pytest
 
-from rsltrace.search.explore.kept_traces import KeptTraces
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.search import Budget, Search
 from rsltrace.search.explore.small.causes import make_small
 from rsltrace.search.explore.strategies.named import RandomWalk
 from rsltrace.search.explore.table import Table, rows
-from rsltrace.search.explore.trial import CHECK, Failure, JobSource, Trial, TrialResult
+from rsltrace.search.explore.trial import CHECK, Failure, JobSource, KeptTraces, Trial, TrialResult
 
 _TRIALS = 8
 
@@ -36,7 +35,7 @@ class Late:
         return len(self._under_way)
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         self._under_way[trial.number] = (trial, trace)
 

@@ -14,7 +14,7 @@ import pytest
 from campaigns.explore.suite import all_bugs
 from rsltrace.errors import ExploreError
 from rsltrace.job import job_from_text
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.faults import FaultWalk
 from rsltrace.search.explore.strategies.named import strategy_named
 from rsltrace.search.explore.strategies.strategy import choices_left
@@ -44,12 +44,12 @@ def alike(write_job: Callable[[str, str], Path]) -> Iterator[Worker]:
     """A worker that has loaded what a run needs: its first run is never forked."""
     source = JobSource(str(write_job("alike", JOB)))
     with Worker(source) as one:
-        one.run(Trial(0, {}), Path(source.path).with_suffix(".mcap"), Wants(), 300)
+        one.run(Trial(0, {}), Path(source.path).with_suffix(".mcap"), TrialOptions(), 300)
         yield one
 
 
 def _both(
-    worker: Worker, number: int, overlay: dict[str, Any], wants: Wants, folder: Path
+    worker: Worker, number: int, overlay: dict[str, Any], wants: TrialOptions, folder: Path
 ) -> TrialResult:
     """Run a trial forked and from the beginning; both have to be equal. Return the first."""
     forked, whole = (folder / f"{name}{number}.mcap" for name in ("forked", "whole"))
@@ -64,7 +64,7 @@ def _both(
 
 @pytest.mark.long
 def test_a_forked_run_is_the_one_from_the_beginning(alike: Worker, tmp_path: Path) -> None:
-    wants = Wants(keep=True, behaviours=True, steps=True, fork_ns=ALIKE_NS)
+    wants = TrialOptions(keep=True, behaviours=True, steps=True, fork_ns=ALIKE_NS)
     digests = set()
     for number, (overlay, why) in enumerate(OVERLAYS):
         found = _both(alike, number, overlay, wants, tmp_path)
@@ -80,7 +80,7 @@ def test_strategies_leave_the_beginning_as_it_is(alike: Worker, tmp_path: Path) 
     plain = alike.run(
         Trial(0, {"policy": {"departures": []}}),
         tmp_path / "plain.mcap",
-        Wants(keep=True, behaviours=True, steps=True, fork_ns=ALIKE_NS),
+        TrialOptions(keep=True, behaviours=True, steps=True, fork_ns=ALIKE_NS),
         300,
     )
     assert 0 < plain.choices_before < plain.choices
@@ -102,7 +102,7 @@ def test_strategies_leave_the_beginning_as_it_is(alike: Worker, tmp_path: Path) 
         assert number > 3
     with pytest.raises(ExploreError, match="no choice of what runs next after that time"):
         choices_left(replace(plain, choices_before=plain.choices))
-    with pytest.raises(ExploreError, match="ends before runs would be forked"):
+    with pytest.raises(ExploreError, match="ends before the time of --fork-after"):
         FaultWalk(job, fork_ns=10**9).begin(plain)
     with pytest.raises(ExploreError, match="runs with other settings differ"):
         strategy_named("vary", job, fork_after=("1s", 10**9))
@@ -125,7 +125,7 @@ def test_a_search_forks_and_what_it_finds_is_repeated_from_the_beginning(
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
     assert repeated.returncode == 1
     refused = command("explore", job, "--resume", "--fork-after", "0.5s", "-o", tmp_path / "found")
-    assert "its search was another one (fork after differs)" in refused.stderr
+    assert "has a different search (fork after differs)" in refused.stderr
 
 
 BEYOND = {
@@ -159,7 +159,7 @@ def test_what_cannot_be_copied_is_run_from_the_beginning(
     )
     job = write_job("beyond", JOB.replace("nodes_under_search:Last", f"{module}:Last"))
     job.write_text(f"{job.read_text()}search_path: ['.', {tmp_path}]\nguard: false\n")
-    wants = Wants(keep=True, fork_ns=ALIKE_NS)
+    wants = TrialOptions(keep=True, fork_ns=ALIKE_NS)
     overlay = {"policy": {"departures": [{"choice": 19, "run": 1}]}}
     with Worker(JobSource(str(job))) as worker:
         worker.run(Trial(0, {}), tmp_path / "plain.mcap", wants, 300)
@@ -175,7 +175,7 @@ def test_what_cannot_be_copied_is_run_from_the_beginning(
 @pytest.mark.parametrize("bug", all_bugs()[::20], ids=lambda bug: bug.name)
 def test_the_suite_of_bugs_forks_in_the_middle(bug: Any, tmp_path: Path) -> None:
     source = JobSource(str(bug.job))
-    wants = Wants(keep=True, behaviours=True, steps=True)
+    wants = TrialOptions(keep=True, behaviours=True, steps=True)
     with Worker(source) as worker:
         plain = worker.run(
             Trial(0, {"policy": {"departures": []}}), tmp_path / "p.mcap", wants, 300

@@ -14,9 +14,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.small.causes import write_small
-from rsltrace.search.explore.small.reduction import Reduced, Reduction, ddmin
+from rsltrace.search.explore.small.reduction import ReducedTrial, TrialReduction, ddmin
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
 from rsltrace.trace.reader import Trace
@@ -121,14 +121,16 @@ def robot(searched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def small(
     robot: Path, overlay: dict[str, Any], job: str = "job.yaml"
-) -> tuple[TrialResult, Reduced]:
+) -> tuple[TrialResult, ReducedTrial]:
     source = JobSource(str(robot / job))
     scratch = robot.parent / "scratch"
     scratch.mkdir(exist_ok=True)
     with Worker(source) as worker:
-        given = worker.run(Trial(7, overlay, "found"), scratch / "given.mcap", Wants(keep=True))
+        given = worker.run(
+            Trial(7, overlay, "found"), scratch / "given.mcap", TrialOptions(keep=True)
+        )
         assert given.failure is not None, overlay
-        return given, Reduction(source, given, worker, scratch).reduce()
+        return given, TrialReduction(source, given, worker, scratch).reduce()
 
 
 def failing_seed(robot: Path) -> dict[str, Any]:
@@ -136,7 +138,7 @@ def failing_seed(robot: Path) -> dict[str, Any]:
         for seed in range(100):
             overlay = {"seed": seed, "policy": "permutation"}
             trace = robot.parent / "seed.mcap"
-            if worker.run(Trial(seed, overlay), trace, Wants()).failure is not None:
+            if worker.run(Trial(seed, overlay), trace, TrialOptions()).failure is not None:
                 return overlay
     raise AssertionError("no order fails")
 

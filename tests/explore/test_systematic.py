@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.systematic import Systematic
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
@@ -50,7 +50,9 @@ def compare(path: Path, tmp_path: Path) -> tuple[Systematic, dict[str, int]]:
 
         def run(departures: list[dict[str, int]]) -> TrialResult:
             trial = Trial(0, {"policy": {"departures": departures}})
-            found = worker.run(trial, tmp_path / "run.mcap", Wants(behaviours=True, steps=True))
+            found = worker.run(
+                trial, tmp_path / "run.mcap", TrialOptions(behaviours=True, steps=True)
+            )
             assert found.failure is None
             return found
 

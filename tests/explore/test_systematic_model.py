@@ -8,7 +8,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from rsltrace.search.explore.strategies.systematic import Systematic
-from rsltrace.search.explore.trial import Step, Trial, TrialResult
+from rsltrace.search.explore.trial import Trial, TrialResult, TrialStep
 from tests.tiers import cases
 
 NODES = 3
@@ -25,7 +25,7 @@ def run(model: Model, begin: list[int], departures: dict[int, int]) -> TrialResu
     queues: dict[int, list[int]] = {}
     ready: list[int] = []
     counts = [0] * len(model)
-    steps: list[Step] = []
+    steps: list[TrialStep] = []
     order: list[tuple[int, int]] = []
 
     def arrive(callback: int, message: int) -> None:
@@ -52,7 +52,7 @@ def run(model: Model, begin: list[int], departures: dict[int, int]) -> TrialResu
             touches[f"t{target}"] = True
             arrive(target, values[node])
         counts[callback] += 1
-        steps.append(Step(tuple(names), chosen, 0, touches, "begin"))
+        steps.append(TrialStep(tuple(names), chosen, 0, touches, "begin"))
     overlay = {"policy": {"departures": [{"choice": c, "run": r} for c, r in departures.items()]}}
     trial = Trial(0, overlay)
     return TrialResult(trial, final_state=str(values), order=tuple(order), steps=tuple(steps))

@@ -13,7 +13,7 @@ import pytest
 
 from rsltrace.errors import ExploreError
 from rsltrace.job import load_job
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import JobSource, Trial, overrides_of, result_of
 from rsltrace.search.explore.workers import Worker
 
@@ -34,7 +34,7 @@ def test_a_trial_is_the_record_of_its_written_out_job(
     digests = []
     for number, overlay in enumerate(OVERLAYS):
         trial = Trial(number, overlay)
-        found = worker.run(trial, tmp_path / f"{number}.mcap", Wants())
+        found = worker.run(trial, tmp_path / f"{number}.mcap", TrialOptions())
         assert found.failure is None
         assert found.trace is None
         assert not list(tmp_path.glob("*.mcap"))
@@ -61,7 +61,7 @@ def test_texts_are_not_replaced_when_they_are_read_again(searched: Path) -> None
 def test_workers_do_not_grow_and_leave_nobody_behind(
     searched: Path, tmp_path: Path, *, forks: bool
 ) -> None:
-    wants = Wants(behaviours=True, fork_ns=50_000_000 if forks else -1)
+    wants = TrialOptions(behaviours=True, fork_ns=50_000_000 if forks else -1)
     with Worker(JobSource(str(searched / "job.yaml"))) as worker:
         sizes = []
         for number in range(60):
@@ -98,10 +98,10 @@ def _rss_kb(pid: object) -> int:
 def test_a_worker_that_dies_is_replaced_and_its_trial_made_again(
     worker: Worker, tmp_path: Path
 ) -> None:
-    first = worker.run(Trial(0, {}), tmp_path / "run.mcap", Wants())
+    first = worker.run(Trial(0, {}), tmp_path / "run.mcap", TrialOptions())
     assert worker._process is not None
     os.kill(worker._process.pid, signal.SIGKILL)
-    again = worker.run(Trial(1, {}), tmp_path / "run.mcap", Wants())
+    again = worker.run(Trial(1, {}), tmp_path / "run.mcap", TrialOptions())
     assert again.failure is None
     assert again.digest == first.digest
 
@@ -109,4 +109,4 @@ def test_a_worker_that_dies_is_replaced_and_its_trial_made_again(
 def test_a_job_that_cannot_run_is_no_result(worker: Worker, tmp_path: Path) -> None:
     wrong = Trial(5, {"set": {"nodes.0.node": "nodes_under_search:Nobody"}}, "a wrong node")
     with pytest.raises(ExploreError, match=r"trial 5 \(a wrong node\): .*Nobody"):
-        worker.run(wrong, tmp_path / "run.mcap", Wants())
+        worker.run(wrong, tmp_path / "run.mcap", TrialOptions())

@@ -190,7 +190,7 @@ def test_diff_tells_content_from_timing(tmp_path: Path, command: Any) -> None:
     assert simulated.returncode == 0, simulated.stderr
     same = command("diff", "native.mcap", "simulated.mcap")
     assert same.returncode == 3, same.stdout
-    assert "contents are the same but for times" in same.stdout
+    assert "messages are the same except for times" in same.stdout
     assert "verdict: same-content" in same.stdout
     differs = command("diff", "run.mcap", "native.mcap", "--format", "json")
     assert differs.returncode == 1

@@ -23,7 +23,7 @@ from rsltrace_viewer.rerun_export.messages.trails import Track
 
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.remarks import DifferentJobs
-from rsltrace.diff.result import Diff, Side
+from rsltrace.diff.result import ComparedRun, Diff
 
 S = 1_000_000_000
 
@@ -195,7 +195,7 @@ def test_lists_are_cut_by_their_counts() -> None:
 
 
 def test_texts_of_a_trace_are_no_markdown() -> None:
-    side = Side("a```.mcap", "0" * 16, 1, 2, True)
+    side = ComparedRun("a```.mcap", "0" * 16, 1, 2, True)
     diff = Diff(
         side,
         side,

@@ -180,7 +180,7 @@ def test_a_job_that_is_not_here_is_not_offered(here: Path, name: str) -> None:
     (here.parent / "job.yaml").write_text("nodes: []\n")
     command, warning = _again(name)
     assert command == ""
-    assert "was made elsewhere: its job" in warning
+    assert "no command to reproduce this: the job" in warning
 
 
 def test_another_job_of_that_name_is_told(here: Path) -> None:
@@ -188,7 +188,7 @@ def test_another_job_of_that_name_is_told(here: Path) -> None:
     assert record_again(mine).warnings == ()  # type: ignore[arg-type]
     theirs = record_again(_Job("job.yaml", "nodes: [x]\n"))  # type: ignore[arg-type]
     assert theirs.command == "rsltrace record job.yaml"
-    assert "was made elsewhere, or the job has been changed" in remark_text(theirs.warnings[0])
+    assert "or the trace is of another job" in remark_text(theirs.warnings[0])
 
 
 @pytest.mark.parametrize("name", ["", "<python>"])
@@ -240,7 +240,7 @@ class Fragile(Listener):
     assert rsltrace("record", "job.yaml", "-o", "b.mcap").returncode == 3
     late = ("--set", "delay.default.constant=10ms", "--until", "2")
     assert rsltrace("record", "job.yaml", "-o", "a.mcap", *late).returncode == 0
-    note = "ended by an exception: /listener: subscription /numbers raised AssertionError, event "
+    note = "ended with an exception (event "
     assert f"\nnote: b {note}" in rsltrace("diff", "a.mcap", "b.mcap").stdout
     assert f"\nnote: a {note}" in rsltrace("diff", "b.mcap", "a.mcap").stdout
     several = rsltrace("diff", "a.mcap", "a.mcap", "b.mcap").stdout

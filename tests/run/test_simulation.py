@@ -346,8 +346,8 @@ def test_the_same_driver_gives_the_same_trace(simulate: Any, tmp_path: Path) -> 
         ),
         (
             lambda sim: sim.call(sim.node("echo").say, 5),  # of two at one time, by their names
-            "what outside did at 1.0 s happened only in b; a went on with the message from outside "
-            "on /numbers at 1.0 s",
+            "what outside did at 1.0 s happened only in b; a continued with the message from "
+            "outside on /numbers at 1.0 s",
         ),
         (lambda sim: None, "the message from outside on /numbers at 1.0 s happened only in a"),
     ],

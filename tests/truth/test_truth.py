@@ -83,9 +83,7 @@ def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
         return replace(found, agreeing=found.agreeing + 1)
 
     monkeypatch.setattr(Diff, "sentence", property(lambda self: "something differs"))
-    monkeypatch.setattr(
-        Divergence, "root_sentence", property(lambda self: "chance decided otherwise")
-    )
+    monkeypatch.setattr(Divergence, "root_sentence", property(lambda self: "random draws differ"))
     monkeypatch.setattr(oracle, "diff", lying)
     (outcome,) = try_cases([("value, in code", 0)])
     assert {"index", "first line", "cause", "blame", "values"} <= {c.what for c in outcome.wrong}

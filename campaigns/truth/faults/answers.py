@@ -51,7 +51,7 @@ def answer(rng: random.Random) -> Planted:
 @fault("answer on a socket that is not recorded")
 def unrecorded(rng: random.Random) -> Planted:
     a, b, truth = _asked(rng, "warn", "ask({port})")
-    first = (r"possible cause: what came back from socket\.connect.* at .*\.py:\d+",)
+    first = (r"possible cause: the result of socket\.connect.* at .*\.py:\d+",)
     return Planted(a, b, replace(truth, first=first, says=(r"not deterministic",)))
 
 
@@ -191,5 +191,5 @@ def seed(rng: random.Random) -> Planted:
     a.environment["TRUTH_SEED"] = "1"
     b = a.copy()
     b.environment["TRUTH_SEED"] = "2"
-    first = (rf"{LIKELY}{node.full_name} read TRUTH_SEED, 1 in a and 2 in b",)
+    first = (rf"{LIKELY}{node.full_name} read TRUTH_SEED \(1 in a, 2 in b\)",)
     return Planted(a, b, replace(_truth(node), first=first))

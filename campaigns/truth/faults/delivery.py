@@ -71,7 +71,7 @@ def depth(rng: random.Random) -> Planted:
             ("missing",),
             receiver.full_name,
             "/burst",
-            first=(rf"queue of {shallow} overflowed",),
+            first=(rf"queue \(depth {shallow}\) overflowed",),
             says=(rf"code of module {receiver.module}",),
             never=NEVER,
         ),
@@ -149,7 +149,7 @@ _changed_setup(
     "drain",
     SUBSCRIBED,
     '"/burst", self.heard, QoSProfile(depth=3, history=HistoryPolicy.KEEP_LAST))',
-    r"queue of 3 overflowed",
+    r"queue \(depth 3\) overflowed",
 )
 _changed_setup(
     "another type on a topic",

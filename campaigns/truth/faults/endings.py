@@ -48,7 +48,7 @@ def constructor(rng: random.Random) -> Planted:
     b.node(node.name).setup.append('raise RuntimeError("planted")')
     truth = Truth(
         ("exception",),
-        first=(r"raised RuntimeError: planted in b and not in a", node.full_name),
+        first=(r"raised an exception only in b: RuntimeError: planted", node.full_name),
         never=NEVER,
     )
     return Planted(a, b, truth)
@@ -96,7 +96,7 @@ def logged(rng: random.Random) -> Planted:
         ("exception",),
         node.full_name,
         node.callbacks[0].entity,
-        first=(r"raised ValueError: planted in b and not in a",),
+        first=(r"raised an exception only in b: ValueError: planted",),
         says=(NOT_DETERMINISTIC,),
     )
     return Planted(a, b, truth)

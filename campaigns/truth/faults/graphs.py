@@ -124,7 +124,7 @@ def extra(rng: random.Random) -> Planted:
     b.job["nodes"].insert(at, {"node": "truth_spare:Spare"})
     truth = Truth(
         GRAPH,
-        first=(r"/spare is constructed in b and not in a",),
+        first=(r"/spare is constructed in b but not in a",),
         says=(r"nodes",),
         never=NEVER,
         independent=None,
@@ -140,7 +140,7 @@ def missing(rng: random.Random) -> Planted:
     b.job["nodes"].remove(b.entry(node.name))
     truth = Truth(
         GRAPH,
-        first=(rf"{node.full_name} is constructed in a and not in b",),
+        first=(rf"{node.full_name} is constructed in a but not in b",),
         says=(r"nodes",),
         never=NEVER,
         independent=None,

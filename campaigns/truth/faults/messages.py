@@ -114,13 +114,13 @@ message(
     "rotated array",
     "Float64MultiArray(data=[1.0, 2.0, 3.0, 4.0])",
     "typed.data = [2.0, 3.0, 4.0, 1.0]",
-    "same elements in another order",
+    "same elements in a different order",
 )
 message(
     "sorted array with equal elements",
     "Float64MultiArray(data=[3.0, 1.0, 3.0, 2.0])",
     "typed.data = sorted(typed.data)",
-    "same elements in another order",
+    "same elements in a different order",
 )
 message(
     "array with one element of another",

@@ -83,7 +83,7 @@ _mixed("slept after", ["time.sleep(0.002)"], "slept 2 ms in b", mark="# after", 
 _mixed(
     "exception",
     ['raise RuntimeError("planted")'],
-    "raised RuntimeError: planted in b and not in a",
+    "raised an exception only in b: RuntimeError: planted",
     verdicts=("exception",),
 )
 _mixed("log", ['self.get_logger().warning("planted")'], 'log WARN "planted" only in b')

@@ -35,7 +35,7 @@ def on_import(rng: random.Random) -> Planted:
     node.top.append(f"READ = {READ}")
     node.callbacks[0].lines.insert(1, "value = value + READ")
     b, value = _another_environment(a, rng)
-    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE, 4 in a and {value} in b, at {node.module}"
+    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE \(4 in a, {value} in b\) at {node.module}"
     return Planted(a, b, replace(_truth(node), first=(words,)))
 
 
@@ -47,7 +47,7 @@ def in_helper(rng: random.Random) -> Planted:
     node.top.append("import truth_helper")
     node.callbacks[0].lines.insert(1, "value = value + truth_helper.READ")
     b, value = _another_environment(a, rng)
-    words = rf"{LIKELY}.* read TRUTH_VALUE, 4 in a and {value} in b, at truth_helper\.py:3"
+    words = rf"{LIKELY}.* read TRUTH_VALUE \(4 in a, {value} in b\) at truth_helper\.py:3"
     return Planted(a, b, replace(_truth(node), first=(words,)))
 
 
@@ -67,7 +67,7 @@ def shows_late(rng: random.Random) -> Planted:
     node.setup.append(f"self.read = {READ}")
     node.callbacks[0].lines.insert(1, f"if self.n == {rng.randint(3, 6)}: value = self.read")
     b, value = _another_environment(a, rng)
-    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE, 4 in a and {value} in b"
+    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE \(4 in a, {value} in b\)"
     return Planted(a, b, replace(_truth(node), first=(words,)))
 
 
@@ -121,7 +121,7 @@ def decides_on_parameter(rng: random.Random) -> Planted:
     node.setup.append(f'self.more = self.declare_parameter("more", {READ}).value')
     node.callbacks[0].lines.insert(1, "value = value + self.more")
     b, value = _another_environment(a, rng)
-    words = rf"{node.full_name} read TRUTH_VALUE, 4 in a and {value} in b, at .*; first effect: "
+    words = rf"{node.full_name} read TRUTH_VALUE \(4 in a, {value} in b\) at .*; first effect: "
     truth = Truth((), node.full_name, first=(words, node.callbacks[0].publishes))
     return Planted(a, b, truth)
 
@@ -137,7 +137,7 @@ def both(rng: random.Random) -> Planted:
     a.environment["TRUTH_UNUSED"] = "here"
     b.environment["TRUTH_UNUSED"] = "there"
     truth = _truth(node)
-    return Planted(a, b, replace(truth, first=(rf"TRUTH_VALUE, 4 in a and {value} in b",)))
+    return Planted(a, b, replace(truth, first=(rf"TRUTH_VALUE \(4 in a, {value} in b\)",)))
 
 
 @fault("file that is missing")
@@ -205,7 +205,7 @@ def set_order(rng: random.Random) -> Planted:
     b = a.copy()
     b.hidden = "fault"
     first = (
-        r"/list\W+data has the same elements in another order",
+        r"/list\W+data has the same elements in a different order",
         rf"{LIKELY}the order of the set self\.things, at {node.module}\.py:\d+",
     )
     return Planted(a, b, replace(_truth(node), first=first, values=""))

@@ -11,7 +11,7 @@ from campaigns.truth.recordings import Recordings
 
 ALWAYS_FALSE = (
     r"different number of times",
-    r"chance decided",
+    r"random draws differ",
     r"told to stop, or had no more to do",
 )
 """What no planted fault but one of chance may be blamed on."""

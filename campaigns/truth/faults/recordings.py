@@ -140,7 +140,7 @@ def ignored(rng: random.Random) -> Planted:
         topic,
         {"ignored": 4},
         "equal-within-tolerance",
-        (r"equal but for what is ignored, not identical: 4 of \d+ messages",),
+        (r"equal except for ignored fields, not identical: 4 of \d+ messages",),
         None,
         options,
     )

@@ -83,7 +83,7 @@ sensor(
     "joints in another order",
     "JointState(name=['left', 'right', 'arm'], position=[0.1, 0.2, 0.3])",
     "sent.name = sent.name[::-1]; sent.position = sent.position[::-1]",
-    "name has the same elements in another order and 1 more field",
+    "name has the same elements in a different order and 1 more field",
 )
 sensor(
     "name of a joint",

@@ -113,7 +113,7 @@ _in(
     "calls: server raises",
     _called(1, "answer"),
     ['raise ValueError("planted")'],
-    "raised ValueError: planted in b and not in a",
+    "raised an exception only in b: ValueError: planted",
     verdicts=("exception",),
     independent=None,
 )

@@ -1,7 +1,7 @@
 """Which event of one run is which of the other, once they have diverged.
 
 Events are matched within one kind of one entity only (see ``match``): the same input at the same
-time from the same cause is surest, "the one that stands in its place" is weakest. What is left over
+time from the same cause is surest, the same position is weakest. What is left over
 is in one run only.
 """
 
@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from rsltrace.diff.alignment.rows import Rows
+from rsltrace.diff.alignment.rows import EventColumns
 from rsltrace.trace.model.event import NO_EVENT
 
 # Matching two sequences of events of one entity: from the surest sign to the weakest.
@@ -81,7 +81,7 @@ def match(a: EventSequence, b: EventSequence, *, surest_only: bool) -> list[Pair
 
 
 def _same_ends(a: EventSequence, b: EventSequence) -> tuple[int, int]:
-    """Return how many events at the beginning and at the end are pairs beyond doubt."""
+    """Return how many events at the beginning and at the end are certainly pairs."""
     most = min(len(a), len(b))
     begin = 0
     while begin < most and _surely(a, b, begin, begin):
@@ -261,8 +261,8 @@ def _can_be(a: When, b: When, limit: int) -> bool:
 
 
 @dataclass
-class Pairs:
-    """Who belongs to whom, by place in the two ``Rows`` (-1: nobody)."""
+class EventPairs:
+    """The partner of each event, by place in the two ``EventColumns`` (-1: none)."""
 
     a: list[int]
     b: list[int]
@@ -303,16 +303,18 @@ class EarlierPairs:
         )
 
 
-def align(a: Rows, b: Rows, past: EarlierPairs, taken_a: set[int], taken_b: set[int]) -> Pairs:
+def align(
+    a: EventColumns, b: EventColumns, past: EarlierPairs, taken_a: set[int], taken_b: set[int]
+) -> EventPairs:
     """Match the events of two blocks. Those whose indexes are in ``taken_a`` and ``taken_b``
     have partners in an earlier block and are left alone."""
     groups = _groups(a, b, taken_a, taken_b)
-    pairs = Pairs([], [])
+    pairs = EventPairs([], [])
     # The partner of an event's cause is a strong sign, and known only when causes are matched: so
-    # what is certain without it comes first, and then everything is matched anew with it.
+    # what is certain without it comes first, and then everything is matched again with it.
     for surest_only in (True, False, False):
         causes_a, causes_b = _causes(a, b, pairs, past)
-        pairs = Pairs([-1] * len(a), [-1] * len(b))
+        pairs = EventPairs([-1] * len(a), [-1] * len(b))
         for places_a, places_b in groups:
             sequence_a, sequence_b = (
                 _sequence(a, causes_a, places_a),
@@ -324,7 +326,7 @@ def align(a: Rows, b: Rows, past: EarlierPairs, taken_a: set[int], taken_b: set[
     return pairs
 
 
-def _sequence(rows: Rows, causes: list[int], places: list[int]) -> EventSequence:
+def _sequence(rows: EventColumns, causes: list[int], places: list[int]) -> EventSequence:
     stamp, input_, nth = rows.stamp, rows.input, rows.cause_output
     return EventSequence(
         stamp=[stamp[place] for place in places],
@@ -335,7 +337,7 @@ def _sequence(rows: Rows, causes: list[int], places: list[int]) -> EventSequence
 
 
 def _groups(
-    a: Rows, b: Rows, taken_a: set[int], taken_b: set[int]
+    a: EventColumns, b: EventColumns, taken_a: set[int], taken_b: set[int]
 ) -> list[tuple[list[int], list[int]]]:
     groups: dict[tuple[int, int], tuple[list[int], list[int]]] = {}
     for rows, taken, side in ((a, taken_a, 0), (b, taken_b, 1)):
@@ -345,7 +347,9 @@ def _groups(
     return [group for group in groups.values() if group[0] and group[1]]
 
 
-def _causes(a: Rows, b: Rows, pairs: Pairs, past: EarlierPairs) -> tuple[list[int], list[int]]:
+def _causes(
+    a: EventColumns, b: EventColumns, pairs: EventPairs, past: EarlierPairs
+) -> tuple[list[int], list[int]]:
     """Return the causes of all events as indexes in a, so that equal causes are equal numbers.
 
     NO_CAUSE for events without one, UNKNOWN where the cause has (as yet) no counterpart.

@@ -86,7 +86,7 @@ class _Column:
         return int(self._room[place]) if 0 <= place < self.count else _NONE
 
 
-class _Side:
+class _RunRows:
     """What is known of one run. Offsets count from the first difference."""
 
     def __init__(self, count: int, agreeing: int) -> None:
@@ -118,7 +118,7 @@ class AlignedRows:
         """Changes whenever rows do."""
         self.shifted = False
         """Whether an event is known that both runs have, but not at the same time."""
-        self._a, self._b = _Side(count_a, agreeing), _Side(count_b, agreeing)
+        self._a, self._b = _RunRows(count_a, agreeing), _RunRows(count_b, agreeing)
         self._signs = _Column()
         self._pairs = _Column()
         """By offset of the event in a: sign and _SAME_TIME of the pair that it is half of."""
@@ -305,7 +305,7 @@ class AlignedRows:
         chosen = np.flatnonzero(fits)[_increasing(pair_b[fits])]
         return pair_a[chosen], pair_b[chosen]
 
-    def _partners(self, side: _Side, indexes: Ints) -> Ints:
+    def _partners(self, side: _RunRows, indexes: Ints) -> Ints:
         if len(indexes):
             side.partners.extend_to(int(indexes[-1]) + 1 - self.agreeing)
         return side.partners.values[indexes - self.agreeing]

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.alignment.align import EarlierPairs, Pairs, align
+from rsltrace.diff.alignment.align import EarlierPairs, EventPairs, align
 from rsltrace.diff.alignment.rows import (
     CONSTRUCT,
     SHUTDOWN,
-    Rows,
+    EventColumns,
     Run,
     load_rows,
     longest_increasing,
@@ -59,8 +59,8 @@ class AlignedBlock:
     """A part of both runs. ``items`` are in the order of events; ``end_a`` and ``end_b`` are the
     indexes up to which the runs are aligned after it. ``rows`` reach a little further."""
 
-    rows_a: Rows
-    rows_b: Rows
+    rows_a: EventColumns
+    rows_b: EventColumns
     items: list[EventPair]
     end_a: int
     end_b: int
@@ -141,7 +141,7 @@ class AlignedBlocks:
 
     def _next(
         self, first_a: int, first_b: int, past: EarlierPairs, taken_a: set[int], taken_b: set[int]
-    ) -> tuple[AlignedBlock, Pairs]:
+    ) -> tuple[AlignedBlock, EventPairs]:
         events, margin = self.events, max(_MARGIN_MIN, self.events // 4)
         while True:
             rows_a = load_rows(self.run_a, first_a, first_a + events + margin)
@@ -149,7 +149,7 @@ class AlignedBlocks:
             end_a, end_b = _cuts(rows_a, rows_b, events)
             if end_a > 0 or end_b > 0 or not (len(rows_a) or len(rows_b)):
                 break
-            events *= 4  # everything at one time: look further, or there would be no progress
+            events *= 4  # all at one time: read more, or there would be no progress
         pairs = align(rows_a, rows_b, past, taken_a, taken_b)
         items = _items(rows_a, rows_b, pairs, end_a, end_b, taken_a, taken_b)
         block = AlignedBlock(rows_a, rows_b, items, first_a + end_a, first_b + end_b)
@@ -187,7 +187,7 @@ def equal_block(run_a: Run, run_b: Run, first_a: int, first_b: int) -> EqualBloc
     return EqualBlock(first_a, first_b, counts, first_a + done, first_b + done)
 
 
-def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
+def _cuts(a: EventColumns, b: EventColumns, events: int) -> tuple[int, int]:
     """Return how many events of each belong to the block: all before some common time."""
     limits = []
     for rows in (a, b):
@@ -202,9 +202,9 @@ def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
 
 
 def _items(
-    a: Rows,
-    b: Rows,
-    pairs: Pairs,
+    a: EventColumns,
+    b: EventColumns,
+    pairs: EventPairs,
     end_a: int,
     end_b: int,
     taken_a: set[int],
@@ -243,7 +243,7 @@ def _items(
     return [item for _, _, _, item in keyed]
 
 
-def _spine(a: Rows, b: Rows, pairs: Pairs) -> frozenset[int]:
+def _spine(a: EventColumns, b: EventColumns, pairs: EventPairs) -> frozenset[int]:
     """Return the places in b of as many pairs as can be that are in the same order in both runs,
     have the same input and happened at the same time: what the rest is ordered by."""
     times_a, times_b = a.times, b.times
@@ -259,7 +259,7 @@ def _spine(a: Rows, b: Rows, pairs: Pairs) -> frozenset[int]:
     )
 
 
-def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> EventPair:
+def _pair(a: EventColumns, b: EventColumns, place_a: int, place_b: int) -> EventPair:
     same = (
         a.stamp[place_a] == b.stamp[place_b]
         and a.input[place_a] == b.input[place_b]
@@ -277,7 +277,7 @@ def _mark_inversions(block: AlignedBlock) -> None:
     for item in block.items:
         if item.a >= 0 and item.b >= 0:
             i, j = item.a - a.first, item.b - b.first
-            # What only stands in another's place, with another input, has no order of its own.
+            # A pair with different inputs matches by position only: its order says nothing.
             if a.stamp[i] == b.stamp[j] and a.input[i] == b.input[j]:
                 moments.setdefault(a.stamp[i], []).append(item)
     for items in moments.values():
@@ -285,7 +285,7 @@ def _mark_inversions(block: AlignedBlock) -> None:
 
 
 def mark_inverted(items: list[EventPair]) -> None:
-    """Set ``inverted`` of pairs of one time that stand in another order in b than in a."""
+    """Set ``inverted`` of pairs at one time that are in a different order in b."""
     items.sort(key=lambda item: item.a)
     order = [item.b for item in items]
     if all(early < late for early, late in itertools.pairwise(order)):
@@ -302,7 +302,7 @@ def mark_inverted(items: list[EventPair]) -> None:
 
 def _mark_beyond(block: AlignedBlock) -> None:
     """Mark what one run did after the other had ended. Shutting nodes down is not doing, and a
-    run that goes on to a later time without an event has not ended."""
+    run that continues to a later time without an event has not ended."""
     for rows, other, end, of_b in (
         (block.rows_a, block.rows_b, block.end_b, False),
         (block.rows_b, block.rows_a, block.end_a, True),

@@ -1,7 +1,7 @@
 """Which entity of one run is which of the other.
 
 Ids count up in creation order, so one entity more shifts all ids after it. Entities are therefore
-matched by what they are: node, kind, name and type, and their number among those that are alike.
+matched by what they are: node, kind, name and type, and their number among equal ones.
 Everything behind this module speaks of *numbers*, which mean the same entity in both runs.
 """
 
@@ -29,7 +29,7 @@ class EntityMatching:
     ``keys`` and ``nodes`` (the number of the owning node) go by number; ``numbers_a`` and
     ``numbers_b`` give the number of an id, shape (largest id + 1,), -1 where there is no entity.
     ``same_ids`` says that no id means something else in the other run. ``renamed`` are the mains
-    that are called otherwise in b: names in a and b.
+    that have another name in b: names in a and b.
     """
 
     keys: tuple[EntityKey, ...]

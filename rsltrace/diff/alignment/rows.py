@@ -1,7 +1,7 @@
 """A block of one run as plain columns, in terms that mean the same in both runs.
 
-Entities are numbers (see ``entity_matching``), and an event's *content* stands for its outputs: the
-trace's own output hash, or one made anew where the ids in it differ between the runs.
+Entities are numbers (see ``entity_matching``), and an event's *content* represents its outputs: the
+trace's own output hash, or a new one where the ids in it differ between the runs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import Draw, EventKind, OutputKind, encode_draw
 from rsltrace.trace.reader import Trace
 
-# Where two runs diverge: a binary search over chain hashes, which stand for all that came before.
+# Where two runs diverge: a binary search over chain hashes, which cover all events before.
 #
 # Both files carry the chain hash at the end of each segment. Where they end a segment at the same
 # event, as two recordings of one job do, no event is read until the one segment is found that
@@ -149,7 +149,7 @@ OF_THEIR_OWN = (EntityKind.MAIN.label, EntityKind.THREAD.label)
 
 
 @dataclass
-class Rows:
+class EventColumns:
     """The events ``first <= index < first + len(stamp)`` of a run, as columns.
 
     ``number`` is the entity, ``owner`` what a difference in this event may change for later ones:
@@ -224,7 +224,7 @@ def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
     return rows
 
 
-def load_rows(run: Run, first: int, last: int) -> Rows:
+def load_rows(run: Run, first: int, last: int) -> EventColumns:
     """Read the events ``first <= index < last`` (as far as there are such) of a run."""
     columns: dict[str, list[int]] = {name: [] for name in _COLUMNS}
     numbers: list[int] = []
@@ -234,7 +234,7 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
             values += part[name].tolist()
     nodes = run.matching.nodes
     stateful = {n: n for n, key in enumerate(run.matching.keys) if key.kind in OF_THEIR_OWN}
-    rows = Rows(
+    rows = EventColumns(
         run=run,
         first=first,
         at_end=first + len(numbers) >= run.trace.event_count,
@@ -270,7 +270,7 @@ _COLUMNS = (
 ).split()
 
 
-def _constructed(rows: Rows, place: int) -> int:
+def _constructed(rows: EventColumns, place: int) -> int:
     """Return the number of the first node that a constructor made (0: none)."""
     keys = rows.run.matching.keys
     for kind, number, _, _ in rows.outputs(rows.first + place):

@@ -18,11 +18,23 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
-from rsltrace.diff.bags.messages import Fetched, TopicPair, compare_topic
+from rsltrace.diff.bags.messages import FetchedMessages, TopicPair, compare_topic
 from rsltrace.diff.bags.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
-from rsltrace.diff.bags.source import Source, SourceTopic, open_source, source_of
-from rsltrace.diff.facts.bags import BagVerdict, LoneTopic, MessageDivergence, Recording, TopicDiff
-from rsltrace.diff.facts.remarks import ComparedByBytes, LogTimesIgnored, OtherType, Remark, Told
+from rsltrace.diff.bags.source import RecordingSource, SourceTopic, open_source, source_of
+from rsltrace.diff.facts.bags import (
+    BagVerdict,
+    ComparedRecording,
+    LoneTopic,
+    MessageDivergence,
+    TopicDiff,
+)
+from rsltrace.diff.facts.remarks import (
+    DifferentType,
+    LogTimesIgnored,
+    ReaderNote,
+    Remark,
+    UndecodedMessages,
+)
 from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.result import BagDiff
 from rsltrace.diff.values.fields import fields_of
@@ -141,28 +153,28 @@ def diff_bags(
     """
     options = options or DiffOptions()
     with open_source(a) as source_a, open_source(b) as source_b:
-        return _Comparison(source_a, source_b, options).run()
+        return _BagComparison(source_a, source_b, options).run()
 
 
 def compare_messages(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
     """Compare all messages, requests and responses of two traces; those of one time belong
     together. Reads all of both. Raises TraceError where they are damaged."""
     options = replace(options, by=BY_STAMP, topics=(), nodes=())
-    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+    return _BagComparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
 def compare_content(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
     """Compare all messages, requests and responses of two traces, topic by topic and in the order
     of each, whatever their times. Reads all of both. Raises TraceError where they are damaged."""
-    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+    return _BagComparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
-class _Comparison:
-    def __init__(self, a: Source, b: Source, options: DiffOptions) -> None:
+class _BagComparison:
+    def __init__(self, a: RecordingSource, b: RecordingSource, options: DiffOptions) -> None:
         self._a, self._b = a, b
         self._options = options
         self._pairs, self._lone_a, self._lone_b = _paired(a, b, options)
-        self._remarks: list[Remark] = [Told(note) for note in (*a.notes, *b.notes)]
+        self._remarks: list[Remark] = [ReaderNote(note) for note in (*a.notes, *b.notes)]
 
     def run(self) -> BagDiff:
         scans_a, scans_b = self._scan(self._a, 0), self._scan(self._b, 1)
@@ -189,7 +201,7 @@ class _Comparison:
         lone_b = tuple(_lone(self._b.topics[j], scans_b[j]) for j in self._lone_b)
         return self._result(recording_a, recording_b, topics, lone_a, lone_b)
 
-    def _scan(self, source: Source, side: int) -> dict[int, _Scan]:
+    def _scan(self, source: RecordingSource, side: int) -> dict[int, _Scan]:
         lone = (self._lone_a, self._lone_b)[side]
         wanted = {pair[side] for pair in self._pairs} | set(lone)
         scans = {number: _Scan() for number in sorted(wanted)}
@@ -240,10 +252,10 @@ class _Comparison:
                         full[place] = everything.key(message)
                     keys[place] = maker.key(message)
                 except TraceError as error:
-                    self._note(ComparedByBytes(str(error)))
+                    self._note(UndecodedMessages(str(error)))
 
     def _compare(self, pairs: list[TopicPair], starts: tuple[int, int]) -> list[TopicDiff]:
-        fetched = Fetched(self._a, self._b, pairs, self._options)
+        fetched = FetchedMessages(self._a, self._b, pairs, self._options)
         return [compare_topic(pair, fetched, starts, self._options) for pair in pairs]
 
     def _note(self, remark: Remark) -> None:
@@ -252,8 +264,8 @@ class _Comparison:
 
     def _result(
         self,
-        a: Recording,
-        b: Recording,
+        a: ComparedRecording,
+        b: ComparedRecording,
         topics: tuple[TopicDiff, ...],
         lone_a: tuple[LoneTopic, ...],
         lone_b: tuple[LoneTopic, ...],
@@ -266,12 +278,12 @@ class _Comparison:
         else:
             verdict = BagVerdict.WITHIN_TOLERANCE if tolerated else BagVerdict.EQUAL
             if not (a.complete and b.complete):
-                verdict = BagVerdict.AS_FAR_AS_THEY_GO
+                verdict = BagVerdict.AGREE_UNTIL_TRUNCATED
         if self._options.by != BY_STAMP and topics:
             self._note(LogTimesIgnored())
         for topic in topics:
             if topic.type_a != topic.type_b:
-                self._note(OtherType(topic.topic, topic.type_a, topic.type_b))
+                self._note(DifferentType(topic.topic, topic.type_a, topic.type_b))
         return BagDiff(
             a=a,
             b=b,
@@ -283,12 +295,12 @@ class _Comparison:
             first=first,
             next_step=_next_step(a, b, first, self._options),
             remarks=tuple(self._remarks),
-            as_far_as_they_go=self._options.as_far_as_they_go,
+            allow_truncated=self._options.allow_truncated,
         )
 
 
 def _paired(
-    a: Source, b: Source, options: DiffOptions
+    a: RecordingSource, b: RecordingSource, options: DiffOptions
 ) -> tuple[list[tuple[int, int]], list[int], list[int]]:
     """Return the pairs of topics to compare, and those that only one side has."""
     in_a = [i for i, topic in enumerate(a.topics) if options.wants_topic(topic.name)]
@@ -322,9 +334,9 @@ def _times(scan: _Scan) -> Keys:
     return np.array(scan.stamps, dtype=np.uint64)
 
 
-def _recording(source: Source, scans: dict[int, _Scan]) -> Recording:
+def _recording(source: RecordingSource, scans: dict[int, _Scan]) -> ComparedRecording:
     filled = [scan.stamps for scan in scans.values() if scan.stamps]
-    return Recording(
+    return ComparedRecording(
         path=source.path,
         kind=source.kind,
         topics=len(source.topics),
@@ -340,7 +352,10 @@ def _lone(topic: SourceTopic, scan: _Scan) -> LoneTopic:
 
 
 def _next_step(
-    a: Recording, b: Recording, first: MessageDivergence | None, options: DiffOptions
+    a: ComparedRecording,
+    b: ComparedRecording,
+    first: MessageDivergence | None,
+    options: DiffOptions,
 ) -> str:
     if first is None or options.topics == (first.topic,):
         return ""

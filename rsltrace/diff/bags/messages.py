@@ -10,11 +10,10 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-from rsltrace.diff.bags.pairing import LOOKAHEAD, MessagePair, Pairing
-from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
-from rsltrace.diff.bags.source import Source, SourceTopic
+from rsltrace.diff.bags.sequences import LOOKAHEAD, Gap, Keys, MessagePair, Pairing, moved_messages
+from rsltrace.diff.bags.source import RecordingSource, SourceTopic
 from rsltrace.diff.facts.bags import BagMessage, MessageDivergence, TopicDiff
-from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
+from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
 from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.values.fields import diff_messages, field_differences, preview
 from rsltrace.diff.values.globs import FieldRules
@@ -43,14 +42,16 @@ class TopicPair:
     full_b: Keys
 
 
-class Fetched:
+class FetchedMessages:
     """Gives the messages of the gaps, by topic and index, decoded.
 
     Without tolerances only what is shown is needed: one pass per file collects it for all topics.
     With tolerances every gap is looked at: each topic is then read by itself, in step.
     """
 
-    def __init__(self, a: Source, b: Source, pairs: list[TopicPair], options: DiffOptions) -> None:
+    def __init__(
+        self, a: RecordingSource, b: RecordingSource, pairs: list[TopicPair], options: DiffOptions
+    ) -> None:
         self._a, self._b = a, b
         self._context = options.context
         self._collected: tuple[dict[int, dict[int, bytes]], ...] = ({}, {})
@@ -58,7 +59,7 @@ class Fetched:
             for side, source in ((0, a), (1, b)):
                 self._collect(source, side, pairs)
 
-    def _collect(self, source: Source, side: int, pairs: list[TopicPair]) -> None:
+    def _collect(self, source: RecordingSource, side: int, pairs: list[TopicPair]) -> None:
         ranges: dict[int, tuple[int, int]] = {}
         for pair in pairs:
             if pair.gaps:
@@ -79,25 +80,25 @@ class Fetched:
             elif place >= last and all(seen[n] >= end for n, (_, end) in ranges.items()):
                 return
 
-    def sides(self, pair: TopicPair) -> tuple[_Side, _Side]:
+    def sides(self, pair: TopicPair) -> tuple[_TopicMessages, _TopicMessages]:
         """Return access to the messages of a topic in a and in b."""
         made = []
         for side, source, number in ((0, self._a, pair.number_a), (1, self._b, pair.number_b)):
             collected = self._collected[side].get(number)
             if collected is not None:
-                made.append(_Side(source, number, known=collected))
+                made.append(_TopicMessages(source, number, known=collected))
             else:
                 stream = (data for _, _, data in source.read({number}))
-                made.append(_Side(source, number, stream=stream, keep=self._context))
+                made.append(_TopicMessages(source, number, stream=stream, keep=self._context))
         return made[0], made[1]
 
 
-class _Side:
-    """The messages of one topic of one recording, asked for in about their order."""
+class _TopicMessages:
+    """The messages of one topic of one recording, read in about their order."""
 
     def __init__(
         self,
-        source: Source,
+        source: RecordingSource,
         number: int,
         *,
         known: dict[int, bytes] | None = None,
@@ -113,7 +114,7 @@ class _Side:
         self._next = 0
 
     def get(self, index: int) -> object | None:
-        """Return a decoded message, or None if it is not at hand. Raises TraceError."""
+        """Return a decoded message, or None if it is not available. Raises TraceError."""
         while self._stream is not None and self._next <= index:
             data = next(self._stream, None)
             if data is None:
@@ -137,7 +138,7 @@ class _Side:
 
 
 def compare_topic(
-    pair: TopicPair, fetched: Fetched, starts: tuple[int, int], options: DiffOptions
+    pair: TopicPair, fetched: FetchedMessages, starts: tuple[int, int], options: DiffOptions
 ) -> TopicDiff:
     """Return how the messages of one topic compare. Raises BagError or TraceError."""
     own = options.for_topic(pair.a.name)
@@ -253,7 +254,7 @@ def _ignored(pair: TopicPair, *, outside: bool) -> int:
     return count
 
 
-def _covered(a: _Side, b: _Side, one: MessagePair, rules: FieldRules) -> bool:
+def _covered(a: _TopicMessages, b: _TopicMessages, one: MessagePair, rules: FieldRules) -> bool:
     if one.a < 0 or one.b < 0:
         return False
     try:
@@ -266,8 +267,8 @@ def _covered(a: _Side, b: _Side, one: MessagePair, rules: FieldRules) -> bool:
 def _divergence(
     pair: TopicPair,
     one: MessagePair,
-    a: _Side,
-    b: _Side,
+    a: _TopicMessages,
+    b: _TopicMessages,
     starts: tuple[int, int],
     options: DiffOptions,
 ) -> MessageDivergence:
@@ -280,9 +281,9 @@ def _divergence(
         try:
             fields, more = diff_messages(a.get(one.a), b.get(one.b), options)
             if not fields:
-                no_fields = NoFields.UNDESCRIBED_BYTES
+                no_fields = NoFieldsReason.UNDESCRIBED_BYTES
         except TraceError as error:
-            no_fields, problem = NoFields.UNREADABLE, str(error)
+            no_fields, problem = NoFieldsReason.UNREADABLE, str(error)
     side, stamps, index = (a, pair.stamps_a, one.a) if in_a else (b, pair.stamps_b, one.b)
     before = range(max(index - options.context, 0), index)
     return MessageDivergence(
@@ -308,8 +309,8 @@ def _moved(
     pair: TopicPair,
     one: MessagePair,
     whole: MessagePair,
-    a: _Side,
-    b: _Side,
+    a: _TopicMessages,
+    b: _TopicMessages,
     starts: tuple[int, int],
     options: DiffOptions,
 ) -> MessageDivergence:

@@ -33,7 +33,7 @@ class SourceTopic:
 
 
 @dataclass(slots=True)
-class Source:
+class RecordingSource:
     """A recording to compare; a context manager. Reading may raise BagError or TraceError.
 
     ``read`` yields (log time in ns, index in ``topics``, CDR) of the topics whose indexes it is
@@ -49,7 +49,7 @@ class Source:
     notes: tuple[str, ...] = ()
     _decoders: dict[int, Callable[[bytes], object]] = field(default_factory=dict)
 
-    def __enter__(self) -> Source:
+    def __enter__(self) -> RecordingSource:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -62,7 +62,7 @@ class Source:
         return self._decoders[topic](data)
 
 
-def open_source(path: str | os.PathLike[str]) -> Source:
+def open_source(path: str | os.PathLike[str]) -> RecordingSource:
     """Open a recording: a bag's folder, one of its files, or a trace.
 
     Raises BagError or TraceError naming the file and what is wrong with it.
@@ -71,7 +71,7 @@ def open_source(path: str | os.PathLike[str]) -> Source:
         return _trace_source(path)
     # Of a folder all is wanted; a file that was cut off can be compared as far as it goes.
     bag = open_bag(path, recover=Path(path).is_file())
-    return Source(
+    return RecordingSource(
         path=os.fspath(path),
         kind=bag.storage_id,
         topics=tuple(
@@ -89,14 +89,14 @@ def open_source(path: str | os.PathLike[str]) -> Source:
     )
 
 
-def _trace_source(path: str | os.PathLike[str]) -> Source:
+def _trace_source(path: str | os.PathLike[str]) -> RecordingSource:
     from rsltrace.trace.reader import Trace
 
     trace = Trace.open(os.fspath(path))
     return replace(source_of(trace, services=False), close=trace.close)
 
 
-def source_of(trace: Trace, *, services: bool) -> Source:
+def source_of(trace: Trace, *, services: bool) -> RecordingSource:
     """Return the messages of an open trace, with or without requests and responses."""
     topics_by_name: dict[str, SourceTopic] = {}
     for channel in trace.channels.values():
@@ -112,7 +112,7 @@ def source_of(trace: Trace, *, services: bool) -> Source:
             for stamp_ns, _, data in trace.messages(topics[number].name):
                 yield stamp_ns, number, data
 
-    return Source(
+    return RecordingSource(
         path=trace.name,
         kind="trace",
         topics=topics,

@@ -49,7 +49,7 @@ def call_differences(
 
     If all answers agree, the first calls before them in the same node, or when its modules were
     imported, that gave different ones come first: what was read earlier may show only now. ``node``
-    is another node that is to blame.
+    is another node that can be the cause.
     """
     inside = _paired(_inside(run_a, a), _inside(run_b, b))
     differing = [call for call in inside if call.differs]
@@ -68,7 +68,7 @@ def call_differences(
 
 
 def unrecorded_answer(run: Run, view: EventView) -> UnrecordedAnswer | None:
-    """Return which answer of a socket or a program nobody kept: the last one in an event, else the
+    """Return the last unrecorded answer of a socket or a program: in an event, else the
     last one before it in its node; None if there was none."""
     found = [*_before(run, view), *_inside(run, view)]
     kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
@@ -163,7 +163,7 @@ def call_difference(
     events: tuple[int | None, int | None],
     answers: tuple[str | None, str | None],
 ) -> CallDifference:
-    """Return a call of both runs, or of one, with what tells its answers apart."""
+    """Return a call of both runs, or of one, with what distinguishes its answers."""
     a, b = answers
     touched = [_CHANGED.fullmatch(value or "") for value in answers]
     return CallDifference(
@@ -230,10 +230,10 @@ def _exit_text(value: Any) -> str:
 
 
 def _text(value: Any) -> str:
-    return str(_Shown(value)) if isinstance(value, (dict, list)) else repr(value)
+    return str(_AnswerText(value)) if isinstance(value, (dict, list)) else repr(value)
 
 
-class _Shown:
+class _AnswerText:
     """A decoded value whose ``repr`` is that of the answer itself."""
 
     def __init__(self, value: Any) -> None:
@@ -242,11 +242,11 @@ class _Shown:
     def __repr__(self) -> str:
         value = self._value
         if isinstance(value, list):
-            return repr([_Shown(item) for item in value])
+            return repr([_AnswerText(item) for item in value])
         if isinstance(value, dict) and "bytes" in value:
             return repr(base64.b64decode(value["bytes"], validate=True))
         if isinstance(value, dict) and "tuple" in value:
-            return repr(tuple(_Shown(item) for item in value["tuple"]))
+            return repr(tuple(_AnswerText(item) for item in value["tuple"]))
         if isinstance(value, dict) and "error" in value:
             kind, _, text, *_ = value["error"]
             return f"{kind}: {text}"

@@ -1,6 +1,6 @@
 """From two differing events to a verdict: what happened, and why.
 
-The rules stand in the order in which they are asked: what is seen first in ``_judge`` wins.
+The first rule in ``_judge`` that applies wins.
 """
 
 from __future__ import annotations
@@ -10,37 +10,37 @@ from dataclasses import dataclass, field, replace
 
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.propagation import NODE
-from rsltrace.diff.causes.relevance import Place, Relevance
+from rsltrace.diff.causes.relevance import DivergenceSite, Relevance
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
-    CameFrom,
-    Happening,
+    CauseFact,
+    CauseKind,
+    DifferentDraw,
+    DifferentInput,
+    DifferentOrder,
+    DifferentOutput,
+    DifferentSenders,
+    DifferentTime,
+    DivergenceFact,
+    DivergenceKind,
+    EventInOneRun,
+    ExceptionInOneRun,
     Judgement,
     Loss,
+    NoEarlierDifference,
     NotDelivered,
-    NothingBefore,
-    OnlyInOne,
-    OtherDraw,
-    OtherInput,
-    OtherOrder,
-    OtherOutput,
-    OtherTime,
     ParameterFiles,
-    RaisedInOne,
-    Reason,
     Root,
-    Slept,
+    SleepTimes,
     Verdict,
-    WaitedFor,
-    What,
-    Why,
+    WaitInOneRun,
 )
 from rsltrace.diff.facts.evidence import (
-    EntitiesChanged,
+    EntityChanges,
     EventView,
     MessageDifference,
-    ParametersChanged,
-    ParametersSet,
+    ParameterChanges,
+    ParameterValues,
     Presence,
     Setting,
     StateDifference,
@@ -56,7 +56,7 @@ _OF_BAGS = ("bags", "faults", "start", "construct_time", "min_time_step")
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
+class DivergenceCase:
     """What is known of a place where the runs differ.
 
     ``a`` and ``b`` are counterparts, or one of them is None. ``other_a`` and ``other_b`` are what
@@ -83,10 +83,10 @@ class Case:
     periods_ns: tuple[int, int] | None = None
     """Of a timer, its period in both runs, if they differ."""
 
-    slept: Slept | None = None
+    slept: SleepTimes | None = None
     """How long a callback slept, if that differs."""
 
-    changed: EntitiesChanged | None = None
+    changed: EntityChanges | None = None
     """The entities whose QoS differs, of the topics that are concerned."""
 
     swapped: bool = False
@@ -117,7 +117,7 @@ class Case:
         settings = self.settings
         if self.one.kind is EventKind.BAG and not drawn:
             settings = [setting for setting in settings if setting.part in _OF_BAGS]
-        place = Place(frozenset(nodes - {""}), constructing, inside, drawn)
+        place = DivergenceSite(frozenset(nodes - {""}), constructing, inside, drawn)
         self.blamed[:] = self.relevance.of(settings, place)
         return bool(self.blamed)
 
@@ -125,8 +125,8 @@ class Case:
         self,
         verdict: Verdict,
         root: Root,
-        what: What,
-        why: Why | None,
+        what: DivergenceFact,
+        why: CauseFact | None,
         events: tuple[EventView | None, EventView | None] | None = None,
     ) -> Judgement:
         """Return a verdict, on the two events or on others."""
@@ -147,13 +147,13 @@ ROOT_OF = {
 }
 
 
-def judge(case: Case) -> Judgement:
+def judge(case: DivergenceCase) -> Judgement:
     """Return the verdict on a place where the runs differ."""
     judgement = _judge(case)
     return replace(judgement, settings=tuple(case.blamed))
 
 
-def _judge(case: Case) -> Judgement:
+def _judge(case: DivergenceCase) -> Judgement:
     a, b, one = case.a, case.b, case.one
     if one.kind is EventKind.CONSTRUCT and not (a and b and a.raised != b.raised):
         return _construction(case)
@@ -173,7 +173,7 @@ def _judge(case: Case) -> Judgement:
     if any(is_switch(m.hash_a or 0) or is_switch(m.hash_b or 0) for m in draws):
         case.blame()
         return case.judgement(
-            Verdict.SCHEDULE, Root.SCHEDULE, Happening.THREAD_SWITCHED, Reason.POLICY_CHOSE
+            Verdict.SCHEDULE, Root.SCHEDULE, DivergenceKind.THREAD_SWITCHED, CauseKind.POLICY_CHOSE
         )
     if draws and all(m.kind is OutputKind.DRAW for m in case.messages):
         return _draw(case, a, draws)
@@ -185,28 +185,28 @@ def _judge(case: Case) -> Judgement:
 # -- the verdicts ----------------------------------------------------------------------------------
 
 
-def _construction(case: Case) -> Judgement:
+def _construction(case: DivergenceCase) -> Judgement:
     a, b = case.a, case.b
     explained = case.blame()
     verdict, root = Verdict.GRAPH, Root.JOB if explained else Root.CALLBACK
-    what: What
+    what: DivergenceFact
     if a is None or b is None:
-        root, what = Root.JOB, Happening.CONSTRUCTED_IN_ONE
+        root, what = Root.JOB, DivergenceKind.CONSTRUCTED_IN_ONE
     elif a.entity != b.entity:
-        what = Happening.NODE_RENAMED
+        what = DivergenceKind.NODE_RENAMED
     elif case.inverted:
-        what = Happening.CONSTRUCTION_ORDER
+        what = DivergenceKind.CONSTRUCTION_ORDER
     elif a.stamp_ns != b.stamp_ns and all(map(_is_stamp_of_parameters, case.messages)):
         return _timing(case, a)
     elif case.changed is not None:
         what = case.changed
     elif any(m.kind is OutputKind.ENTITY for m in case.messages):
-        what = Happening.OTHER_ENTITIES
+        what = DivergenceKind.OTHER_ENTITIES
     elif explained:
-        verdict, what = Verdict.ENVIRONMENT, Happening.OTHER_CONSTRUCTION
+        verdict, what = Verdict.ENVIRONMENT, DivergenceKind.OTHER_CONSTRUCTION
     else:
         verdict, root = Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK
-        what = Happening.OTHER_CONSTRUCTION_SAME_JOB
+        what = DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB
     return case.judgement(verdict, root, what, _why_constructed(case))
 
 
@@ -216,131 +216,135 @@ def _is_stamp_of_parameters(message: MessageDifference) -> bool:
     return message.topic == PARAMETER_EVENTS and paths == ["stamp"] and not message.more_fields
 
 
-def _why_constructed(case: Case) -> Why:
+def _why_constructed(case: DivergenceCase) -> CauseFact:
     """Say why a constructor may have done something else in the same job and environment."""
     names = [
         value[0]
         for message in case.messages
-        if isinstance(message.fate, ParametersSet | ParametersChanged)
+        if isinstance(message.fate, ParameterValues | ParameterChanges)
         for value in message.fate.values
     ]
     files = case.relevance.parameter_files
-    return ParameterFiles(tuple(names), tuple(files)) if names and files else Reason.CONSTRUCTOR
+    return ParameterFiles(tuple(names), tuple(files)) if names and files else CauseKind.CONSTRUCTOR
 
 
-def _schedule(case: Case) -> Judgement:
+def _schedule(case: DivergenceCase) -> Judgement:
     case.blame()
-    what, events = OtherOrder(case.one), (case.other_a, case.other_b)
-    return case.judgement(Verdict.SCHEDULE, Root.SCHEDULE, what, Reason.READY_AT_ONCE, events)
+    what, events = DifferentOrder(case.one), (case.other_a, case.other_b)
+    return case.judgement(Verdict.SCHEDULE, Root.SCHEDULE, what, CauseKind.READY_AT_ONCE, events)
 
 
-def _one_sided(case: Case) -> Judgement:
+def _one_sided(case: DivergenceCase) -> Judgement:
     one, a = case.one, case.a
     verdict, root = (Verdict.MISSING, Root.MISSING) if a else (Verdict.EXTRA, Root.EXTRA)
-    what = OnlyInOne(case.other_b if a else case.other_a, case.loss, case.periods_ns)
+    what = EventInOneRun(case.other_b if a else case.other_a, case.loss, case.periods_ns)
     cause = case.cause_a if a else case.cause_b
-    why: Why | None
+    why: CauseFact | None
     if case.why is not None:
         why = None
     elif cause is not None and one.kind is EventKind.RESUME:
-        why = WaitedFor(cause)
+        why = WaitInOneRun(cause)
     elif cause is not None:
         why = NotDelivered(cause, case.loss)
     else:
-        why = _FROM_OUTSIDE.get(one.kind, Reason.NOTHING_MADE_IT_RUN)
-    if why not in (None, Reason.DRIVEN_IN_ONE):
+        why = _FROM_OUTSIDE.get(one.kind, CauseKind.NOTHING_MADE_IT_RUN)
+    if why not in (None, CauseKind.DRIVEN_IN_ONE):
         case.blame()
     return case.judgement(verdict, root, what, why)
 
 
 _FROM_OUTSIDE = {
-    EventKind.BAG: Reason.ONLY_IN_ONE_BAG,
-    EventKind.OUTSIDE: Reason.DRIVEN_IN_ONE,
-    EventKind.FAULT: Reason.FAULT_IN_ONE,
+    EventKind.BAG: CauseKind.ONLY_IN_ONE_BAG,
+    EventKind.OUTSIDE: CauseKind.DRIVEN_IN_ONE,
+    EventKind.FAULT: CauseKind.FAULT_IN_ONE,
 }
 
 
-def _exception(case: Case, a: EventView) -> Judgement:
+def _exception(case: DivergenceCase, a: EventView) -> Judgement:
     error = next((m.preview for m in case.messages if m.kind is OutputKind.EXCEPTION), "")
     where = Presence.ONLY_A if a.raised else Presence.ONLY_B
     after_shutdown = any(
         m.kind is OutputKind.SHUTDOWN and m.presence is where for m in case.messages
     )
-    what, why = RaisedInOne(error, after_shutdown), _hidden(case, _doubt(a), inside=True)
+    what, why = ExceptionInOneRun(error, after_shutdown), _hidden(case, _doubt(a), inside=True)
     return case.judgement(Verdict.EXCEPTION, Root.EXCEPTION, what, why)
 
 
-def _timing(case: Case, a: EventView) -> Judgement:
+def _timing(case: DivergenceCase, a: EventView) -> Judgement:
     if a.kind is EventKind.BAG:  # a bag decides on the time of its messages, and nothing else does
         case.blame()
-        what = Happening.BAG_MESSAGES_SWAPPED if case.swapped else Happening.BAG_MESSAGE_MOVED
-        why = Reason.BAGS_SWAPPED if case.swapped else Reason.BAGS_AT_OTHER_TIMES
+        what = (
+            DivergenceKind.BAG_MESSAGES_SWAPPED
+            if case.swapped
+            else DivergenceKind.BAG_MESSAGE_MOVED
+        )
+        why = CauseKind.BAGS_SWAPPED if case.swapped else CauseKind.BAGS_AT_OTHER_TIMES
         return case.judgement(Verdict.TIMING, Root.EXTERNAL_INPUT, what, why)
-    moved = OtherTime(case.periods_ns, case.slept)
+    moved = DifferentTime(case.periods_ns, case.slept)
     return case.judgement(Verdict.TIMING, Root.TIMING, moved, _hidden(case, "time"))
 
 
-def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
-    what: What
-    why: Why
+def _different_input(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
+    what: DivergenceFact
+    why: CauseFact
     root = Root.EXTERNAL_INPUT
     if a.kind is EventKind.BAG:
         case.blame()
-        what, why = Happening.OTHER_BAG_MESSAGE, Reason.BAGS_DIFFER
+        what, why = DivergenceKind.OTHER_BAG_MESSAGE, CauseKind.BAGS_DIFFER
     elif a.kind is EventKind.OUTSIDE:
-        what, why = Happening.OTHER_FROM_OUTSIDE, Reason.DRIVEN_DIFFERENTLY
+        what, why = DivergenceKind.OTHER_FROM_OUTSIDE, CauseKind.DRIVEN_DIFFERENTLY
     else:
         root = Root.UNKNOWN
-        what = OtherInput(next((m.topic for m in case.messages if m.is_input and m.topic), ""))
+        what = DifferentInput(next((m.topic for m in case.messages if m.is_input and m.topic), ""))
         if case.cause_a is None or case.cause_b is None:
-            why = Reason.SENDER_UNKNOWN
+            why = CauseKind.SENDER_UNKNOWN
         elif (a.cause_event, a.cause_output) == (b.cause_event, b.cause_output):
-            why = Reason.OTHER_CONTENT_ARRIVED
+            why = CauseKind.OTHER_CONTENT_ARRIVED
         else:
-            why = CameFrom(case.cause_a, case.cause_b)
+            why = DifferentSenders(case.cause_a, case.cause_b)
     return case.judgement(Verdict.DIFFERENT_INPUT, root, what, why)
 
 
-def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
+def _another_cause(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
     if a.cause_event == b.cause_event and a.output_hash != b.output_hash:
         case.blame(drawn=True)
-        what, reason = Happening.ONLY_ZERO_DELAYS, Reason.DELAY_IN_ONE
+        what, reason = DivergenceKind.ONLY_ZERO_DELAYS, CauseKind.DELAY_IN_ONE
         return case.judgement(Verdict.DRAW, Root.DRAW, what, reason)
-    what, reason = Happening.OTHER_SENDER, Reason.EQUAL_MESSAGES_SWAPPED
+    what, reason = DivergenceKind.OTHER_SENDER, CauseKind.EQUAL_MESSAGES_SWAPPED
     return case.judgement(Verdict.SCHEDULE, Root.SCHEDULE, what, reason)
 
 
-def _draw(case: Case, a: EventView, draws: Sequence[MessageDifference]) -> Judgement:
+def _draw(case: DivergenceCase, a: EventView, draws: Sequence[MessageDifference]) -> Judgement:
     first = draws[0]
     case.blame(drawn=True)
     is_clock = _is_of_clock(first)
     of_delays = any(setting.part in _DRAWN_FROM for setting in case.blamed)
-    what = OtherDraw(
+    what = DifferentDraw(
         first,
         more=len(draws) - 1,
         of_clock=is_clock,
         of_event=first.entity == a.entity,
         connected=first.presence is Presence.BOTH or is_clock or of_delays,
     )
-    why = Reason.STREAM_MOVED if what.connected else Reason.NOT_CONNECTED
+    why = CauseKind.STREAM_MOVED if what.connected else CauseKind.NOT_CONNECTED
     return case.judgement(Verdict.DRAW, Root.DRAW, what, why)
 
 
-def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
+def _same_input(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
     if a.kind is EventKind.OUTSIDE:
-        done, driven = Happening.OTHER_DONE_OUTSIDE, Reason.DRIVEN_DIFFERENTLY
+        done, driven = DivergenceKind.OTHER_DONE_OUTSIDE, CauseKind.DRIVEN_DIFFERENTLY
         return case.judgement(Verdict.DIFFERENT_INPUT, Root.EXTERNAL_INPUT, done, driven)
-    what: What
+    what: DivergenceFact
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
-        what = Happening.OTHER_STATE
+        what = DivergenceKind.OTHER_STATE
     else:
         others = [m for m in case.messages if not _is_qos_event(m)]
         if case.changed is not None and not others:
             explained = case.blame()
             root = Root.JOB if explained else Root.CALLBACK
-            return case.judgement(Verdict.GRAPH, root, case.changed, Reason.CONSTRUCTOR)
+            return case.judgement(Verdict.GRAPH, root, case.changed, CauseKind.CONSTRUCTOR)
         only_slept = all(message.fate is not None for message in case.messages)
-        what = OtherOutput(case.slept, only_slept=case.slept is not None and only_slept)
+        what = DifferentOutput(case.slept, only_slept=case.slept is not None and only_slept)
     suspended = EventFlag.SUSPENDED in a.flags | b.flags
     why = _hidden(case, _doubt(a), inside=not suspended)
     return case.judgement(Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, what, why)
@@ -349,13 +353,15 @@ def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
 # -- what they rest on -----------------------------------------------------------------------------
 
 
-def _hidden(case: Case, doubt: str, *, inside: bool = False) -> NothingBefore | None:
+def _hidden(
+    case: DivergenceCase, doubt: str, *, inside: bool = False
+) -> NoEarlierDifference | None:
     """Return what a root means: nothing that the trace shows differs before it."""
     if case.why == NODE:
         return None
     case.blame(inside=inside)
     state_unknown = bool(case.one.entity.node and not case.one.state_hash)
-    return NothingBefore(doubt, state_unknown, case.relevance.guard_is_off)
+    return NoEarlierDifference(doubt, state_unknown, case.relevance.guard_is_off)
 
 
 def _doubt(view: EventView) -> str:

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from rsltrace.diff.alignment.rows import BAG, Run, load_rows
 from rsltrace.diff.facts.causes import (
     Loss,
-    NothingArrives,
-    QueueOverflowed,
-    Slept,
-    StillWaits,
+    NoMoreMessages,
+    QueueOverflow,
+    SleepTimes,
+    UnfinishedCall,
 )
 from rsltrace.diff.facts.evidence import (
-    EntitiesChanged,
     EntityChange,
+    EntityChanges,
     EntityProperty,
     EventView,
     MessageDifference,
@@ -55,11 +55,11 @@ def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | Non
     later = _received_after(has_not, number, view.cause_event, view.cause_output)
     if later is None:
         more = _received_after(has, number, view.cause_event, view.cause_output)
-        return NothingArrives(name) if more is not None else None
+        return NoMoreMessages(name) if more is not None else None
     depth = _depth(has_not, number)
     sent = _sent_between(has_not, view, later)
     if depth is not None and sent >= depth:
-        return QueueOverflowed(depth, name)
+        return QueueOverflow(depth, name)
     return None
 
 
@@ -125,11 +125,11 @@ def topics_of(view: EventView, messages: Sequence[MessageDifference]) -> frozens
 
 def entity_changes(
     run_a: Run, run_b: Run, topics: frozenset[str], nodes: frozenset[str] = frozenset()
-) -> EntitiesChanged | None:
+) -> EntityChanges | None:
     """Return which entities of both runs have another QoS, of some topics and services, or are in
     another callback group, of some nodes; None if there are none.
 
-    A depth is not told: it shows in another way.
+    Depths are not included: they show as overflows.
     """
     alone = {*run_a.matching.only_a, *run_a.matching.only_b}
     found = []
@@ -142,7 +142,7 @@ def entity_changes(
         if key.node in nodes and (groups := (a.get("group"), b.get("group")))[0] != groups[1]:
             one, other = (str(group or "default") for group in groups)
             found.append(EntityChange(key, EntityProperty.GROUP, (("", one, other),)))
-    return EntitiesChanged(tuple(found)) if found else None
+    return EntityChanges(tuple(found)) if found else None
 
 
 def _policies(a: object, b: object) -> tuple[tuple[str, str | int | None, str | int | None], ...]:
@@ -168,7 +168,7 @@ def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
     for wait in _waits(lacking):
         is_held = any(0 <= one < len(table) and table[one] == number for one in wait.held)
         if wait.since_ns <= view.stamp_ns and (is_held or wait.text not in elsewhere):
-            return StillWaits(wait.text, wait.since_ns, name)
+            return UnfinishedCall(wait.text, wait.since_ns, name)
     return None
 
 
@@ -176,17 +176,17 @@ def _waits(run: Run) -> list[EndlessWait]:
     return waits_of(run.trace.result) if run.trace.complete else []
 
 
-def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Slept | None:
+def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> SleepTimes | None:
     """Return how long two events of one callback slept, or the callback before them; None if it was
     as long in both, or if they did not."""
     if a is None or b is None or a.kind is not b.kind:
         return None
     in_a, in_b = _slept_ns(run_a, a), _slept_ns(run_b, b)
-    return None if in_a == in_b else Slept(in_a, in_b)
+    return None if in_a == in_b else SleepTimes(in_a, in_b)
 
 
 def _slept_ns(run: Run, view: EventView) -> int | None:
-    """Return how long a callback slept after an event, or before one with which it went on."""
+    """Return how long a callback slept after an event, or before one that resumed it."""
     number = run.matching.by_key[view.entity]
     if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
         rows = load_rows(run, max(view.index - _LOOKED_AT_MAX, 0), view.index)

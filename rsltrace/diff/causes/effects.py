@@ -8,8 +8,8 @@ from collections.abc import Callable
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair
 from rsltrace.diff.alignment.rows import CONSTRUCT, SHUTDOWN
 from rsltrace.diff.causes.propagation import (
+    DivergenceOrigin,
     FoundDivergence,
-    Origin,
     Propagation,
     outputs_of_one,
 )
@@ -19,7 +19,7 @@ PARAMETER_EVENTS = "/parameter_events"
 
 
 def is_effect(block: AlignedBlock, item: EventPair) -> bool:
-    """Whether an item is more than a node that was set up otherwise.
+    """Whether an item is more than a node that was set up differently.
 
     What a constructor logs or says on ``/parameter_events``, and the state of a node, are not.
     """
@@ -45,7 +45,7 @@ def is_effect(block: AlignedBlock, item: EventPair) -> bool:
 
 
 def is_setup(block: AlignedBlock, item: EventPair) -> bool:
-    """Whether an item is a node that was set up otherwise, and no effect yet."""
+    """Whether an item is a node that was set up differently, and no effect yet."""
     if item.plain or item.beyond or is_effect(block, item):
         return False
     rows, index = (block.rows_a, item.a) if item.a >= 0 else (block.rows_b, item.b)
@@ -55,7 +55,7 @@ def is_setup(block: AlignedBlock, item: EventPair) -> bool:
 class EffectSearch:
     """Looks through blocks, after ``Propagation`` took each, for what is to be shown first.
 
-    If the first divergence is a node set up otherwise that is the first effect of this. If all of
+    If the first divergence is a node set up differently that is the first effect of this. If all of
     it is ``covered`` (ignored, or within tolerance) it is the first difference that is not.
     ``found`` is None as long as there is nothing to show but the first divergence.
     """
@@ -74,7 +74,7 @@ class EffectSearch:
 
     @property
     def in_vain(self) -> bool:
-        """Whether nothing was found that a node set up otherwise has led to."""
+        """Whether nothing was found that a node set up differently has led to."""
         return self.found is None and not self.past_covered and 0 in self._setups
 
     def take(self, block: AlignedBlock, propagation: Propagation) -> None:
@@ -100,7 +100,7 @@ class EffectSearch:
                 self.found = propagation.found_at(item, origin)
                 return
 
-    def _is_wanted(self, item: EventPair, origin: Origin) -> bool:
+    def _is_wanted(self, item: EventPair, origin: DivergenceOrigin) -> bool:
         if self._covered is not None and self._covered(item):
             return False
         return self.past_covered or origin.root in self._setups

@@ -17,7 +17,7 @@ from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
 
 COUNTED_MAX = 8192
-"""Events up to here are told which of their entity's events they are. Counting takes reading."""
+"""Events up to here get their number among their entity's events. Counting takes reading."""
 
 _SUMMARY_OUTPUTS_MAX = 4
 _DRAW = int(OutputKind.DRAW)
@@ -119,7 +119,7 @@ class EventViews:
 
 
 def drawn_for(key: EntityKey) -> str:
-    """Return what chance decided about: a link, or a clock that was set."""
+    """Return what a random draw is about: a link, or a clock that was set."""
     if key.kind == EntityKind.NODE.label:
         return f"the clock of {key.name}"
     return f"{key.kind} {key.name} of {key.node}"

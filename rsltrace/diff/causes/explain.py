@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.diff.alignment.blocks import EventPair
 from rsltrace.diff.alignment.rows import Run, outputs_of
 from rsltrace.diff.causes.calls import call_differences
-from rsltrace.diff.causes.classify import ROOT_OF, Case, judge
+from rsltrace.diff.causes.classify import ROOT_OF, DivergenceCase, judge
 from rsltrace.diff.causes.delivery import (
     are_swapped,
     entity_changes,
@@ -24,19 +24,27 @@ from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.likely_cause import likely_cause
 from rsltrace.diff.causes.message_differences import message_differences
-from rsltrace.diff.causes.propagation import BUSY, DRAWN, MADE, NODE, STUCK, FoundDivergence, Origin
+from rsltrace.diff.causes.propagation import (
+    BUSY,
+    DRAWN,
+    MADE,
+    NODE,
+    STUCK,
+    DivergenceOrigin,
+    FoundDivergence,
+)
 from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
-from rsltrace.diff.facts.causes import CauseOf, FollowsFrom, Judgement, Root, Verdict
+from rsltrace.diff.facts.causes import Consequence, Judgement, Root, SameCause, Verdict
 from rsltrace.diff.facts.evidence import (
+    AffectedTopic,
+    CauseLink,
     CauseStep,
-    EntitiesChanged,
+    EntityChanges,
     EventView,
-    Link,
     LinkKind,
     MessageDifference,
-    Reach,
     Setting,
     SettingKind,
 )
@@ -48,10 +56,10 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import seconds_text
 
 ANCESTORS_MAX = 5
-"""Events told that led to a root: both runs have them, they only say how it came to run."""
+"""Events shown that led to a root. Both runs have them."""
 
 STEPS_MAX = 16
-"""Steps told between a root and its consequence; of a longer way, the last ones."""
+"""Steps shown between a root and its consequence; of more, the last ones."""
 
 
 @dataclass
@@ -73,7 +81,7 @@ class Explainer:
         """What to know before one runs a ``next_step``."""
 
     def explain(self, found: FoundDivergence) -> Divergence:
-        """Return everything about a root, or about a consequence that was asked for."""
+        """Return everything about a root, or about a selected consequence."""
         a, b, messages = self._differing(found)
         judgement = self._judge(found, a, b, messages)
         if found.origin.previous is not None:
@@ -81,13 +89,13 @@ class Explainer:
         return self._divergence(found, judgement)
 
     def explain_effect(self, found: FoundDivergence, first: Divergence) -> Divergence:
-        """Return everything about the first effect of a node that was set up otherwise."""
+        """Return everything about the first effect of a node that was set up differently."""
         effect = self.explain(found)
         root = self._root_judgement(found.origin.root)
         return replace(
             effect,
             root=ROOT_OF.get(root.verdict, root.root),
-            why=CauseOf(first),
+            why=SameCause(first),
             settings=root.settings,
             reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
             next_step=first.next_step,
@@ -117,7 +125,7 @@ class Explainer:
         if view is None or view.kind is EventKind.SHUTDOWN:
             return None
         item = EventPair(-1 if of_b else index, index if of_b else -1, same=False)
-        origin = Origin(item, root=0, why=None, previous=None)
+        origin = DivergenceOrigin(item, root=0, why=None, previous=None)
         found = FoundDivergence(origin, view.stamp_ns, item.a, item.b)
         return self._judge(found, *self._differing(found))
 
@@ -149,7 +157,7 @@ class Explainer:
         messages: tuple[MessageDifference, ...],
     ) -> Judgement:
         return judge(
-            Case(
+            DivergenceCase(
                 a=a,
                 b=b,
                 other_a=self.view(found.place_a, of_b=False),
@@ -174,7 +182,7 @@ class Explainer:
 
     def _changed(
         self, view: EventView | None, messages: Sequence[MessageDifference]
-    ) -> EntitiesChanged | None:
+    ) -> EntityChanges | None:
         """Return the entities whose QoS shows in an event."""
         if view is None or not (topics := topics_of(view, messages)):
             return None
@@ -186,13 +194,13 @@ class Explainer:
             self._judged[number] = self._judge(found, *self._differing(found))
         return self._judged[number]
 
-    def _following(self, judgement: Judgement, origin: Origin) -> Judgement:
+    def _following(self, judgement: Judgement, origin: DivergenceOrigin) -> Judgement:
         """Return the verdict on a consequence: its own, with the root of its divergence."""
         root = self._root_judgement(origin.root)
         return replace(
             judgement,
             root=ROOT_OF.get(root.verdict, root.root),
-            why=FollowsFrom(root),
+            why=Consequence(root),
             node_diverged=origin.why == NODE
             and judgement.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
         )
@@ -206,13 +214,13 @@ class Explainer:
         origins.reverse()
         steps = []
         for origin, following in zip(origins, [*origins[1:], None], strict=True):
-            link = Link()
+            link = CauseLink()
             if following is not None and following.why == NODE:
                 item = following.item
                 view = self.view(item.a, of_b=False) or self.view(item.b, of_b=True)
-                link = Link(LinkKind.CHANGED_STATE, view.entity.node) if view else link
+                link = CauseLink(LinkKind.CHANGED_STATE, view.entity.node) if view else link
             elif following is not None and following.why in _SHARED:
-                link = Link(_SHARED[following.why])
+                link = CauseLink(_SHARED[following.why])
             elif following is not None:
                 link = self._sent(following)
             a = self.view(origin.item.a, of_b=False)
@@ -221,10 +229,10 @@ class Explainer:
         if len(steps) > STEPS_MAX:
             left_out = len(steps) - STEPS_MAX
             steps[1 : 1 + left_out] = []
-            steps[0] = replace(steps[0], link=Link(LinkKind.MORE_STEPS, steps=left_out))
+            steps[0] = replace(steps[0], link=CauseLink(LinkKind.MORE_STEPS, steps=left_out))
         return (*self._ancestors(origins[0]), *steps)
 
-    def _ancestors(self, root: Origin) -> list[CauseStep]:
+    def _ancestors(self, root: DivergenceOrigin) -> list[CauseStep]:
         """Return what led to a root, as far as both runs have it."""
         steps: list[CauseStep] = []
         item = root.item
@@ -241,7 +249,7 @@ class Explainer:
             view = a
         return steps[::-1]
 
-    def _sent(self, origin: Origin) -> Link:
+    def _sent(self, origin: DivergenceOrigin) -> CauseLink:
         """Say how the cause of an event led to it."""
         item = origin.item
         for run, index in ((self.run_a, item.a), (self.run_b, item.b)):
@@ -249,14 +257,14 @@ class Explainer:
                 event = run.trace.event(index)
                 if event.cause_event != NO_EVENT:
                     return self._link(run, event.cause_event, event.cause_output)
-        return Link()
+        return CauseLink()
 
-    def _link(self, run: Run, cause: int, nth: int) -> Link:
+    def _link(self, run: Run, cause: int, nth: int) -> CauseLink:
         outputs = outputs_of(run, cause)
         if nth >= len(outputs):
-            return Link(LinkKind.CAUSED)
+            return CauseLink(LinkKind.CAUSED)
         kind, number, _, _ = outputs[nth]
-        return Link(_LINKS.get(kind, LinkKind.CAUSED), run.matching.keys[number].name)
+        return CauseLink(_LINKS.get(kind, LinkKind.CAUSED), run.matching.keys[number].name)
 
     # -- the rest --------------------------------------------------------------------------------
 
@@ -291,7 +299,7 @@ class Explainer:
             same_node_b=self._viewer_b.before_in_node(place_b, count, node),
         )
 
-    def _reaches(self, found: FoundDivergence) -> tuple[Reach, ...]:
+    def _reaches(self, found: FoundDivergence) -> tuple[AffectedTopic, ...]:
         keys = self.run_a.matching.keys
         topics: dict[str, tuple[int, int, int]] = {}
         for number, (first, count, moved) in found.reached.items():
@@ -299,7 +307,7 @@ class Explainer:
             earlier, so_far, by = topics.get(topic, (first, 0, moved))
             topics[topic] = (min(first, earlier), so_far + count, moved if first < earlier else by)
         reaches = [
-            Reach(topic, max(first - found.stamp, 0), count, moved)
+            AffectedTopic(topic, max(first - found.stamp, 0), count, moved)
             for topic, (first, count, moved) in topics.items()
             if self.options.wants_topic(topic)
         ]
@@ -369,7 +377,7 @@ _SHARED = {
 }
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
-"""What recording the job once more tells more about: which of the two runs is the usual one."""
+"""Verdicts where recording the job again helps: it shows which run is the usual one."""
 
 _LINKS: dict[int, LinkKind] = {
     OutputKind.MESSAGE: LinkKind.PUBLISHED,

@@ -1,9 +1,9 @@
 """What differs in the jobs of two runs, key by key, and in which line of the job file.
 
 Compared is what was meant: the resolved jobs, in which every key has a value, so that another
-layout of the file, a unit written otherwise or an override on the command line show as what they
+layout of the file, another unit or an override on the command line show as what they
 are. Keys are written as ``--set`` takes them. Traces without a resolved job (it is damaged, or
-somebody else wrote the trace) are compared by the lines of the job files.
+another program wrote the trace) are compared by the lines of the job files.
 """
 
 from __future__ import annotations

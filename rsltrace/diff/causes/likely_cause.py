@@ -1,4 +1,4 @@
-"""What is likely behind a divergence: who got which answer from outside, or the order of a set."""
+"""The likely cause of a divergence: different external answers, or the order of a set."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
+    ExternalAnswers,
     Judgement,
     LikelyCause,
-    OutsideAnswers,
     Root,
     SetOrder,
     Verdict,
 )
-from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, Moved
+from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, OutputOrder
 from rsltrace.errors import JobError
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.finding import Source
@@ -52,7 +52,7 @@ def likely_cause(
     relevance: Relevance,
 ) -> LikelyCause | None:
     """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
-    shows, entities with other properties. If nothing does, the answer that nobody kept.
+    shows, entities with other properties. Else an unrecorded answer.
     """
     run_a, run_b = runs
     run = run_b if judgement.a is None else run_a
@@ -62,7 +62,7 @@ def likely_cause(
     if calls and calls[0].differs:
         changed = judgement.changed
         subject = subject_of(view) if changed is None else changed.node
-        return OutsideAnswers(subject, telling_calls(calls, judgement.messages))
+        return ExternalAnswers(subject, telling_calls(calls, judgement.messages))
     if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
         return found
     if judgement.verdict in _OF_ORDER and judgement.changed is None:
@@ -130,7 +130,7 @@ def _set_behind(
 
 
 def _is_reordered(message: MessageDifference) -> bool:
-    return isinstance(message.fate, Moved) or any(one.is_reordered for one in message.fields)
+    return isinstance(message.fate, OutputOrder) or any(one.is_reordered for one in message.fields)
 
 
 def _is_as_recorded(run: Run, file: Path) -> bool:

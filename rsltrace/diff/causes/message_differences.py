@@ -12,8 +12,8 @@ from itertools import islice, pairwise
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import (
     TIMER,
+    EventColumns,
     OutputRow,
-    Rows,
     Run,
     counts,
     load_rows,
@@ -23,18 +23,18 @@ from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
 from rsltrace.diff.facts.evidence import (
     EventView,
-    Fate,
     FieldDifference,
     MessageDifference,
-    Moved,
-    NoFields,
-    ParametersChanged,
-    ParametersSet,
+    NoFieldsReason,
+    OutputFate,
+    OutputOrder,
+    ParameterChanges,
+    ParameterValues,
     Presence,
-    SentLater,
-    SentTimes,
-    TimerCancelled,
-    TimerPeriodSet,
+    SendCount,
+    SendDelay,
+    TimerCancellation,
+    TimerPeriod,
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.values.fields import diff_messages, preview
@@ -76,7 +76,7 @@ def message_differences(
 
     Where one run has no such event, all of the other's. At most ``MESSAGES_MAX``.
     """
-    evidence = _Evidence(run_a, run_b, options)
+    evidence = _MessageComparison(run_a, run_b, options)
     found: list[MessageDifference] = []
     for difference in evidence.differences(a, b):
         if options.wants_topic(difference.topic):
@@ -97,7 +97,7 @@ _SENT = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _CANCEL_HASH = hash64(pack_operation(TIMER_CANCEL, 0))
 
 
-class _Evidence:
+class _MessageComparison:
     def __init__(self, run_a: Run, run_b: Run, options: DiffOptions) -> None:
         self._run_a = run_a
         self._run_b = run_b
@@ -112,7 +112,7 @@ class _Evidence:
             yield self._difference(_INPUT, input_a, input_b, hash_a, hash_b)
         outputs_a = outputs_of(self._run_a, a.index) if a is not None else []
         outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
-        fates = _Fates(self._run_a, self._run_b, a, b)
+        fates = _OutputChanges(self._run_a, self._run_b, a, b)
         bag = any(view is not None and _is_published_input(view) for view in (a, b))
         keys = self._run_a.matching.keys
         for position, x, y, moved in matched_outputs(outputs_a, outputs_b, keys):
@@ -178,7 +178,7 @@ class _Evidence:
             presence=presence,
             hash_a=hash_a,
             hash_b=hash_b,
-            fate=Moved() if moved else None,
+            fate=OutputOrder() if moved else None,
             entity=key,
         )
         if moved or kind == OutputKind.ENTITY:
@@ -193,7 +193,7 @@ class _Evidence:
             try:
                 value = self._decoded(run, output)
             except TraceError as error:
-                return replace(base, no_fields=NoFields.UNREADABLE, error=str(error))
+                return replace(base, no_fields=NoFieldsReason.UNREADABLE, error=str(error))
             if value is None and kind not in _WITH_PAYLOAD:
                 return base
             if value is None:
@@ -206,15 +206,17 @@ class _Evidence:
             return replace(base, fields=(FieldDifference("raised", raised[0], raised[1]),))
         if len(values) == 1:
             was_set = _parameters_set(values[0]) if topic == PARAMETER_EVENTS else ()
-            became = ParametersSet(was_set) if was_set else None
+            became = ParameterValues(was_set) if was_set else None
             text = _log_text(values[0]) if kind == OutputKind.LOG else ""
             return replace(base, preview=text or preview(values[0]), fate=became)
         fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
         no_fields = None
         if not fields:
-            no_fields = NoFields.ALL_IGNORED if self._options.ignore else NoFields.EQUAL_FIELDS
+            no_fields = (
+                NoFieldsReason.ALL_IGNORED if self._options.ignore else NoFieldsReason.EQUAL_FIELDS
+            )
         changed = _parameters_changed(*values) if topic == PARAMETER_EVENTS else ()
-        fate = ParametersChanged(changed) if changed else None
+        fate = ParameterChanges(changed) if changed else None
         return replace(base, fields=fields, more_fields=more, no_fields=no_fields, fate=fate)
 
     def _decoded(self, run: Run, row: OutputRow) -> object | None:
@@ -234,7 +236,7 @@ class _Evidence:
         return trace.decode(channel, found[2])
 
 
-_NOT_RECORDED = (NoFields.NOT_RECORDED_IN_A, NoFields.NOT_RECORDED_IN_B)
+_NOT_RECORDED = (NoFieldsReason.NOT_RECORDED_IN_A, NoFieldsReason.NOT_RECORDED_IN_B)
 
 
 def _last_line(traceback: object) -> str:
@@ -275,7 +277,7 @@ def _entity_id(run: Run, number: int) -> int:
 # -- what became of an output --------------------------------------------------------------------
 
 
-class _Fates:
+class _OutputChanges:
     """What became of the outputs of one pair of events."""
 
     def __init__(self, run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> None:
@@ -284,27 +286,27 @@ class _Fates:
 
     def fate(
         self, row: OutputRow, outputs: tuple[list[OutputRow], list[OutputRow]], *, only_b: bool
-    ) -> Fate | None:
+    ) -> OutputFate | None:
         """Return what became of an output that only one run has, None if that is all."""
         if None in self._views:
             return None
         in_a, in_b = (sum(other[:3] == row[:3] for other in side) for side in outputs)
         name = "b" if only_b else "a"
         if row[0] in _SENT and in_a and in_b:
-            return SentTimes(in_a, in_b)
+            return SendCount(in_a, in_b)
         if row[0] == OutputKind.TIMER:
             return self._done_to_timer(row, name, only_b=only_b)
         return self._later(row, only_b=only_b) if row[0] in _SENT else None
 
     @cached_property
-    def _rows(self) -> tuple[Rows, Rows]:
+    def _rows(self) -> tuple[EventColumns, EventColumns]:
         rows = []
         for run, view in zip(self._runs, self._views, strict=True):
             assert view is not None
             rows.append(load_rows(run, view.index, view.index + _LOOKED_AT_MAX))
         return rows[0], rows[1]
 
-    def _later(self, row: OutputRow, *, only_b: bool) -> SentLater | None:
+    def _later(self, row: OutputRow, *, only_b: bool) -> SendDelay | None:
         """Say whether the other run sends the same later, and from there on as this one."""
         has, has_not = self._rows[::-1] if only_b else self._rows
         mine, theirs = (list(islice(_sent(rows, row), 2)) for rows in (has, has_not))
@@ -315,17 +317,17 @@ class _Fates:
         repeats = len({content for _, content in mine}) < len(mine)
         if late_ns <= 0 or (mine[1:] != theirs[1:] and (repeats or moved != theirs)):
             return None  # another one, of a sender that often sends the same
-        return SentLater(late_ns, "a" if only_b else "b")
+        return SendDelay(late_ns, "a" if only_b else "b")
 
-    def _done_to_timer(self, row: OutputRow, name: str, *, only_b: bool) -> Fate | None:
+    def _done_to_timer(self, row: OutputRow, name: str, *, only_b: bool) -> OutputFate | None:
         _, number, content, _ = row
         if content == _CANCEL_HASH:
-            return TimerCancelled(name)
+            return TimerCancellation(name)
         mine, theirs = self._rows[::-1] if only_b else self._rows
         for period_ns in _periods(mine, number):
             if hash64(pack_operation(TIMER_PERIOD, period_ns)) == content:
                 before_ns = next(iter(_periods(theirs, number)), None)
-                return TimerPeriodSet(before_ns, period_ns, name)
+                return TimerPeriod(before_ns, period_ns, name)
         return None
 
 
@@ -353,7 +355,7 @@ def _parameters(event: object) -> dict[str, str]:
     return found
 
 
-def _sent(rows: Rows, row: OutputRow) -> Iterator[tuple[int, int]]:
+def _sent(rows: EventColumns, row: OutputRow) -> Iterator[tuple[int, int]]:
     """Yield (stamp, content) of an output and of what its sender sends from there on."""
     found = False
     for place, stamp in enumerate(rows.stamp):
@@ -364,7 +366,7 @@ def _sent(rows: Rows, row: OutputRow) -> Iterator[tuple[int, int]]:
                     yield stamp, output[2]
 
 
-def _periods(rows: Rows, number: int) -> list[int]:
+def _periods(rows: EventColumns, number: int) -> list[int]:
     """Return the times between the events of a timer, each once."""
     stamps = [
         rows.stamp[place]

@@ -22,8 +22,8 @@ from rsltrace.diff.alignment.rows import (
     OF_THEIR_OWN,
     SHUTDOWN,
     SUBSCRIPTION,
+    EventColumns,
     OutputRow,
-    Rows,
     counts,
 )
 from rsltrace.diff.causes.relevance import resolved_job
@@ -48,7 +48,7 @@ _DEPTH_MAX = 100
 
 
 @dataclass(slots=True)
-class Origin:
+class DivergenceOrigin:
     """Why an event differs. ``root`` is the number of the divergence it follows from (or is), or
     UNDECIDED until the end of the instant.
 
@@ -59,7 +59,7 @@ class Origin:
     item: EventPair
     root: int
     why: str | None
-    previous: Origin | None
+    previous: DivergenceOrigin | None
     depth: int = 0
 
 
@@ -73,7 +73,7 @@ class FoundDivergence:
     set where nothing but the cause differs. ``swapped`` are the entities that changed places.
     """
 
-    origin: Origin
+    origin: DivergenceOrigin
     stamp: int
     place_a: int
     place_b: int
@@ -93,23 +93,23 @@ class Propagation:
         self.found: list[FoundDivergence] = []
         self.watched: FoundDivergence | None = None
         self._watch = watch
-        self._owners: dict[int, Origin] = {}
-        self._origins_a: dict[int, Origin] = {}
-        self._origins_b: dict[int, Origin] = {}
+        self._owners: dict[int, DivergenceOrigin] = {}
+        self._origins_a: dict[int, DivergenceOrigin] = {}
+        self._origins_b: dict[int, DivergenceOrigin] = {}
         self._block: AlignedBlock
-        self._moment: list[Origin] = []
+        self._moment: list[DivergenceOrigin] = []
         self._moment_stamp = -1
         self._inverted_in: dict[int, int] = {}
-        self._sent: dict[str, Origin] = {}
-        self._drawn: Origin | None = None
-        self._made: dict[int, Origin] = {}
-        self._busy: Origin | None = None
+        self._sent: dict[str, DivergenceOrigin] = {}
+        self._drawn: DivergenceOrigin | None = None
+        self._made: dict[int, DivergenceOrigin] = {}
+        self._busy: DivergenceOrigin | None = None
 
-    def origin_of(self, item: EventPair) -> Origin | None:
+    def origin_of(self, item: EventPair) -> DivergenceOrigin | None:
         """Return why an item differs, if it does."""
         return self._origins_a.get(item.a) or self._origins_b.get(item.b)
 
-    def found_at(self, item: EventPair, origin: Origin) -> FoundDivergence:
+    def found_at(self, item: EventPair, origin: DivergenceOrigin) -> FoundDivergence:
         """Return an item of the last block as what to put in words."""
         reached = self.found[origin.root].reached
         places = self._places(item)
@@ -173,7 +173,7 @@ class Propagation:
         elif item.same:
             # It only changed places: with whom, and whether that was due to something, is known
             # when the instant is over.
-            origin = Origin(item, UNDECIDED, why, previous)
+            origin = DivergenceOrigin(item, UNDECIDED, why, previous)
             self._moment.append(origin)
             self._remember(item, origin)
         else:
@@ -182,7 +182,7 @@ class Propagation:
     def _take_alone(self, item: EventPair) -> None:
         """Take an item that differs and follows from nothing by its cause or its node."""
         rows, index = self._rows(item)
-        previous: Origin | None = None
+        previous: DivergenceOrigin | None = None
         if self._busy is None and self._moved_by(item):
             self._take_others_at(self._first_stamp(item))
             why, previous = self._explanation(item)
@@ -200,7 +200,7 @@ class Propagation:
             if alone and self._block.stamp(item) == stamp and self.origin_of(item) is None:
                 self._take_item(item)
 
-    def _shared_root(self, item: EventPair) -> tuple[str, Origin] | None:
+    def _shared_root(self, item: EventPair) -> tuple[str, DivergenceOrigin] | None:
         """Return what an item follows from that neither its cause nor its node tells: what is drawn
         differently once is drawn differently again, and who is busy for longer keeps others
         waiting."""
@@ -239,17 +239,17 @@ class Propagation:
             for trace, index in ((a, item.a), (b, item.b))
         )
 
-    def _consequence(self, item: EventPair, why: str | None, previous: Origin) -> None:
+    def _consequence(self, item: EventPair, why: str | None, previous: DivergenceOrigin) -> None:
         depth = previous.depth + 1
-        if depth > _DEPTH_MAX:  # lets go of what lies further back
+        if depth > _DEPTH_MAX:  # forgets what is further back
             why, previous, depth = None, self.found[previous.root].origin, 1
-        origin = Origin(item, previous.root, why, previous, depth)
+        origin = DivergenceOrigin(item, previous.root, why, previous, depth)
         self._remember(item, origin)
         self._spread(item, origin)
         if self._watch is not None and self.watched is None and self._watch(item, self._block):
             self.watched = FoundDivergence(origin, self._block.stamp(item), *self._places(item))
 
-    def _rows(self, item: EventPair) -> tuple[Rows, int]:
+    def _rows(self, item: EventPair) -> tuple[EventColumns, int]:
         if item.a >= 0:
             return self._block.rows_a, item.a
         return self._block.rows_b, item.b
@@ -259,7 +259,7 @@ class Propagation:
         return frozenset(rows.number[item.a - rows.first] for item in items)
 
     def _root(self, item: EventPair) -> FoundDivergence:
-        origin = Origin(item, len(self.found), None, None)
+        origin = DivergenceOrigin(item, len(self.found), None, None)
         place_a, place_b = self._places(item)
         found = FoundDivergence(origin, self._first_stamp(item), place_a, place_b)
         self.found.append(found)
@@ -279,7 +279,7 @@ class Propagation:
                 return item.a, other.b
         return (block.end_a, item.b) if item.a < 0 else (item.a, block.end_b)
 
-    def _remember(self, item: EventPair, origin: Origin) -> None:
+    def _remember(self, item: EventPair, origin: DivergenceOrigin) -> None:
         if item.a >= 0:
             self._origins_a[item.a] = origin
         if item.b >= 0:
@@ -303,7 +303,7 @@ class Propagation:
         mark_inverted(copies)
         still = {copy.a: copy.b for copy in copies if copy.inverted}
         swapped = self._entities([origin.item for origin in moment if origin.item.a in still])
-        # What decides between two that are due at once decides every time: that is one divergence.
+        # A tie that is broken differently once is so every time: that is one divergence.
         root = next((found for found in self.found if swapped and swapped <= found.swapped), None)
         for origin in moment:
             item = origin.item
@@ -322,7 +322,7 @@ class Propagation:
 
     # -- why -------------------------------------------------------------------------------------
 
-    def _explanation(self, item: EventPair) -> tuple[str | None, Origin | None]:
+    def _explanation(self, item: EventPair) -> tuple[str | None, DivergenceOrigin | None]:
         """Return what an item follows from: ``cause`` or ``node``, and the origin of that."""
         a, b = self._block.rows_a, self._block.rows_b
         rows, index = self._rows(item)
@@ -341,7 +341,7 @@ class Propagation:
                 return CAUSE, origin
         return (NODE, by_node) if by_node is not None else (None, None)
 
-    def _acting(self, rows: Rows, place: int) -> int:
+    def _acting(self, rows: EventColumns, place: int) -> int:
         """Return whose doing an event is: of a constructor, the node that it starts again (0: it
         starts it for the first time)."""
         matching = rows.run.matching
@@ -350,7 +350,9 @@ class Propagation:
             return rows.owner[place]
         return matching.by_key.get(replace(key, ordinal=key.ordinal - 1), 0)
 
-    def _passes_on(self, origin: Origin, rows: Rows, at: int, item: EventPair) -> bool:
+    def _passes_on(
+        self, origin: DivergenceOrigin, rows: EventColumns, at: int, item: EventPair
+    ) -> bool:
         """Whether the difference of a cause is one that the event it caused can have got.
 
         A message that is the same may still have had another delay.
@@ -382,13 +384,13 @@ class Propagation:
 
     # -- what follows ----------------------------------------------------------------------------
 
-    def _spread(self, item: EventPair, origin: Origin) -> None:
-        """Note whom a differing event reaches: its node, and the topics of what it sent."""
+    def _spread(self, item: EventPair, origin: DivergenceOrigin) -> None:
+        """Note what a differing event affects: its node, and the topics of what it sent."""
         rows, index = self._rows(item)
         place = index - rows.first
         owner = rows.owner[place]
         if item.same:
-            # Changed places: its node notices only if it got two things in another order.
+            # Only reordered: its node notices only if it received two inputs in a different order.
             self._inverted_in[owner] = self._inverted_in.get(owner, 0) + 1
             if self._inverted_in[owner] >= 2:
                 self._taint(owner, origin)
@@ -397,7 +399,7 @@ class Propagation:
         nodes, number = rows.run.matching.nodes, rows.number[place]
         ran_alone = item.a < 0 or item.b < 0
         if ran_alone or not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
-            # What chance decides on the way leaves the sender as it was; its own clock does not.
+            # A draw for a link does not change the sender; one for its clock does.
             self._taint(owner, origin)
         if any(o[0] == _DRAW for o in outputs):
             self._drawn = self._drawn or origin
@@ -461,7 +463,7 @@ class Propagation:
         a = self._block.rows_a
         return list(beyond(a.outputs(item.a), Counter(output[:3] for output in differing)))
 
-    def _taint(self, owner: int, origin: Origin) -> None:
+    def _taint(self, owner: int, origin: DivergenceOrigin) -> None:
         if owner:
             self._owners.setdefault(owner, origin)
 

@@ -1,8 +1,8 @@
-"""The command that records a trace's job once more, with what the command line said of it.
+"""The command that records a trace's job again, with its command line options.
 
 A job that was put together (``--set``, ``--seed``, a launch file, …) begins, in the trace, with
 comments that say of what. Without them the command would record another run. A trace may come from
-anybody and the command is there to be pasted, so it takes from the trace only what is harmless: a
+anyone and the command is meant for pasting, so it uses only what is harmless: a
 job or launch file that is here, and options of a fixed list with numbers, times and names.
 """
 
@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rsltrace.diff.facts.remarks import CannotRepeat, JobChanged, Remark
+from rsltrace.diff.facts.remarks import JobChanged, NoRecordCommand, Remark
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
@@ -70,7 +70,7 @@ _ROS_OPTIONS = {"-r": _REMAPPING, "--remap": _REMAPPING, "-p": _PARAMETER, "--pa
 
 @dataclass(frozen=True, slots=True)
 class RecordAgain:
-    """How a trace's job is recorded once more: a command that is safe to paste, or "".
+    """How a trace's job is recorded again: a command that is safe to paste, or "".
 
     ``warnings`` say why there is none, or what to know of it.
     """
@@ -134,9 +134,9 @@ def record_again(trace: Trace) -> RecordAgain:
     for option, change in options_of(trace):
         _take(words, option, change, name)
     if words.foreign:
-        return RecordAgain("", (CannotRepeat(trace.name, options=tuple(words.foreign)),))
+        return RecordAgain("", (NoRecordCommand(trace.name, options=tuple(words.foreign)),))
     if words.job and not path:
-        return RecordAgain("", (CannotRepeat(trace.name, job=name),))
+        return RecordAgain("", (NoRecordCommand(trace.name, job=name),))
     changed = words.job and not is_same
     return RecordAgain(words.command(), (JobChanged(trace.name, path),) if changed else ())
 
@@ -210,7 +210,7 @@ def _take_launch_file(words: _Words, spec: str, name: str) -> None:
 
 
 def _is_below_here(file: str) -> bool:
-    """Whether a path leads to a file in the present folder or below, and is written so."""
+    """Whether a path leads to a file in the working directory or below, and is written so."""
     path = Path(file)
     if path.is_absolute() or ".." in path.parts or not _LAUNCH_NAME.fullmatch(path.name):
         return False

@@ -1,7 +1,7 @@
 """Which of the settings that differ can be why two runs diverge at a place.
 
 A key that only says what is recorded, a delay of a topic that is not there, the code of another
-node: they differ, and explain nothing. To blame them hides what is not deterministic.
+node: they differ, and explain nothing. Naming them would hide what is nondeterministic.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ _DRAWING_POLICY = "permutation"
 
 
 @dataclass(frozen=True)
-class Place:
+class DivergenceSite:
     """Where two runs diverge, as far as it matters for what can be the cause.
 
     ``nodes`` are the full names of those involved; ``constructing`` says that a node is being made,
-    ``inside`` that a callback got the same at the same time, ``drawn`` that chance decided.
+    ``inside`` that a callback got the same at the same time, ``drawn`` that a random draw differs.
     """
 
     nodes: frozenset[str]
@@ -55,11 +55,11 @@ class Relevance:
     run_b: Run
     _used: dict[str, set[str]] = field(default_factory=dict)
 
-    def of(self, settings: Sequence[Setting], place: Place) -> tuple[Setting, ...]:
+    def of(self, settings: Sequence[Setting], place: DivergenceSite) -> tuple[Setting, ...]:
         """Return the settings that can be why the runs diverge there."""
         return tuple(setting for setting in settings if self._can_matter(setting, place))
 
-    def _can_matter(self, setting: Setting, place: Place) -> bool:
+    def _can_matter(self, setting: Setting, place: DivergenceSite) -> bool:
         if setting.kind is SettingKind.CODE:
             return self._is_code_of(setting.name, place)
         key, *rest = setting.key.split(".") if setting.key else [""]
@@ -76,7 +76,7 @@ class Relevance:
             return not owners or bool(owners & place.nodes)
         return True
 
-    def _is_code_of(self, module: str, place: Place) -> bool:
+    def _is_code_of(self, module: str, place: DivergenceSite) -> bool:
         """Whether a module is one that the nodes may use: not that of other nodes alone."""
         owners = {name for name, of in self._modules.items() if module in self._used_by(of)}
         return not owners or not place.nodes or bool(owners & place.nodes)
@@ -86,7 +86,7 @@ class Relevance:
             self._used[module] = used_by(self._traces, module)
         return self._used[module]
 
-    def _draws(self, place: Place) -> bool:
+    def _draws(self, place: DivergenceSite) -> bool:
         """Whether a node draws random numbers; what the guard does not see is taken for drawn."""
         if any(_value(job, "policy", "order") == _DRAWING_POLICY for job in self._jobs):
             return not place.inside

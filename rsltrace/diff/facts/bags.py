@@ -10,7 +10,7 @@ from enum import Enum
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
-from rsltrace.diff.facts.evidence import FieldDifference, NoFields, Presence
+from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presence
 from rsltrace.diff.facts.remarks import Remark
 
 if TYPE_CHECKING:
@@ -23,13 +23,13 @@ class BagVerdict(Enum):
 
     EQUAL = "equal"
     WITHIN_TOLERANCE = "equal-within-tolerance"
-    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
-    """One of them is cut, and until there they agree (or are equal within tolerance)."""
+    AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
+    """One of them is truncated, and they agree until then (or are equal within tolerance)."""
     DIFFERENT = "different"
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
+class ComparedRecording:
     """One of the two sides. ``kind`` is ``mcap``, ``sqlite3`` or ``trace``.
 
     ``complete`` is false for a file that was cut off and read as far as it goes.
@@ -72,7 +72,7 @@ class MessageDivergence:
     after_ns: int
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
-    no_fields: NoFields | None = None
+    no_fields: NoFieldsReason | None = None
     error: str = ""
     before: tuple[BagMessage, ...] = ()
     moved: bool = False
@@ -84,7 +84,7 @@ class TopicDiff:
     """How the messages of one topic compare; ``first`` is None if nothing but tolerance is between.
 
     ``equal`` messages are the same bit for bit in every field that is compared, ``tolerated`` ones
-    within tolerance, ``ignored`` ones but for fields that are not compared, ``moved`` ones the same
+    within tolerance, ``ignored`` ones except for ignored fields, ``moved`` ones the same
     but in another order. The other counts never include these. ``type_b`` differs from ``type_a``
     only where the recordings disagree about the topic's type.
     """
@@ -108,7 +108,7 @@ class TopicDiff:
 
     @property
     def agreeing(self) -> int:
-        """How many messages are equal, or are so within tolerance and but for what is ignored."""
+        """How many messages are equal, or are so within tolerance and except for ignored fields."""
         return self.equal + self.tolerated + self.ignored
 
 
@@ -130,8 +130,8 @@ class BagComparison:
     the log time).
     """
 
-    a: Recording
-    b: Recording
+    a: ComparedRecording
+    b: ComparedRecording
     verdict: BagVerdict
     by: str
     topics: tuple[TopicDiff, ...] = ()
@@ -140,8 +140,8 @@ class BagComparison:
     first: MessageDivergence | None = None
     next_step: str = ""
     remarks: tuple[Remark, ...] = ()
-    as_far_as_they_go: bool = False
-    """Whether it is enough that they agree as far as they go."""
+    allow_truncated: bool = False
+    """Whether truncated recordings are accepted."""
 
     @property
     def identical(self) -> bool:
@@ -161,7 +161,7 @@ class BagComparison:
     @property
     def agrees_until_cut(self) -> bool:
         """Whether a recording is cut, and they agree as far as both go."""
-        return self.verdict is BagVerdict.AS_FAR_AS_THEY_GO
+        return self.verdict is BagVerdict.AGREE_UNTIL_TRUNCATED
 
     @property
     def failed(self) -> bool:
@@ -178,8 +178,8 @@ class BagComparison:
 
     @property
     def _is_enough(self) -> bool:
-        """Whether agreeing as far as they go was asked for, and something agrees."""
-        return self.as_far_as_they_go and any(t.agreeing for t in self.topics)
+        """Whether truncated recordings are accepted, and something agrees."""
+        return self.allow_truncated and any(t.agreeing for t in self.topics)
 
 
 # -- native runs ---------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ class CallbackTimes:
 
 
 @dataclass(frozen=True, slots=True)
-class Tail:
+class ExtraMessages:
     """A topic of which ``run`` has ``more`` messages, at its end."""
 
     topic: str
@@ -211,7 +211,7 @@ class Tail:
 
 
 @dataclass(frozen=True, slots=True)
-class MovedCallback:
+class ReorderedCallback:
     """A callback that ran in another order: its events."""
 
     entity: EntityKey
@@ -235,8 +235,8 @@ class NativeComparison:
     changed places."""
     first: MessageDivergence | None
     """The first that does, on a topic that both have."""
-    tails: tuple[Tail, ...]
+    tails: tuple[ExtraMessages, ...]
     compared: int
     moved: int
-    first_moved: MovedCallback | None
+    first_moved: ReorderedCallback | None
     callbacks: tuple[CallbackTimes, ...]

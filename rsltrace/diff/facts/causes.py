@@ -1,7 +1,7 @@
 """What a divergence is, and where it comes from.
 
-A ``Judgement`` holds both: ``what`` happened, ``why``, and what is likely behind it. Of ``What``
-and ``Why``, those that say nothing but themselves are members of an enum.
+A ``Judgement`` holds both: ``what`` happened, ``why``, and the likely cause. Facts without
+values of their own are members of ``DivergenceKind`` and ``CauseKind``.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import Enum
 
 from rsltrace.diff.facts.evidence import (
     CallDifference,
-    EntitiesChanged,
+    EntityChanges,
     EventView,
     Fact,
     MessageDifference,
@@ -24,8 +24,8 @@ class Verdict(Enum):
     """Why two runs diverge. The set is closed; ``Diff.sentence`` puts it in words."""
 
     IDENTICAL = "identical"
-    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
-    """One of the recordings is cut, and until there they agree: nobody knows what came after."""
+    AGREE_UNTIL_TRUNCATED = "agree-until-truncated"
+    """One of the recordings is truncated, and they agree until then."""
     DIFFERENT_JOBS = "different-jobs"
     """One of the runs has no event to compare, and their jobs or graphs are others."""
     SAME_INPUT_DIFFERENT_OUTPUT = "same-input-different-output"
@@ -38,11 +38,11 @@ class Verdict(Enum):
     RAN_LONGER = "ran-longer"
     EXCEPTION = "exception"
     DRAW = "draw"
-    """What chance decided about a message: its delay, whether it is lost."""
+    """A random draw for a message: its delay, whether it is lost."""
     GRAPH = "graph"
     ENVIRONMENT = "environment"
     SAME_CONTENT = "same-content"
-    """A run is native, and all messages say the same but for times: what differs is timing, and
+    """A run is native, and all messages are the same except for times: what differs is timing, and
     perhaps the order of callbacks."""
     OTHER_CONTENT = "other-content"
     """A run is native, and messages say something else, or are missing."""
@@ -71,7 +71,7 @@ class Root(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Slept:
+class SleepTimes:
     """How long a callback slept in each run (ns), None where it did not."""
 
     a: int | None
@@ -79,7 +79,7 @@ class Slept:
 
 
 @dataclass(frozen=True, slots=True)
-class StillWaits(Fact):
+class UnfinishedCall(Fact):
     """A call that waited to the end of ``run`` and kept an event from happening there."""
 
     text: str
@@ -88,7 +88,7 @@ class StillWaits(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class QueueOverflowed(Fact):
+class QueueOverflow(Fact):
     """The queue of a subscription was full in ``run``."""
 
     depth: int
@@ -96,20 +96,20 @@ class QueueOverflowed(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NothingArrives(Fact):
+class NoMoreMessages(Fact):
     """A subscription receives nothing more in ``run``."""
 
     run: str
 
 
-Loss = StillWaits | QueueOverflowed | NothingArrives | EntitiesChanged
+Loss = UnfinishedCall | QueueOverflow | NoMoreMessages | EntityChanges
 """Why an event did not happen in one of the runs, as far as that is known."""
 
 
 # -- what --------------------------------------------------------------------------------------
 
 
-class Happening(Enum):
+class DivergenceKind(Enum):
     """What happened, where the events and messages say the rest."""
 
     CONSTRUCTED_IN_ONE = "constructed-in-one"
@@ -130,15 +130,15 @@ class Happening(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherOrder(Fact):
+class DifferentOrder(Fact):
     """The same events ran in another order. ``event`` is one that moved."""
 
     event: EventView
 
 
 @dataclass(frozen=True, slots=True)
-class OnlyInOne(Fact):
-    """An event that only one run has; ``instead`` is what the other went on with."""
+class EventInOneRun(Fact):
+    """An event that only one run has; ``instead`` is what the other continued with."""
 
     instead: EventView | None = None
     loss: Loss | None = None
@@ -146,7 +146,7 @@ class OnlyInOne(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class RaisedInOne(Fact):
+class ExceptionInOneRun(Fact):
     """An exception in one run only, from the same input."""
 
     error: str
@@ -154,24 +154,24 @@ class RaisedInOne(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherTime(Fact):
+class DifferentTime(Fact):
     """An event that both runs have, at another time (or due at another one)."""
 
     periods_ns: tuple[int, int] | None = None
-    slept: Slept | None = None
+    slept: SleepTimes | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class OtherInput(Fact):
+class DifferentInput(Fact):
     """An event that received something else; ``topic`` is empty if that was no message."""
 
     topic: str
 
 
 @dataclass(frozen=True, slots=True)
-class OtherDraw(Fact):
-    """Chance decided otherwise about ``message``, and about ``more``. ``connected`` is False where
-    one run has nothing to draw for: what it sends reaches nobody there."""
+class DifferentDraw(Fact):
+    """A random draw for ``message`` differs, and ``more``. ``connected`` is False where
+    one run has nothing to draw for: its output has no receiver there."""
 
     message: MessageDifference
     more: int
@@ -181,10 +181,10 @@ class OtherDraw(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherOutput(Fact):
+class DifferentOutput(Fact):
     """The same input, another output."""
 
-    slept: Slept | None = None
+    slept: SleepTimes | None = None
     only_slept: bool = False
 
 
@@ -204,33 +204,33 @@ class RunEnd:
 
 
 @dataclass(frozen=True, slots=True)
-class EndedBefore(Fact):
-    """One run was over, the other did the same until then and went on."""
+class EarlierEnd(Fact):
+    """One run ended; the other was identical until then and continued."""
 
     over: RunEnd
     other: RunEnd
 
 
-What = (
-    Happening
-    | OtherOrder
-    | OnlyInOne
-    | RaisedInOne
-    | OtherTime
-    | OtherInput
-    | OtherDraw
-    | OtherOutput
-    | EndedBefore
-    | EntitiesChanged
+DivergenceFact = (
+    DivergenceKind
+    | DifferentOrder
+    | EventInOneRun
+    | ExceptionInOneRun
+    | DifferentTime
+    | DifferentInput
+    | DifferentDraw
+    | DifferentOutput
+    | EarlierEnd
+    | EntityChanges
 )
 
 
 # -- why ---------------------------------------------------------------------------------------
 
 
-class Reason(Enum):
-    """Why, where events, messages and settings say the rest. If settings are to blame that is what
-    is told; else what its name says."""
+class CauseKind(Enum):
+    """Why, where events, messages and settings say the rest. Settings that can be the cause are
+    named instead."""
 
     CONSTRUCTOR = "constructor"
     READY_AT_ONCE = "ready-at-once"
@@ -263,7 +263,7 @@ class ParameterFiles(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class WaitedFor(Fact):
+class WaitInOneRun(Fact):
     """A callback that waited, in one run only, for what ``cause`` sent."""
 
     cause: EventView
@@ -278,7 +278,7 @@ class NotDelivered(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class CameFrom(Fact):
+class DifferentSenders(Fact):
     """The inputs came from other events."""
 
     a: EventView
@@ -286,7 +286,7 @@ class CameFrom(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NothingBefore(Fact):
+class NoEarlierDifference(Fact):
     """Nothing that the traces show differs before. ``doubt`` is what is not deterministic if no
     setting explains it: the kind of what ran, or ``time``."""
 
@@ -296,7 +296,7 @@ class NothingBefore(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NothingLeft(Fact):
+class NoEventsLeft(Fact):
     """``run`` had nothing left to do, since an event is missing in it: see ``alone``."""
 
     run: str
@@ -304,29 +304,29 @@ class NothingLeft(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class FollowsFrom(Fact):
+class Consequence(Fact):
     """A consequence: ``root`` is where the runs diverged before."""
 
     root: Judgement
 
 
 @dataclass(frozen=True, slots=True)
-class CauseOf(Fact):
+class SameCause(Fact):
     """The same as that of ``first``: of an effect, the cause of how its node was set up."""
 
     first: Judgement
 
 
-Why = (
-    Reason
+CauseFact = (
+    CauseKind
     | ParameterFiles
-    | WaitedFor
+    | WaitInOneRun
     | NotDelivered
-    | CameFrom
-    | NothingBefore
-    | NothingLeft
-    | FollowsFrom
-    | CauseOf
+    | DifferentSenders
+    | NoEarlierDifference
+    | NoEventsLeft
+    | Consequence
+    | SameCause
 )
 
 
@@ -334,8 +334,8 @@ Why = (
 
 
 @dataclass(frozen=True, slots=True)
-class OutsideAnswers(Fact):
-    """``subject`` (a node or main, or nobody) asked the outside and got other answers."""
+class ExternalAnswers(Fact):
+    """``subject`` (a node or main, or empty) got different external answers."""
 
     subject: str
     calls: tuple[CallDifference, ...]
@@ -353,7 +353,7 @@ class SetOrder(Fact):
 
 @dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
-    """An answer from outside that nobody kept: it may be behind it. ``source`` is the key of
+    """An unrecorded external answer: a possible cause. ``source`` is the key of
     ``guard:`` that keeps it."""
 
     call: str
@@ -361,7 +361,7 @@ class UnrecordedAnswer(Fact):
     source: str
 
 
-LikelyCause = OutsideAnswers | SetOrder | UnrecordedAnswer | EntitiesChanged
+LikelyCause = ExternalAnswers | SetOrder | UnrecordedAnswer | EntityChanges
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,8 +377,8 @@ class Judgement:
 
     verdict: Verdict
     root: Root
-    what: What
-    why: Why | None
+    what: DivergenceFact
+    why: CauseFact | None
     a: EventView | None
     b: EventView | None
     messages: tuple[MessageDifference, ...] = ()
@@ -394,11 +394,11 @@ class Judgement:
         return self.a or self.b
 
     @property
-    def changed(self) -> EntitiesChanged | None:
+    def changed(self) -> EntityChanges | None:
         """The entities whose properties show in it."""
-        if isinstance(self.what, OnlyInOne) and isinstance(self.what.loss, EntitiesChanged):
+        if isinstance(self.what, EventInOneRun) and isinstance(self.what.loss, EntityChanges):
             return self.what.loss
-        return self.what if isinstance(self.what, EntitiesChanged) else None
+        return self.what if isinstance(self.what, EntityChanges) else None
 
     @property
     def is_unexplained(self) -> bool:
@@ -407,10 +407,10 @@ class Judgement:
             return False
         why, one = self.why, self.one
         if isinstance(why, NotDelivered):
-            return isinstance(why.loss, NothingArrives | EntitiesChanged)
-        if why is Reason.NOTHING_MADE_IT_RUN:
+            return isinstance(why.loss, NoMoreMessages | EntityChanges)
+        if why is CauseKind.NOTHING_MADE_IT_RUN:
             return one is not None and bool(one.entity.node or one.entity.kind in NO_CALLBACKS)
-        return why is Reason.CONSTRUCTOR or isinstance(why, NothingBefore | WaitedFor)
+        return why is CauseKind.CONSTRUCTOR or isinstance(why, NoEarlierDifference | WaitInOneRun)
 
 
 NO_CALLBACKS = ("main", "thread")

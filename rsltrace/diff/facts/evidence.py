@@ -119,8 +119,8 @@ def node_of(entity: EntityKey) -> str:
 
 # -- fields ------------------------------------------------------------------------------------
 
-ULP_TOLD_MAX = 1_000_000
-"""Reports tell smaller distances in units in the last place: larger ones are no rounding."""
+ULP_SHOWN_MAX = 1_000_000
+"""Up to this, reports show a distance in units in the last place."""
 
 
 class FieldNoteKind(Enum):
@@ -194,12 +194,12 @@ class FieldDifference:
 
 
 @dataclass(frozen=True, slots=True)
-class Moved(Fact):
+class OutputOrder(Fact):
     """An output that both runs have, in another order."""
 
 
 @dataclass(frozen=True, slots=True)
-class SentTimes(Fact):
+class SendCount(Fact):
     """How often both runs sent the same."""
 
     a: int
@@ -207,7 +207,7 @@ class SentTimes(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class SentLater(Fact):
+class SendDelay(Fact):
     """A run sent the same, later."""
 
     by_ns: int
@@ -215,15 +215,15 @@ class SentLater(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class TimerCancelled(Fact):
+class TimerCancellation(Fact):
     """A timer was cancelled, in one run."""
 
     run: str
 
 
 @dataclass(frozen=True, slots=True)
-class TimerPeriodSet(Fact):
-    """A timer got another period, in one run; ``before_ns`` is None where nobody knows the old."""
+class TimerPeriod(Fact):
+    """A timer got another period, in one run; ``before_ns`` is None if the old one is unknown."""
 
     before_ns: int | None
     after_ns: int
@@ -231,27 +231,27 @@ class TimerPeriodSet(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ParametersSet(Fact):
+class ParameterValues(Fact):
     """Parameters that only one run set: (name, value)."""
 
     values: tuple[tuple[str, str], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class ParametersChanged(Fact):
+class ParameterChanges(Fact):
     """Parameters that both runs set, to another value: (name, a, b)."""
 
     values: tuple[tuple[str, str, str], ...]
 
 
-Fate = (
-    Moved
-    | SentTimes
-    | SentLater
-    | TimerCancelled
-    | TimerPeriodSet
-    | ParametersSet
-    | ParametersChanged
+OutputFate = (
+    OutputOrder
+    | SendCount
+    | SendDelay
+    | TimerCancellation
+    | TimerPeriod
+    | ParameterValues
+    | ParameterChanges
 )
 """What became of an output."""
 
@@ -259,7 +259,7 @@ Fate = (
 NO_ENTITY = EntityKey("", "", "", "")
 
 
-class NoFields(Enum):
+class NoFieldsReason(Enum):
     """Why no field of a message is shown."""
 
     ALL_IGNORED = "all-ignored"
@@ -293,9 +293,9 @@ class MessageDifference:
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
     preview: str = ""
-    no_fields: NoFields | None = None
+    no_fields: NoFieldsReason | None = None
     error: str = ""
-    fate: Fate | None = None
+    fate: OutputFate | None = None
     code: tuple[str, ...] = ()
     entity: EntityKey = NO_ENTITY
 
@@ -304,7 +304,7 @@ class MessageDifference:
         """Whether all that differs in it is ignored or within tolerance."""
         if self.fields:  # what nothing covers comes first
             return self.fields[0].within_tolerance
-        return self.no_fields is NoFields.ALL_IGNORED
+        return self.no_fields is NoFieldsReason.ALL_IGNORED
 
     @property
     def is_input(self) -> bool:
@@ -333,7 +333,7 @@ class EntityChange:
 
 
 @dataclass(frozen=True, slots=True)
-class EntitiesChanged(Fact):
+class EntityChanges(Fact):
     """Entities that both runs made, with other properties."""
 
     changes: tuple[EntityChange, ...]
@@ -357,7 +357,7 @@ class CallDifference:
     """A call whose answer came from outside, in a diverging event or (``event_*``) before it.
 
     ``a`` and ``b`` are what it gave, as text; None where a run did not make the call. ``subject``
-    is what it asked for (``MOTOR_SEED``, ``gains.yaml``), ``short`` what tells both answers apart.
+    is what it asked for (``MOTOR_SEED``, ``gains.yaml``), ``short`` what distinguishes the answers.
     ``only_touched``: nothing of a file differs but when it was written.
     """
 
@@ -413,7 +413,7 @@ class LinkKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class CauseLink:
     """How an event led to the next: over which topic, node, …, or over how many ``steps``."""
 
     kind: LinkKind = LinkKind.NOTHING
@@ -431,11 +431,11 @@ class CauseStep:
 
     a: EventView | None
     b: EventView | None
-    link: Link = Link()
+    link: CauseLink = CauseLink()
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
+class AffectedTopic:
     """A topic that the divergence reaches, and how long (simulated ns) after it.
 
     ``moved_ns``: the first message is the same one in b, only so much later (negative: earlier).

@@ -9,14 +9,14 @@ from rsltrace.diff.facts.evidence import Fact
 
 
 @dataclass(frozen=True, slots=True)
-class Told(Fact):
-    """What a reader of recordings has said."""
+class ReaderNote(Fact):
+    """A note of the reader of a recording."""
 
     text: str
 
 
 @dataclass(frozen=True, slots=True)
-class Interrupted(Fact):
+class TruncatedRecording(Fact):
     """The recording of ``run`` is cut off."""
 
     run: str
@@ -36,7 +36,7 @@ class EndedByException(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherEnd(Fact):
+class DifferentEnd(Fact):
     """Identical events, another ``what`` (reason, exit code)."""
 
     what: str
@@ -45,7 +45,7 @@ class OtherEnd(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedAs(Fact):
+class RenamedProgram(Fact):
     """Two names of one program."""
 
     a: str
@@ -53,22 +53,22 @@ class ComparedAs(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NothingAskedFor(Fact):
-    """No difference among what was asked for (globs)."""
+class SelectionIsEqual(Fact):
+    """No difference among the selected names (globs)."""
 
     asked: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class ShownLater(Fact):
-    """The runs diverge at event ``start``; shown is where what was asked for differs."""
+class SelectionDivergesLater(Fact):
+    """The runs diverge at event ``start``; shown is where a selected name differs."""
 
     start: int
     asked: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
-class ShownPastTolerated(Fact):
+class StartIsTolerated(Fact):
     """At event ``start`` all that differs is ignored or within tolerance; shown is what is not."""
 
     start: int
@@ -83,8 +83,8 @@ class MoreDivergences(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class CannotRepeat(Fact):
-    """There is no command to record a trace once more: it takes ``options`` that could run code, or
+class NoRecordCommand(Fact):
+    """There is no command to record a trace again: it takes ``options`` that could run code, or
     the ``job`` is not here."""
 
     trace: str
@@ -106,7 +106,7 @@ class LogTimesIgnored(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class OtherType(Fact):
+class DifferentType(Fact):
     """A topic that has another type in each recording."""
 
     topic: str
@@ -115,27 +115,27 @@ class OtherType(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class ComparedByBytes(Fact):
+class UndecodedMessages(Fact):
     """Messages that could not be decoded."""
 
     error: str
 
 
 Remark = (
-    Told
-    | Interrupted
+    ReaderNote
+    | TruncatedRecording
     | EndedByException
-    | OtherEnd
-    | ComparedAs
-    | NothingAskedFor
-    | ShownLater
-    | ShownPastTolerated
+    | DifferentEnd
+    | RenamedProgram
+    | SelectionIsEqual
+    | SelectionDivergesLater
+    | StartIsTolerated
     | MoreDivergences
-    | CannotRepeat
+    | NoRecordCommand
     | JobChanged
     | LogTimesIgnored
-    | OtherType
-    | ComparedByBytes
+    | DifferentType
+    | UndecodedMessages
 )
 
 
@@ -144,7 +144,7 @@ Remark = (
 
 @dataclass(frozen=True, slots=True)
 class Identical(Fact):
-    """All events are the same; ``names_differ``: but for names of programs."""
+    """All events are the same; ``names_differ``: except for program names."""
 
     events: int
     digest: str = ""
@@ -152,7 +152,7 @@ class Identical(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class AgreeUntilCut(Fact):
+class EqualUntilTruncated(Fact):
     """They agree as far as the recordings go that are ``cut``."""
 
     events: int
@@ -168,7 +168,7 @@ class DifferentJobs(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class Diverged(Fact):
+class RunsDiverge(Fact):
     """See the divergences. ``searched_to`` is the event up to which no effect of another set-up was
     found (-1: to the end), None if none was looked for, or one was found. ``foreign`` are the names
     of the jobs where the runs have no node in common."""
@@ -178,11 +178,11 @@ class Diverged(Fact):
 
 
 @dataclass(frozen=True, slots=True)
-class NativeCompared(Fact):
+class NativeRuns(Fact):
     """See ``Diff.native``."""
 
 
-Outcome = Identical | AgreeUntilCut | DifferentJobs | Diverged | NativeCompared
+Outcome = Identical | EqualUntilTruncated | DifferentJobs | RunsDiverge | NativeRuns
 
 
 # -- which of two runs a third one repeats -------------------------------------------------------

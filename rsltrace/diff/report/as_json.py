@@ -16,7 +16,7 @@ from typing import Any
 
 from rsltrace.diff.exit_codes import exit_code_of_several
 from rsltrace.diff.facts.bags import MessageDivergence
-from rsltrace.diff.facts.causes import CauseOf, Judgement
+from rsltrace.diff.facts.causes import Judgement, SameCause
 from rsltrace.diff.facts.evidence import (
     CauseStep,
     EventView,
@@ -26,8 +26,8 @@ from rsltrace.diff.facts.evidence import (
     Setting,
 )
 from rsltrace.diff.result import BagDiff, Diff, Divergence
-from rsltrace.diff.sentences.runs import moved_text
-from rsltrace.diff.sentences.values import fate_text, link_text, no_fields_text, notes_text
+from rsltrace.diff.sentences.runs import order_text
+from rsltrace.diff.sentences.values import link_text, no_fields_text, notes_text, output_change_text
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.words.entities import EntityKey
@@ -114,11 +114,15 @@ def _judgement(found: Judgement) -> dict[str, Any]:
 
 
 def _message(message: MessageDifference) -> dict[str, Any]:
-    return {**_fields(message), "note": fate_text(message), "reason": no_fields_text(message)}
+    return {
+        **_fields(message),
+        "note": output_change_text(message),
+        "reason": no_fields_text(message),
+    }
 
 
 def _bag_message(found: MessageDivergence) -> dict[str, Any]:
-    return {**_fields(found), "note": moved_text(found), "reason": no_fields_text(found)}
+    return {**_fields(found), "note": order_text(found), "reason": no_fields_text(found)}
 
 
 def _setting(setting: Setting) -> dict[str, Any]:
@@ -154,7 +158,7 @@ _FORMS: dict[type, Callable[[Any], Any]] = {
     EventView: _event,
     Divergence: _divergence,
     Judgement: _judgement,
-    CauseOf: lambda why: {"fact": "cause_of", "first": _judgement(why.first)},
+    SameCause: lambda why: {"fact": "same_cause", "first": _judgement(why.first)},
     MessageDifference: _message,
     MessageDivergence: _bag_message,
     Setting: _setting,

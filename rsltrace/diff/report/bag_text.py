@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from rsltrace.diff.facts.bags import (
     BagComparison,
     BagMessage,
+    ComparedRecording,
     LoneTopic,
     MessageDivergence,
     NativeComparison,
-    Recording,
     TopicDiff,
 )
 from rsltrace.diff.facts.evidence import Presence
@@ -33,7 +33,7 @@ from rsltrace.diff.report.line import (
     wrapped,
 )
 from rsltrace.diff.result import BagDiff
-from rsltrace.diff.sentences.runs import moved_text, tail_text
+from rsltrace.diff.sentences.runs import order_text, tail_text
 from rsltrace.diff.sentences.values import no_fields_text
 from rsltrace.trace.model.texts import (
     format_duration,
@@ -58,7 +58,7 @@ _RARE = ("ignored", "moved")
 def bag_report(
     diff: BagDiff, options: DiffOptions, width: int = 100, height: int = HEIGHT
 ) -> list[Line]:
-    """Return the report of two recordings, at most ``height`` lines unless all is asked for."""
+    """Return the report of two recordings: ``height`` lines at most, or ``options.everything``."""
     good = not diff.failed
     verdict = f"{diff.verdict.value}; messages matched by {diff.by}"
     sides = [_facts(side) for side in (diff.a, diff.b)]
@@ -76,13 +76,13 @@ def bag_report(
     return fitted(head, sections, None if options.everything else height)
 
 
-def _facts(side: Recording) -> list[Piece]:
+def _facts(side: ComparedRecording) -> list[Piece]:
     return [
         (printable(side.path), ""),
         (printable(side.kind), ""),
         (f"{side.messages} messages", ""),
         (format_duration(side.end_ns - side.start_ns), ""),
-        ("" if side.complete else "cut off", Style.FAINT),
+        ("" if side.complete else "truncated", Style.FAINT),
     ]
 
 
@@ -93,13 +93,13 @@ def divergence_section(found: MessageDivergence, width: int) -> Section:
     cells = []
     for name, style, message in (("a", Style.SIDE_A, found.a), ("b", Style.SIDE_B, found.b)):
         if message is None:
-            cells.append([(name, style), ("nothing here", Style.FAINT)])
+            cells.append([(name, style), ("no such message", Style.FAINT)])
         else:
             time = f"log time {format_seconds(message.stamp_ns)} s"
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])
     rows += in_columns(cells)
     only = None if found.presence is Presence.BOTH else found.a or found.b
-    if moved := moved_text(found):
+    if moved := order_text(found):
         only = found.a
         rows.append(line(f"    {printable(moved)}"))
     preview = only.preview if only is not None else ""

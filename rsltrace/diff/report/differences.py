@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rsltrace.diff.facts.evidence import (
-    ULP_TOLD_MAX,
+    ULP_SHOWN_MAX,
     FieldDifference,
     MessageDifference,
     Presence,
 )
 from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
-from rsltrace.diff.sentences.values import fate_text, notes_text
+from rsltrace.diff.sentences.values import notes_text, output_change_text
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.words.code import places_text
@@ -42,7 +42,7 @@ def message_title(message: MessageDifference) -> str:
     if message.type and message.kind in _TYPED:
         text += f" ({printable(message.type)})"
     if message.kind is OutputKind.TIMER and message.fate is not None:
-        text += f", {fate_text(message)}"
+        text += f", {output_change_text(message)}"
     elif message.presence is not Presence.BOTH:
         text += f", {message.presence.value}"
     if message.code:
@@ -68,7 +68,7 @@ def distance_text(difference: FieldDifference) -> str:
             parts.append(f"|a-b| {difference.largest:.6g}")
         else:
             parts.append(f"|a-b| {difference.smallest:.6g} to {difference.largest:.6g}")
-    if difference.ulp is not None and difference.ulp <= ULP_TOLD_MAX:
+    if difference.ulp is not None and difference.ulp <= ULP_SHOWN_MAX:
         several = difference.elements is not None and difference.elements[0] > 1
         parts.append(f"{'up to ' if several else ''}{difference.ulp} ulp")
     if difference.notes:

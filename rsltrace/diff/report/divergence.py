@@ -26,7 +26,7 @@ from rsltrace.trace.words.kinds import flag_names
 from rsltrace.trace.words.phrases import event_title, seconds_text
 
 CONTEXT = 5
-"""Events before a divergence that are shown unless another number is asked for."""
+"""Events before a divergence that are shown by default."""
 _DEPTH_MAX = 6
 _SIDE_BY_SIDE = 100
 """Columns of a screen in which two lists of events stand side by side."""
@@ -91,7 +91,7 @@ def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
 def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> list[Line]:
     rows = []
     for name, style, event in sides:
-        cells = event_cells(event) if event is not None else [("nothing here", Style.FAINT)]
+        cells = event_cells(event) if event is not None else [("no such event", Style.FAINT)]
         rows.append([(name, style), *cells])
     return [cut(row, width) for row in in_columns(rows, widest=52)]
 
@@ -124,7 +124,7 @@ def _state(found: Divergence, width: int) -> Section:
         )
         for one in found.state
     ]
-    title = line(("state of the node after it", Style.TITLE))
+    title = line(("state of the node afterwards", Style.TITLE))
     return Section(title, rows, 6, "values", least=2, rank=3)
 
 
@@ -157,10 +157,10 @@ def _calls(found: Divergence, width: int) -> Section:
                 for name, style, value in (("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)):
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
         rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
-    if len(rows) == 2:  # one call, with its answers beside it, and where it was made
-        rows[0] = cut(line(("call from outside: ", Style.TITLE), *rows[0][1:]), width)
+    if len(rows) == 2:  # one call on one line, and its place
+        rows[0] = cut(line(("external call: ", Style.TITLE), *rows[0][1:]), width)
         return Section((), rows, 2, "", least=1, rank=rank)
-    title = "calls whose answers come from outside"
+    title = "external calls"
     return Section(line((title, Style.TITLE)), rows, 8, "lines", least=3, rank=rank)
 
 
@@ -292,12 +292,12 @@ def _reaches(found: Divergence, width: int) -> Section:
         return NOTHING
     parts = []
     for reach in found.reaches:
-        when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "at once"
+        when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "immediately"
         moved = f" ({moved_text(reach.moved_ns)})" if reach.moved_ns else ""
         parts.append(f"{printable(reach.topic)} {when}{moved}")
     for shown in range(len(parts), 0, -1):
         more = [f"and {len(parts) - shown} more"] if shown < len(parts) else []
-        rows = wrapped(f"reaches {', '.join(parts[:shown] + more)}", width, indent="  ")
+        rows = wrapped(f"affects {', '.join(parts[:shown] + more)}", width, indent="  ")
         if len(rows) <= _REACHES_LINES:
             break
     return Section((), rows, len(rows), "", len(rows), rank=5)
@@ -324,7 +324,7 @@ def event_cells(event: EventView) -> list[Piece]:
 
 
 def event_key(event: EventView) -> tuple[object, ...]:
-    """Return what is equal for events that are the same but for their place in the run."""
+    """Return what is equal for events that are the same except for their place in the run."""
     return (
         event.entity,
         event.stamp_ns,

@@ -1,6 +1,6 @@
 """Lines of a report as pieces of styled text, so that one layout serves terminal and pipe.
 
-A style says what a piece is, not what it looks like; without colours the text alone must do.
+A style says what a piece is, not its colour; the text must do without colours.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Style:
 
 
 HEIGHT = 40
-"""Lines of a report unless more is asked for, or the terminal says otherwise."""
+"""Lines of a report by default, unless the terminal has another height."""
 
 _PATH_LEAST = 20
-"""Characters of a path that stay: enough to tell the files of one folder apart."""
+"""Characters of a path that stay: enough to distinguish the files of one folder."""
 
 _PATH_SHORT = 10
 """Characters that stay in a very narrow terminal."""
@@ -199,7 +199,7 @@ NOTHING = Section((), [], 0, "")
 
 _SENTENCE_LINES = 6
 _NOTES_LEAST = 2
-_LEFT_OUT = line(("… a taller terminal shows more, and so does | less", Style.FAINT))
+_LEFT_OUT = line(("… a taller terminal or | less shows more", Style.FAINT))
 
 
 def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:

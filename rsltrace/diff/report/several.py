@@ -46,7 +46,7 @@ def how_many_fail(diffs: Sequence[Diff | BagDiff], golden: str = "") -> str:
     said = f"{diverged} of {len(diffs)} runs diverge{'s' if diverged == 1 else ''}"
     said += f" from {golden}" if golden else ""
     of = "" if diverged else f" of {len(diffs)} runs"
-    also = f"{cut}{of} agree{'s' if cut == 1 else ''} only as far as the recordings go"
+    also = f"{cut}{of} agree{'s' if cut == 1 else ''} only up to where a recording is truncated"
     return also if not diverged else f"{said}, {also}" if cut else said
 
 
@@ -54,7 +54,7 @@ def how_all_agree(diffs: Sequence[Diff | BagDiff], golden: str = "") -> str:
     """Return ``all runs agree``, and how many are cut."""
     cut = sum(diff.agrees_until_cut for diff in diffs)
     agree = f"all {len(diffs)} runs agree with {golden}" if golden else "all runs agree"
-    return agree + (f", {cut} of them as far as the recordings go" if cut else "")
+    return agree + (f", {cut} of them only up to where a recording is truncated" if cut else "")
 
 
 def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:

@@ -1,4 +1,4 @@
-"""The report as a person reads it, whatever was compared."""
+"""The report as text, of any comparison."""
 
 from __future__ import annotations
 

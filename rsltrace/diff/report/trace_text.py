@@ -24,7 +24,7 @@ from rsltrace.diff.report.line import (
     notes_section,
     wrapped,
 )
-from rsltrace.diff.result import Diff, Side
+from rsltrace.diff.result import ComparedRun, Diff
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
 from rsltrace.trace.model.texts import format_seconds, printable, told_apart
@@ -87,11 +87,11 @@ def _is_hint(remark: Remark) -> bool:
 def _head(diff: Diff, width: int) -> list[Line]:
     agree = f"the first {diff.agreeing} events agree"
     if diff.agreeing < 2:
-        agree = "the first event agrees" if diff.agreeing else "no event before agrees"
+        agree = "the first event agrees" if diff.agreeing else "the first events already differ"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
     if diff.native is not None:
-        verdict = f"{diff.verdict.value}; times are not compared, nor fields named stamp"
-    verdict += "; shown is the first effect" if diff.effect is not None else ""
+        verdict = f"{diff.verdict.value}; times and fields named stamp are not compared"
+    verdict += "; this is the first effect" if diff.effect is not None else ""
     sides = [_facts(side, width) for side in (diff.a, diff.b)]
     same = diff.native is not None and diff.within_tolerance
     good = diff.identical or same or (diff.agrees_until_cut and not diff.failed)
@@ -104,7 +104,7 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
         return []
     if diff.within_tolerance:
         tolerated = any(topic.tolerated for topic in diff.tolerance.topics)
-        how = "within tolerance" if tolerated else "but for what is ignored"
+        how = "within tolerance" if tolerated else "except for ignored fields"
         text = f"equal {how}, not identical: the digests differ"
     else:
         said = printable(recordings_sentence(diff.tolerance, "the messages"))
@@ -112,10 +112,10 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
 
-def _facts(side: Side, width: int) -> list[Piece]:
+def _facts(side: ComparedRun, width: int) -> list[Piece]:
     narrow = width < _NARROW
     time = seconds_text(side.end_ns) if narrow else format_seconds(side.end_ns)
-    ended = side.stop_reason or ("" if side.complete else "interrupted")
+    ended = side.stop_reason or ("" if side.complete else "truncated")
     return [
         (printable(side.path), ""),
         (f"{side.events} events", ""),
@@ -133,12 +133,12 @@ def _afterwards(diff: Diff, width: int) -> Section:
         for name in ("matching", "differing", "only_a", "only_b")
     ]
     text = (
-        f"from there to event {diff.aligned_to[0]} of a and {diff.aligned_to[1]} of b: "
+        f"after it, up to event {diff.aligned_to[0]} of a and {diff.aligned_to[1]} of b: "
         f"{total[0]} events match, {total[1]} differ, {total[2]} only in a, {total[3]} only in b"
     )
     if diff.resync_index is not None:
         a, b = diff.resync_index
-        text += f"; they agree again from event {a} of a, {b} of b on"
+        text += f"; the runs agree again from event {a} of a and {b} of b"
     rows = wrapped(text, width, indent="  ")
     least = len(rows)
     worst = sorted(diff.counts, key=lambda c: c.differing + c.only_a + c.only_b, reverse=True)

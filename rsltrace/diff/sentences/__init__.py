@@ -1,7 +1,6 @@
-"""The words of a diff: facts as English, for people. Nothing else in ``rsltrace.diff`` makes
-sentences of facts, and nothing reads them.
+"""The sentences of a diff, made from facts. Only this package makes them; nothing reads them.
 
-``sentence(fact, of)`` looks up what is said of a fact: by its class, or itself for a member of an
+``sentence(fact, of)`` looks up the sentence for a fact: by its class, or itself for a member of an
 enum. ``of`` is what the fact belongs to (a ``Judgement`` or a ``Diff``). The modules of this
 package fill the table: ``divergence``, ``runs``, and ``values`` for what is inside of sentences.
 """
@@ -29,5 +28,5 @@ def says(*facts: Any) -> Callable[[_Made], _Made]:
 
 
 def sentence(fact: Any, of: Any = None) -> str:
-    """Return what is said of a fact."""
+    """Return the sentence for a fact."""
     return SENTENCES[fact if isinstance(fact, Enum) else type(fact)](fact, of)

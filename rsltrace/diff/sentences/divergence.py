@@ -6,56 +6,56 @@ from collections.abc import Sequence
 
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
-    CameFrom,
-    CauseOf,
-    EndedBefore,
-    FollowsFrom,
-    Happening,
+    CauseKind,
+    Consequence,
+    DifferentDraw,
+    DifferentInput,
+    DifferentOrder,
+    DifferentOutput,
+    DifferentSenders,
+    DifferentTime,
+    DivergenceKind,
+    EarlierEnd,
+    EventInOneRun,
+    ExceptionInOneRun,
+    ExternalAnswers,
     Judgement,
+    NoEarlierDifference,
+    NoEventsLeft,
+    NoMoreMessages,
     NotDelivered,
-    NothingArrives,
-    NothingBefore,
-    NothingLeft,
-    OnlyInOne,
-    OtherDraw,
-    OtherInput,
-    OtherOrder,
-    OtherOutput,
-    OtherTime,
-    OutsideAnswers,
     ParameterFiles,
-    QueueOverflowed,
-    RaisedInOne,
-    Reason,
+    QueueOverflow,
     RunEnd,
+    SameCause,
     SetOrder,
-    Slept,
-    StillWaits,
+    SleepTimes,
+    UnfinishedCall,
     UnrecordedAnswer,
     Verdict,
-    WaitedFor,
+    WaitInOneRun,
 )
 from rsltrace.diff.facts.evidence import (
     CallDifference,
-    EntitiesChanged,
     EntityChange,
+    EntityChanges,
     EventView,
     MessageDifference,
     Presence,
     Setting,
     SettingKind,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.diff.sentences.values import (
     IN_ONE,
     NAMED_MAX,
     a_first,
     because_of,
     durations,
-    fate_text,
     field_text,
     joined,
     listed,
+    output_change_text,
     pair_text,
     state_text,
     what_differs,
@@ -113,33 +113,28 @@ def sentence_of(of: Judgement) -> str:
     text = sentence(of.what, of)
     if of.node_diverged:
         text += ", because its node had already diverged"
-    if isinstance(of.what, EntitiesChanged):
+    if isinstance(of.what, EntityChanges):
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
-@says(Happening.CONSTRUCTED_IN_ONE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.CONSTRUCTED_IN_ONE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     has, has_not = _has(of)
     name = _one(of).entity.name or "a part of the run"
-    return f"the graphs differ: {name} is constructed in {has} and not in {has_not}"
+    return f"the graphs differ: {name} is constructed in {has} but not in {has_not}"
 
 
-@says(Happening.NODE_RENAMED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.NODE_RENAMED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     return f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
 
 
-@says(Happening.CONSTRUCTION_ORDER)
-def _(what: Happening, of: Judgement) -> str:
-    return "the nodes are constructed in another order"
-
-
-@says(Happening.OTHER_ENTITIES)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_ENTITIES)
+def _(what: DivergenceKind, of: Judgement) -> str:
     changed = a_first([m for m in of.messages if m.kind is OutputKind.ENTITY])
     types: dict[str, list[str]] = {}
     for m in changed:
@@ -150,28 +145,28 @@ def _(what: Happening, of: Judgement) -> str:
         else f"{m.topic} {IN_ONE.get(m.presence, 'differs')}"
         for m in changed
     ]
-    return f"the graphs differ: {phrase(_one(of))} made other entities ({listed(things)})"
+    return f"the graphs differ: {phrase(_one(of))} created different entities ({listed(things)})"
 
 
-@says(Happening.OTHER_CONSTRUCTION, Happening.OTHER_CONSTRUCTION_SAME_JOB)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_CONSTRUCTION, DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB)
+def _(what: DivergenceKind, of: Judgement) -> str:
     text = f"{phrase(_one(of))} {_did(of.messages)}"
-    same = what is Happening.OTHER_CONSTRUCTION_SAME_JOB
+    same = what is DivergenceKind.OTHER_CONSTRUCTION_SAME_JOB
     return f"{text}, in the same job and environment" if same else text
 
 
-@says(OtherOrder)
-def _(what: OtherOrder, of: Judgement) -> str:
-    text = f"{at_time(what.event.stamp_ns)} the same events ran in another order"
+@says(DifferentOrder)
+def _(what: DifferentOrder, of: Judgement) -> str:
+    text = f"{at_time(what.event.stamp_ns)} the same events ran in a different order"
     if of.a is None or of.b is None:
         return text
     if of.a.entity == of.b.entity:
-        return f"{text}: {phrase(what.event)} took two inputs the other way round"
-    return f"{text}: first {phrase(of.a)} in a, first {phrase(of.b)} in b"
+        return f"{text}: {phrase(what.event)} received two inputs in swapped order"
+    return f"{text}: {phrase(of.a)} ran first in a, {phrase(of.b)} in b"
 
 
-@says(OnlyInOne)
-def _(what: OnlyInOne, of: Judgement) -> str:
+@says(EventInOneRun)
+def _(what: EventInOneRun, of: Judgement) -> str:
     has, has_not = _has(of)
     text = f"{_at(_one(of))} happened only in {has}"
     if what.loss is not None:
@@ -179,24 +174,23 @@ def _(what: OnlyInOne, of: Judgement) -> str:
     if what.periods_ns is not None:
         return f"{text}: timer period {durations(*what.periods_ns)}"
     if what.instead is not None:
-        return f"{text}; {has_not} went on with {_at(what.instead)}"
+        return f"{text}; {has_not} continued with {_at(what.instead)}"
     return text
 
 
-@says(RaisedInOne)
-def _(what: RaisedInOne, of: Judgement) -> str:
+@says(ExceptionInOneRun)
+def _(what: ExceptionInOneRun, of: Judgement) -> str:
     a, _ = _both(of)
-    where, not_where = ("a", "b") if a.raised else ("b", "a")
-    raised = f"raised {what.error or 'an exception'} in {where} and not in {not_where}"
-    text = f"{_at(a)} {raised}, from the same input"
-    return f"{text}, after it had shut its context down" if what.after_shutdown else text
+    when = ", after shutting down its context" if what.after_shutdown else ""
+    error = f": {what.error}" if what.error else ""
+    return f"{_received(a)} raised an exception only in {'a' if a.raised else 'b'}{when}{error}"
 
 
-@says(OtherTime)
-def _(what: OtherTime, of: Judgement) -> str:
+@says(DifferentTime)
+def _(what: DifferentTime, of: Judgement) -> str:
     a, b = _both(of)
     if a.stamp_ns == b.stamp_ns:
-        return f"{_at(a)} was due at another time in a than in b"
+        return f"{_at(a)} was due at different times in a and b"
     text = f"{phrase(a)} ran {_times(a, b)}"
     if what.periods_ns is not None:
         return f"{text}: timer period {durations(*what.periods_ns)}"
@@ -210,61 +204,46 @@ def _times(a: EventView, b: EventView) -> str:
     return f"{times}, {format_duration(abs(late_ns))} {late}"
 
 
-def slept_text(slept: Slept) -> str:
+def slept_text(slept: SleepTimes) -> str:
     """Return ``slept 7 ms in b and not in a``."""
     if slept.a is not None and slept.b is not None:
         in_a, in_b = durations_apart(slept.a, slept.b)
         return f"slept {in_a} in a and {in_b} in b"
     if slept.a is not None:
-        return f"slept {format_duration(slept.a)} in a and not in b"
-    return f"slept {format_duration(slept.b or 0)} in b and not in a"
+        return f"slept {format_duration(slept.a)} in a but not in b"
+    return f"slept {format_duration(slept.b or 0)} in b but not in a"
 
 
-@says(Happening.BAG_MESSAGES_SWAPPED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.BAG_MESSAGES_SWAPPED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     early, late = sorted((a.stamp_ns, b.stamp_ns))
     times = f"{at_time(early)} and {at_time(late)}"
     return f"the bag's messages on {a.entity.name} {times} are swapped"
 
 
-@says(Happening.BAG_MESSAGE_MOVED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.BAG_MESSAGE_MOVED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
     return f"{phrase(a)} was played {_times(a, b)}"
 
 
-@says(Happening.OTHER_BAG_MESSAGE)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_BAG_MESSAGE)
+def _(what: DivergenceKind, of: Judgement) -> str:
     values = next((field_text(m.fields, m.more_fields) for m in of.messages), "")
     return f"{_at(_one(of))} is different{f' ({values})' if values else ''}"
 
 
-@says(Happening.OTHER_FROM_OUTSIDE)
-def _(what: Happening, of: Judgement) -> str:
-    return f"{_at(_one(of))} is different"
+@says(DivergenceKind.ONLY_ZERO_DELAYS)
+def _(what: DivergenceKind, of: Judgement) -> str:
+    how = "did the same in both runs; one run adds delays of 0 ns, which have no effect"
+    return f"{_at(_one(of))} {how}"
 
 
-@says(Happening.OTHER_DONE_OUTSIDE)
-def _(what: Happening, of: Judgement) -> str:
-    return f"{_at(_one(of))} is different{what_differs(of.messages)}"
-
-
-@says(OtherInput)
-def _(what: OtherInput, of: Judgement) -> str:
-    return f"{_at(_one(of))} received a different {what.topic or 'input'}"
-
-
-@says(Happening.ONLY_ZERO_DELAYS)
-def _(what: Happening, of: Judgement) -> str:
-    how = "did the same in both runs, but in one of them with delays of 0 ns"
-    return f"{_at(_one(of))} {how}, which change nothing"
-
-
-@says(Happening.OTHER_SENDER)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.OTHER_SENDER)
+def _(what: DivergenceKind, of: Judgement) -> str:
     a, b = _both(of)
-    text = f"{_at(a)} received equal inputs, but of other "
+    text = f"{_at(a)} received equal inputs from different "
     if a.cause_event == b.cause_event:
         return f"{text}outputs of {_event(a.cause_event)}"
     return f"{text}events: {_event(a.cause_event)} in a, {_event(b.cause_event)} in b"
@@ -283,19 +262,19 @@ _DRAWS: dict[Draw | None, str] = {
 }
 
 
-@says(OtherDraw)
-def _(what: OtherDraw, of: Judgement) -> str:
+@says(DifferentDraw)
+def _(what: DifferentDraw, of: Judgement) -> str:
     m = what.message
     same = "read a clock" if what.of_clock else "did the same in both runs"
     if not what.connected:
-        drawn = f"what it sent goes to {m.topic} {IN_ONE[m.presence]}"
+        drawn = f"its output reaches {m.topic} {IN_ONE[m.presence]}"
     elif what.of_event and not what.of_clock:
         took = (_took(m.hash_a, m.hash_b), _took(m.hash_b, m.hash_a))
         drawn = "took {} in a and {} in b".format(*took)
     else:
         drawn = f"{m.topic}: {_drawn(m.hash_a, m.hash_b)} in a, {_drawn(m.hash_b, m.hash_a)} in b"
-    told = what.connected and (not of.settings or any(s.key == "seed" for s in of.settings))
-    chance = "chance decided differently: " if told else ""
+    random = what.connected and (not of.settings or any(s.key == "seed" for s in of.settings))
+    chance = "its random draws differ: " if random else ""
     text = f"{_at(_one(of))} {same}, but {chance}{drawn}"
     return f"{text} (and {what.more} more)" if what.more else text
 
@@ -320,20 +299,20 @@ def _took(number: int | None, other: int | None) -> str:
     return durations_apart(took_ns, took_ns if other_ns is None else other_ns)[0]
 
 
-@says(Happening.THREAD_SWITCHED)
-def _(what: Happening, of: Judgement) -> str:
+@says(DivergenceKind.THREAD_SWITCHED)
+def _(what: DivergenceKind, of: Judgement) -> str:
     met = next(m for m in of.messages if is_switch(m.hash_a or 0) or is_switch(m.hash_b or 0))
     in_a, in_b = (is_switch(number or 0) for number in (met.hash_a, met.hash_b))
-    places = met.code or ("a line that is not known",)
-    gave = f"{_at(_one(of))} gave way to another thread before {places[0]}"
+    places = met.code or ("an unknown line",)
+    gave = f"{_at(_one(of))} switched to another thread before {places[0]}"
     if in_a and in_b:
         return f"{gave} in a, before {places[-1]} in b"
     one, other = ("a", "b") if in_a else ("b", "a")
-    return f"{gave} in {one}; in {other} it went on"
+    return f"{gave} in {one} but not in {other}"
 
 
-@says(OtherOutput)
-def _(what: OtherOutput, of: Judgement) -> str:
+@says(DifferentOutput)
+def _(what: DifferentOutput, of: Judgement) -> str:
     one, differs = _one(of), what_differs(of.messages)
     if what.slept is not None and what.only_slept:
         text = f"{_at(one)} {slept_text(what.slept)}{differs}"
@@ -343,9 +322,9 @@ def _(what: OtherOutput, of: Judgement) -> str:
     return text
 
 
-@says(Happening.OTHER_STATE)
-def _(what: Happening, of: Judgement) -> str:
-    left = "sent the same, but left its node in a different state"
+@says(DivergenceKind.OTHER_STATE)
+def _(what: DivergenceKind, of: Judgement) -> str:
+    left = "sent the same outputs, but left its node in a different state"
     return f"{_received(_one(of), 'and')} {left}{state_text(of.state)}"
 
 
@@ -369,19 +348,20 @@ def _did(messages: Sequence[MessageDifference]) -> str:
         if one.presence is Presence.BOTH and one.fate is None:
             values = field_text(one.fields, one.more_fields)
             return f"published a different {one.topic}{f' ({values})' if values else ''}"
-    return f"did something different{what_differs(messages)}"
+        if one.fate is None:
+            return f"published {one.topic} {IN_ONE[one.presence]}"
+    return f"behaved differently{what_differs(messages)}"
 
 
-@says(EndedBefore)
-def _(what: EndedBefore, of: Judgement) -> str:
+@says(EarlierEnd)
+def _(what: EarlierEnd, of: Judgement) -> str:
     over, other = what.over, what.other
     where = f" {at_time(over.end_ns)}" if over.has_events else ""
     how = f"ended{where} ({over.reason})"
     if over.stuck:
         how = f"got stuck{where} ({shortened(over.stuck, _WAITS_MAX)})"
-    to = "to" if other.end_ns != over.end_ns else "until"
     return (
-        f"run {over.run} {how}, {other.run} did the same until then and went on {to} "
+        f"run {over.run} {how}; {other.run} was identical until then and continued to "
         f"{seconds_text(other.end_ns)} s ({other.reason})"
     )
 
@@ -389,16 +369,11 @@ def _(what: EndedBefore, of: Judgement) -> str:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-@says(EntitiesChanged)
-def _(changed: EntitiesChanged, of: object) -> str:
-    return joined([_change_text(change) for change in changed.changes])
-
-
 def _change_text(change: EntityChange) -> str:
     entity = change.entity
     values = ", ".join(_property_text(*value) for value in change.values)
-    made = f"{entity.node} made {entity.kind} {printable(entity.name)}"
-    return f"{made} with another {change.property.value}: {values}"
+    made = f"{entity.node} created {entity.kind} {printable(entity.name)}"
+    return f"{made} with a different {change.property.value}: {values}"
 
 
 def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
@@ -418,20 +393,10 @@ def _policy(name: str, value: str | int | None) -> str:
 # -- what became of a message ----------------------------------------------------------------------
 
 
-@says(StillWaits)
-def _(loss: StillWaits, of: object) -> str:
+@says(UnfinishedCall)
+def _(loss: UnfinishedCall, of: object) -> str:
     since = seconds_text(loss.since_ns)
     return f"{shortened(loss.text, _WAITS_MAX)}, from {since} s to the end of {loss.run}"
-
-
-@says(QueueOverflowed)
-def _(loss: QueueOverflowed, of: object) -> str:
-    return f"its queue of {loss.depth} overflowed in {loss.run}"
-
-
-@says(NothingArrives)
-def _(loss: NothingArrives, of: object) -> str:
-    return f"nothing more reaches it in {loss.run}"
 
 
 # -- why -------------------------------------------------------------------------------------------
@@ -443,8 +408,8 @@ def cause_of(of: Judgement) -> str:
         return ""
     text = sentence(of.why, of)
     if isinstance(of.likely, UnrecordedAnswer):
-        kept = f"guard: {{{of.likely.source}: record}} in the job keeps it"
-        text = f"{text}; {sentence(of.likely)} is not recorded ({kept})"
+        how = f"set guard: {{{of.likely.source}: record}} in the job"
+        text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
     elif of.likely is not None:
         because = because_of(of.settings)
         text = f"{sentence(of.likely)}; and {because}" if because else sentence(of.likely)
@@ -459,101 +424,78 @@ def failure_text(failed: RunEnd) -> str:
 
 
 _REASONS = {
-    Reason.DRIVEN_DIFFERENTLY: "the two simulations were not driven in the same way from outside",
-    Reason.BAGS_SWAPPED: "the bags that were played have these two messages in another order",
-    Reason.BAGS_AT_OTHER_TIMES: "the bags that were played have this message at another time",
-    Reason.BAGS_DIFFER: "the bags that were played differ in this message",
-    Reason.OTHER_CONTENT_ARRIVED: "the same message was sent to it, but something else arrived",
-    Reason.SENDER_UNKNOWN: "the trace does not say where it came from",
-    Reason.DELAY_IN_ONE: "only one of the runs gives what it sent a delay",
-    Reason.EQUAL_MESSAGES_SWAPPED: "two equal messages were delivered in another order",
-    Reason.STREAM_MOVED: "job and seed are the same as far as the traces tell, so the stream of "
-    "this link had been drawn from a different number of times before",
-    Reason.POLICY_CHOSE: "the policy chose another one of those that could run",
+    CauseKind.DRIVEN_DIFFERENTLY: "the code that drives the simulation acted differently",
+    CauseKind.BAGS_SWAPPED: "the played bags have these two messages in a different order",
+    CauseKind.BAGS_AT_OTHER_TIMES: "the played bags have this message at different times",
+    CauseKind.BAGS_DIFFER: "the played bags differ in this message",
+    CauseKind.OTHER_CONTENT_ARRIVED: "the same message was sent, but different content arrived",
+    CauseKind.SENDER_UNKNOWN: "the trace does not say where it came from",
+    CauseKind.DELAY_IN_ONE: "only one of the runs delays what it sent",
+    CauseKind.EQUAL_MESSAGES_SWAPPED: "two equal messages were delivered in a different order",
+    CauseKind.STREAM_MOVED: "job and seed are the same as far as the traces show, so the random "
+    "stream of this link was used a different number of times before",
+    CauseKind.POLICY_CHOSE: "the scheduling policy chose a different one of the ready callbacks",
 }
 
 
 @says(*_REASONS)
-def _(why: Reason, of: Judgement) -> str:
+def _(why: CauseKind, of: Judgement) -> str:
     return because_of(of.settings) or _REASONS[why]
 
 
-@says(Reason.CONSTRUCTOR)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.CONSTRUCTOR)
+def _(why: CauseKind, of: Judgement) -> str:
     which = "itself" if of.changed is None else f"of {of.changed.node}"
     return because_of(of.settings) or (
-        f"job and environment are the same as far as the traces tell: the constructor {which} is "
+        f"job and environment are the same as far as the traces show: the constructor {which} is "
         "not deterministic, or its code changed"
     )
 
 
-@says(Reason.READY_AT_ONCE)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.READY_AT_ONCE)
+def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"both were ready at the same simulated time, and {because}"
     return (
-        "both were ready at the same simulated time; whatever decides between them (order of "
-        "creation, of subscription, of delivery) is not the same in the two runs"
+        "both were ready at the same simulated time, and the tie was broken differently (by order "
+        "of creation, subscription or delivery)"
     )
 
 
-@says(Reason.ONLY_IN_ONE_BAG)
-def _(why: Reason, of: Judgement) -> str:
-    return because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
-
-
-@says(Reason.DRIVEN_IN_ONE)
-def _(why: Reason, of: Judgement) -> str:
-    return f"only the simulation of {_has(of)[0]} was driven to do this from outside"
-
-
-@says(Reason.FAULT_IN_ONE)
-def _(why: Reason, of: Judgement) -> str:
-    return because_of(of.settings) or f"the job of {_has(of)[0]} has this fault"
-
-
-@says(Reason.NOTHING_MADE_IT_RUN)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.NOTHING_MADE_IT_RUN)
+def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"nothing before it differs, but {because}"
     one = _one(of)
     has = _has(of)[0]
-    text = f"nothing before it differs, and nothing in the trace made it run in {has}"
+    text = f"nothing before it differs, and the trace does not show why it ran in {has}"
     who = f"the {one.entity.kind} itself" if one.entity.kind in NO_CALLBACKS else one.entity.node
     return f"{text}: {who} is not deterministic" if who else text
 
 
-@says(Reason.NOT_CONNECTED)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, OtherDraw)
+@says(CauseKind.NOT_CONNECTED)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, DifferentDraw)
     has_not = "a" if of.what.message.presence is Presence.ONLY_B else "b"
     topic = of.what.message.topic
-    gone = f"in {has_not} nothing is under way to {topic}: it is gone, or not connected"
+    gone = f"in {has_not} {topic} receives nothing: it is gone or not connected"
     because = because_of(of.settings)
     return f"{gone}; {because}" if because else gone
 
 
-@says(ParameterFiles)
-def _(why: ParameterFiles, of: Judgement) -> str:
-    return because_of(of.settings) or (
-        f"parameter {listed(why.parameters)}: a parameter file ({listed(why.files)}) says "
-        "something else, or the constructor does"
-    )
-
-
-@says(WaitedFor)
-def _(why: WaitedFor, of: Judgement) -> str:
+@says(WaitInOneRun)
+def _(why: WaitInOneRun, of: Judgement) -> str:
     has, has_not = _has(of)
     cause = f"{phrase(why.cause)} (event {why.cause.index})"
     doubt = because_of(of.settings) or f"{_itself(_one(of).entity.kind)} is not deterministic"
-    return f"it waited for {cause} in {has}, and not in {has_not}; {doubt}"
+    return f"it waited for {cause} in {has} but not in {has_not}; {doubt}"
 
 
 @says(NotDelivered)
 def _(why: NotDelivered, of: Judgement) -> str:
     lost = f"arrived only in {_has(of)[0]}" if why.loss is None else sentence(why.loss)
     sent = f"sent in both runs (event {why.cause.index}, {phrase(why.cause)})"
-    text = f"what it should have received was {sent}, but {lost}"
+    text = f"its input was {sent}, but {lost}"
     if because := because_of(of.settings):
         return f"{text}; {because}"
     if of.is_unexplained:
@@ -562,27 +504,19 @@ def _(why: NotDelivered, of: Judgement) -> str:
     return text
 
 
-@says(CameFrom)
-def _(why: CameFrom, of: Judgement) -> str:
-    return (
-        f"in a it came from {phrase(why.a)} (event {why.a.index}), in b from "
-        f"{phrase(why.b)} (event {why.b.index})"
-    )
-
-
-@says(NothingBefore)
-def _(why: NothingBefore, of: Judgement) -> str:
+@says(NoEarlierDifference)
+def _(why: NoEarlierDifference, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"nothing before it differs, but {because}"
     doubt = "what sets its time" if why.doubt == "time" else _itself(why.doubt)
     text = f"nothing before it differs: {doubt} is not deterministic"
     if why.state_unknown:
         text += (
-            f", or the state of {_one(of).entity.node} differed before (which "
-            "guard: {state: record} in the job tells)"
+            f", or the state of {_one(of).entity.node} already differed (to record it, set "
+            "guard: {state: record} in the job)"
         )
     if why.guard_is_off:
-        text += "; with guard: false nobody saw what it read from outside"
+        text += "; with guard: false, what it reads from outside is not recorded"
     return text
 
 
@@ -590,41 +524,31 @@ def _itself(kind: str) -> str:
     return f"the {kind if kind in NO_CALLBACKS else 'callback'} itself"
 
 
-@says(FollowsFrom)
-def _(why: FollowsFrom, of: Judgement) -> str:
-    return f"it follows from an earlier difference: {sentence(why.root.what, why.root)}"
-
-
-@says(CauseOf)
-def _(why: CauseOf, of: Judgement) -> str:
-    return cause_of(why.first)
-
-
-@says(Reason.CUT_OFF)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, EndedBefore)
+@says(CauseKind.CUT_OFF)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, EarlierEnd)
     return (
-        f"the recording of {of.what.over.run} was cut off: its run was killed, is still going on, "
-        "or the file is not whole"
+        f"the recording of {of.what.over.run} is truncated: the run was killed or is still going "
+        "on, or the file is incomplete"
     )
 
 
-@says(Reason.STOPS_DIFFER)
-def _(why: Reason, of: Judgement) -> str:
+@says(CauseKind.STOPS_DIFFER)
+def _(why: CauseKind, of: Judgement) -> str:
     stops = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in of.settings)
-    return f"both do the same as long as they last, and their jobs differ in {stops}"
+    return f"the runs are identical until then; their jobs set different stops: {stops}"
 
 
-@says(NothingLeft)
-def _(why: NothingLeft, of: Judgement) -> str:
+@says(NoEventsLeft)
+def _(why: NoEventsLeft, of: Judgement) -> str:
     alone = why.alone
     missing = f"{sentence(alone.what, alone)}; {cause_of(alone)}"
     return f"{why.run} had nothing left to do: {missing}"
 
 
-@says(Reason.ENDED)
-def _(why: Reason, of: Judgement) -> str:
-    assert isinstance(of.what, EndedBefore)
+@says(CauseKind.ENDED)
+def _(why: CauseKind, of: Judgement) -> str:
+    assert isinstance(of.what, EarlierEnd)
     over = of.what.over
     if over.error:
         how = f"{over.run} failed (exit code {over.exit_code}): {over.error}"
@@ -633,9 +557,9 @@ def _(why: Reason, of: Judgement) -> str:
     elif over.nothing_left:
         how = f"{over.run} had nothing left to do"
     else:
-        how = f"{over.run} ended because of this: {over.reason}"
+        how = f"{over.run} ended: {over.reason}"
     because = because_of(of.settings)
-    return f"both do the same until then; {how}{f'; {because}' if because else ''}"
+    return f"the runs are identical until then; {how}{f'; {because}' if because else ''}"
 
 
 # -- what is likely behind it ----------------------------------------------------------------------
@@ -651,8 +575,8 @@ _CALLED = {
 }
 
 
-@says(OutsideAnswers)
-def _(cause: OutsideAnswers, of: object) -> str:
+@says(ExternalAnswers)
+def _(cause: ExternalAnswers, of: object) -> str:
     who = cause.subject or "the run"
     told = list(dict.fromkeys(call_text(call) for call in cause.calls))
     more = len(told) - NAMED_MAX
@@ -661,23 +585,18 @@ def _(cause: OutsideAnswers, of: object) -> str:
 
 
 def call_text(call: CallDifference) -> str:
-    """Return ``read MOTOR_SEED, 6 in a and 4 in b, at picker.py:24``."""
+    """Return ``read MOTOR_SEED (6 in a, 4 in b) at picker.py:24``."""
     done = f"{_CALLED.get(Source(call.source), 'called')} {printable(call.subject)}"
     place = call.where.partition(" in ")[0]
     if call.a is None or call.b is None:
-        return f"{done} only in {'b' if call.a is None else 'a'}, at {place}"
-    return f"{done}, {call.short[0]} in a and {call.short[1]} in b, at {place}"
+        return f"{done} only in {'b' if call.a is None else 'a'} at {place}"
+    return f"{done} ({call.short[0]} in a, {call.short[1]} in b) at {place}"
 
 
 @says(SetOrder)
 def _(cause: SetOrder, of: object) -> str:
     more = f" (and {cause.more} more)" if cause.more else ""
-    return f"the {cause.what}, at {cause.place}{more}"
-
-
-@says(UnrecordedAnswer)
-def _(cause: UnrecordedAnswer, of: object) -> str:
-    return f"what came back from {cause.call} at {cause.place}"
+    return f"the {cause.what} at {cause.place}{more}"
 
 
 # -- the headline ----------------------------------------------------------------------------------
@@ -691,7 +610,7 @@ _SENT = {
 
 
 def headline(first: Judgement, effect: Judgement | None, searched_to: int | None) -> str:
-    """Return what a person wants to know of two runs that diverge: the settings that are to blame,
+    """Return the headline of two runs that diverge: the settings that can be the cause,
     and the first effect they had.
 
     ``searched_to`` is up to which event no effect was found (-1: to the end), None if it was not
@@ -711,7 +630,7 @@ def headline(first: Judgement, effect: Judgement | None, searched_to: int | None
         topics = listed([message.topic for message in first.messages if not message.is_input])
         where = f"on {topics}" if topics else f"on the state of {one.node}"
         up_to = "" if searched_to < 0 else f" up to event {searched_to}"
-        return f"{lead}; no effect{up_to} but {where}, by {phrase(one)}"
+        return f"{lead}; no effect{up_to} except {where}, by {phrase(one)}"
     return f"{lead}; first effect: {effect_text(first)}"
 
 
@@ -737,7 +656,7 @@ def effect_text(found: Judgement) -> str:
 def _done(message: MessageDifference) -> str:
     verb, on = _SENT[message.kind or OutputKind.MESSAGE]
     if message.fate is not None or message.presence is not Presence.BOTH:
-        what = fate_text(message) or IN_ONE[message.presence]
+        what = output_change_text(message) or IN_ONE[message.presence]
         return f"{verb} {on}{message.topic} {what}"
     fields = message.fields
     other = "message" if message.kind is OutputKind.MESSAGE else "content"
@@ -751,7 +670,7 @@ def _done(message: MessageDifference) -> str:
 
 
 def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
-    """Return the keys of the job that are to blame, with their lines; of what a constructor did,
+    """Return the keys of the job that can be the cause, with their lines; for a constructor,
     the code, too."""
     of_job = [_setting(setting) for setting in settings if setting.key]
     if not of_job and set_up:
@@ -771,3 +690,47 @@ def _setting(setting: Setting) -> str:
     if len(values) == 2:
         return f"{name} {pair_text(setting.a, setting.b)}{place}"
     return f"{name} {printable(''.join(values))} {only}{place}"
+
+
+SENTENCES.update(
+    {
+        DivergenceKind.CONSTRUCTION_ORDER: lambda fact, of: (
+            "the nodes are constructed in a different order"
+        ),
+        DivergenceKind.OTHER_FROM_OUTSIDE: lambda fact, of: f"{_at(_one(of))} is different",
+        DivergenceKind.OTHER_DONE_OUTSIDE: lambda fact, of: (
+            f"{_at(_one(of))} is different{what_differs(of.messages)}"
+        ),
+        DifferentInput: lambda fact, of: (
+            f"{_at(_one(of))} received a different {fact.topic or 'input'}"
+        ),
+        EntityChanges: lambda fact, of: joined([_change_text(change) for change in fact.changes]),
+        QueueOverflow: lambda fact, of: f"its queue (depth {fact.depth}) overflowed in {fact.run}",
+        NoMoreMessages: lambda fact, of: f"it receives nothing more in {fact.run}",
+        CauseKind.ONLY_IN_ONE_BAG: lambda fact, of: (
+            because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
+        ),
+        CauseKind.DRIVEN_IN_ONE: lambda fact, of: (
+            f"the code that drives the simulation did this only in {_has(of)[0]}"
+        ),
+        CauseKind.FAULT_IN_ONE: lambda fact, of: (
+            because_of(of.settings) or f"only the job of {_has(of)[0]} has this fault"
+        ),
+        ParameterFiles: lambda fact, of: (
+            because_of(of.settings)
+            or (
+                f"parameter {listed(fact.parameters)}: a parameter file ({listed(fact.files)}) or "
+                "the constructor sets a different value"
+            )
+        ),
+        DifferentSenders: lambda fact, of: (
+            f"in a it came from {phrase(fact.a)} (event {fact.a.index}), in b from "
+            f"{phrase(fact.b)} (event {fact.b.index})"
+        ),
+        Consequence: lambda fact, of: (
+            f"it follows from an earlier difference: {sentence(fact.root.what, fact.root)}"
+        ),
+        SameCause: lambda fact, of: cause_of(fact.first),
+        UnrecordedAnswer: lambda fact, of: f"the result of {fact.call} at {fact.place}",
+    }
+)

@@ -8,39 +8,40 @@ from typing import Protocol
 from rsltrace.diff.facts.bags import (
     BagComparison,
     BagVerdict,
+    ExtraMessages,
     MessageDivergence,
     NativeComparison,
-    Tail,
     TopicDiff,
 )
 from rsltrace.diff.facts.causes import Judgement
 from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import (
-    AgreeUntilCut,
-    CannotRepeat,
-    ComparedAs,
-    ComparedByBytes,
+    DifferentEnd,
     DifferentJobs,
-    Diverged,
+    DifferentType,
     EndedByException,
+    EqualUntilTruncated,
     Identical,
-    Interrupted,
     JobChanged,
     LogTimesIgnored,
     MoreDivergences,
-    NativeCompared,
-    NothingAskedFor,
-    OtherEnd,
-    OtherType,
+    NativeRuns,
+    NoRecordCommand,
     Outcome,
+    ReaderNote,
     Remark,
+    RenamedProgram,
     RepeatedRun,
     Repeats,
-    ShownLater,
-    ShownPastTolerated,
-    Told,
+    RunsDiverge,
+    SelectionDivergesLater,
+    SelectionIsEqual,
+    StartIsTolerated,
+    TruncatedRecording,
+    UndecodedMessages,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
+from rsltrace.diff.sentences.values import IN_ONE
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.phrases import seconds_text
 
@@ -49,8 +50,8 @@ _TEXT_MAX = 200
 ALL_HINT = "--all shows them"
 
 
-class Compared(Protocol):
-    """What the answer for two runs is told by."""
+class RunComparison(Protocol):
+    """What the answer for two runs needs."""
 
     @property
     def outcome(self) -> Outcome:
@@ -69,7 +70,7 @@ class Compared(Protocol):
         """What is compared of native runs."""
 
 
-def answer(of: Compared) -> str:
+def answer(of: RunComparison) -> str:
     """Return the answer for two runs."""
     return sentence(of.outcome, of)
 
@@ -84,18 +85,18 @@ def remark_text(remark: Remark) -> str:
 
 @says(Identical)
 def _(outcome: Identical, of: object) -> str:
-    but = " but for names of programs" if outcome.names_differ else ""
+    but = " except for program names" if outcome.names_differ else ""
     digest = f", digest {outcome.digest}" if outcome.digest else ""
     return f"the two runs are identical{but}: {outcome.events} events{digest}"
 
 
-@says(AgreeUntilCut)
-def _(outcome: AgreeUntilCut, of: object) -> str:
+@says(EqualUntilTruncated)
+def _(outcome: EqualUntilTruncated, of: object) -> str:
     cut = outcome.cut
-    are_cut = "both recordings are cut" if len(cut) == 2 else f"the recording of {cut[0]} is cut"
+    are_cut = "both recordings are" if len(cut) == 2 else f"the recording of {cut[0]} is"
     if outcome.events:
-        return f"the two runs agree as far as they go, {outcome.events} events: {are_cut}"
-    return f"nothing can be compared: {are_cut}, and has no event"
+        return f"the two runs agree in the first {outcome.events} events; {are_cut} truncated"
+    return f"nothing can be compared: {are_cut} truncated and without events"
 
 
 @says(DifferentJobs)
@@ -103,12 +104,12 @@ def _(outcome: DifferentJobs, of: object) -> str:
     names = [f'"{name}"' for name in outcome.jobs]
     which = f" ({names[0]}, {names[1]})" if names[0] != names[1] else ""
     have = "have" if len(outcome.empty) > 1 else "has"
-    empty = f"{' and '.join(outcome.empty)} {have} no event to compare"
+    empty = f"{' and '.join(outcome.empty)} {have} no events to compare"
     return f"these are runs of different jobs{which}, and {empty}"
 
 
-@says(Diverged)
-def _(outcome: Diverged, of: Compared) -> str:
+@says(RunsDiverge)
+def _(outcome: RunsDiverge, of: RunComparison) -> str:
     from rsltrace.diff.sentences.divergence import headline, sentence_of
 
     first = of.divergences[0]
@@ -120,21 +121,21 @@ def _(outcome: Diverged, of: Compared) -> str:
     return f"{unlike}: {sentence_of(first)}"
 
 
-@says(NativeCompared)
-def _(outcome: NativeCompared, of: Compared) -> str:
+@says(NativeRuns)
+def _(outcome: NativeRuns, of: RunComparison) -> str:
     found = of.native
     assert found is not None
     which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
     said = sum(topic.agreeing for topic in found.content.topics)
     order = (
-        f"{found.moved} of the {found.compared} callbacks of both began in another order"
+        f"{found.moved} of the {found.compared} common callbacks started in a different order"
         if found.moved
-        else f"the {found.compared} callbacks of both began in the same order"
+        else f"the {found.compared} common callbacks started in the same order"
     )
     if found.differs:
-        return f"{which}, and the contents differ{_where(found)}; {order}"
+        return f"{which}, and the messages differ{_where(found)}; {order}"
     return (
-        f"{which}, and the contents are the same but for times: {said} messages on "
+        f"{which}, and the messages are the same except for times: {said} messages on "
         f"{len(found.content.topics)} topics; {order}"
     )
 
@@ -150,16 +151,16 @@ def _where(found: NativeComparison) -> str:
         return text
     text += f": message {shown.index} "
     if first.moved:
-        return f"{text}came in another order, and others are missing or differ"
+        return f"{text}came in a different order, and others are missing or differ"
     if first.presence is not Presence.BOTH:
-        return f"{text}is {first.presence.value}"
+        return f"{text}is {IN_ONE[first.presence]}"
     return text + (f"has a different {first.fields[0].path}" if first.fields else "differs")
 
 
-def tail_text(tail: Tail) -> str:
-    """Return ``/odom: 2 more messages in a, at its end``."""
+def tail_text(tail: ExtraMessages) -> str:
+    """Return ``/odom: 2 more messages at the end of a``."""
     more = f"{tail.more} more message{'' if tail.more == 1 else 's'}"
-    return f"{tail.topic}: {more} in {tail.run}, at its end"
+    return f"{tail.topic}: {more} at the end of {tail.run}"
 
 
 # -- recordings ------------------------------------------------------------------------------------
@@ -171,14 +172,14 @@ def recordings_sentence(of: BagComparison, name: str = "The recordings") -> str:
     messages = sum(topic.agreeing for topic in topics)
     counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
     if of.verdict is BagVerdict.EQUAL:
-        return f"{name} are equal: {counted} say the same."
+        return f"{name} are equal: {counted}."
     if of.verdict is not BagVerdict.DIFFERENT:
         return _nearly_equal(of.verdict, topics, counted, name)
     if first is None:
         lone = [f"{topic.topic} is only in a" for topic in of.topics_only_a]
         lone += [f"{topic.topic} is only in b" for topic in of.topics_only_b]
         more = f" and {len(lone) - 3} more" if len(lone) > 3 else ""
-        same = f"{counted} in both agree, but " if messages else ""
+        same = f"{counted} agree, but " if messages else ""
         text = f"{same}{', '.join(lone[:3])}{more}."
         return text[0].upper() + text[1:]
     when = f"{format_seconds(first.after_ns)} s after the start"
@@ -188,30 +189,29 @@ def recordings_sentence(of: BagComparison, name: str = "The recordings") -> str:
 def _nearly_equal(verdict: BagVerdict, topics: Sequence[TopicDiff], counted: str, name: str) -> str:
     tolerated = sum(topic.tolerated for topic in topics)
     ignored = sum(topic.ignored for topic in topics)
-    if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
-        how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
-        how += f" but for what is ignored ({ignored} differ in it)" if ignored else ""
-        agree = f"{name[:1].lower()}{name[1:]} agree: {counted} {how}"
-        return f"As far as they go, {agree}; not both are whole."
+    if verdict is BagVerdict.AGREE_UNTIL_TRUNCATED:
+        how = f"are equal{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
+        how += f" except for ignored fields ({ignored} differ there)" if ignored else ""
+        return f"{name} agree until one of them is truncated: {counted} {how}."
     if not tolerated:
-        ignoring = f"{ignored} of {counted} differ in it"
-        return f"{name} are equal but for what is ignored, not identical: {ignoring}."
-    also = f", {ignored} more in what is ignored" if ignored else ""
+        ignoring = f"{ignored} of {counted} differ there"
+        return f"{name} are equal except for ignored fields, not identical: {ignoring}."
+    also = f", {ignored} more only in ignored fields" if ignored else ""
     return (
         f"{name} are equal within tolerance, not identical: {tolerated} of {counted} "
-        f"differ, none by more than is tolerated{also}."
+        f"differ within tolerance{also}."
     )
 
 
 def _first_message(first: MessageDivergence) -> str:
     if first.moved:
-        return moved_text(first)
+        return order_text(first)
     if first.presence is Presence.ONLY_A:
         assert first.a is not None
         return f"message {first.a.index} of a is missing in b"
     if first.presence is Presence.ONLY_B:
         assert first.b is not None
-        return f"message {first.b.index} of b is extra, not in a"
+        return f"message {first.b.index} of b is not in a"
     assert first.a is not None
     text = f"message {first.a.index}"
     differing = len(first.fields) + first.more_fields
@@ -221,13 +221,13 @@ def _first_message(first: MessageDivergence) -> str:
     return text if differing == 1 else f"{text} (and {_number(differing - 1, 'other field')})"
 
 
-def moved_text(found: MessageDivergence) -> str:
+def order_text(found: MessageDivergence) -> str:
     """Say where a message is in each recording; "" if it is in the same place of both."""
     if not found.moved or found.a is None or found.b is None:
         return ""
     if found.swapped_at is not None:
         return f"messages {found.swapped_at} and {found.swapped_at + 1} are swapped"
-    return f"message {found.a.index} of a is message {found.b.index} of b, in another order"
+    return f"message {found.a.index} of a is message {found.b.index} of b (different order)"
 
 
 def _number(count: int, noun: str) -> str:
@@ -237,57 +237,34 @@ def _number(count: int, noun: str) -> str:
 # -- what else to know -----------------------------------------------------------------------------
 
 
-@says(Told)
-def _(remark: Told, of: object) -> str:
-    return remark.text
-
-
-@says(Interrupted)
-def _(remark: Interrupted, of: object) -> str:
-    there = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
-    was = f"the recording of {remark.run} ({remark.path}) was interrupted"
-    return f"{was}: compared is what is there, {there}"
+@says(TruncatedRecording)
+def _(remark: TruncatedRecording, of: object) -> str:
+    compared = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
+    cut = f"the recording of {remark.run} ({remark.path}) is truncated"
+    return f"{cut}: only its {compared} are compared"
 
 
 @says(EndedByException)
 def _(remark: EndedByException, of: object) -> str:
     when = f"event {remark.event}, {seconds_text(remark.stamp_ns)} s"
-    return f"{remark.run} ended by an exception: {remark.reason}, {when}"
+    return f"{remark.run} ended with an exception ({when}): {remark.reason}"
 
 
-@says(OtherEnd)
-def _(remark: OtherEnd, of: object) -> str:
-    return f"{remark.what}: {remark.a} in a, {remark.b} in b"
-
-
-@says(ComparedAs)
-def _(remark: ComparedAs, of: object) -> str:
-    return f"{printable(remark.a)} in a is compared with {printable(remark.b)} in b"
-
-
-def _asked(globs: Sequence[str]) -> str:
+def _globs(globs: Sequence[str]) -> str:
     return printable(", ".join(globs))
 
 
-@says(NothingAskedFor)
-def _(remark: NothingAskedFor, of: object) -> str:
-    return (
-        f"nothing that was asked for ({_asked(remark.asked)}) differs among the events that were "
-        "aligned; shown is where the runs diverge"
-    )
+@says(SelectionDivergesLater)
+def _(remark: SelectionDivergesLater, of: object) -> str:
+    shown = f"this report shows where {_globs(remark.asked)} differs"
+    return f"the runs diverge at event {remark.start}; {shown}"
 
 
-@says(ShownLater)
-def _(remark: ShownLater, of: object) -> str:
-    where = f"shown is where {_asked(remark.asked)} differs"
-    return f"the runs diverge at event {remark.start}; {where}"
-
-
-@says(ShownPastTolerated)
-def _(remark: ShownPastTolerated, of: object) -> str:
-    covered = "only in what is ignored or within tolerance"
-    shown = "shown is the first difference that is not"
-    return f"the runs diverge at event {remark.start}, but there {covered}; {shown}"
+@says(StartIsTolerated)
+def _(remark: StartIsTolerated, of: object) -> str:
+    covered = "but only in ignored fields or within tolerance"
+    shown = "this report shows the first other difference"
+    return f"the runs diverge at event {remark.start}, {covered}; {shown}"
 
 
 @says(MoreDivergences)
@@ -296,16 +273,17 @@ def _(remark: MoreDivergences, of: object) -> str:
     return f"{remark.count} more independent divergences{hint}"
 
 
-@says(CannotRepeat)
-def _(remark: CannotRepeat, of: object) -> str:
+@says(NoRecordCommand)
+def _(remark: NoRecordCommand, of: object) -> str:
     if remark.job:
-        return f"{remark.trace} was made elsewhere: its job {_shown(remark.job)} is not here"
+        job = _shown(remark.job)
+        return f"no command to reproduce this: the job {job} of {remark.trace} is not here"
     more = len(remark.options) - _OPTIONS_MAX
     told = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
     told += f" and {more} more" if more > 0 else ""
     return (
         f"no command to reproduce this: {remark.trace} comes from a job that could run code "
-        f"({told}); use that only if you know where the trace is from"
+        f"({told}); run that only if you trust the source of the trace"
     )
 
 
@@ -313,35 +291,17 @@ def _shown(text: str) -> str:
     return shortened(printable(text), _TEXT_MAX)
 
 
-@says(JobChanged)
-def _(remark: JobChanged, of: object) -> str:
-    return (
-        f"{remark.job} is not what {remark.trace} was recorded with: it was made elsewhere, or the "
-        "job has been changed since"
-    )
-
-
-@says(LogTimesIgnored)
-def _(remark: LogTimesIgnored, of: object) -> str:
-    return "log times are not compared (--by stamp matches messages by them)"
-
-
-@says(OtherType)
-def _(remark: OtherType, of: object) -> str:
+@says(DifferentType)
+def _(remark: DifferentType, of: object) -> str:
     a, b = remark.a or "of unknown type", remark.b or "of unknown type"
     return f"{remark.topic} is {a} in a, {b} in b"
-
-
-@says(ComparedByBytes)
-def _(remark: ComparedByBytes, of: object) -> str:
-    return f"{remark.error}; compared byte by byte, padding included"
 
 
 def reproduction_text(of: RepeatedRun) -> str:
     """Return which of two runs a third one repeats."""
     if of.place is None:
-        too = "too" if of.repeats is Repeats.A else "another one"
-        return f"a and b are the same run, and {of.again} {too}"
+        too = "is the same too" if of.repeats is Repeats.A else "is different"
+        return f"a and b are identical; {of.again} {too}"
     third, where = f"the third run ({of.again})", f"at event {of.place}, where a and b diverge"
     if of.repeats in (Repeats.A, Repeats.B):
         return f"{third} reproduces {of.repeats.value}: it does the same {where}"
@@ -351,3 +311,28 @@ def reproduction_text(of: RepeatedRun) -> str:
         f"{third} is a third result: it differs from a at event {of.from_a} and from b at event "
         f"{of.from_b}; a and b diverge at event {of.place}"
     )
+
+
+SENTENCES.update(
+    {
+        ReaderNote: lambda fact, of: fact.text,
+        DifferentEnd: lambda fact, of: f"{fact.what}: {fact.a} in a, {fact.b} in b",
+        RenamedProgram: lambda fact, of: (
+            f"{printable(fact.a)} in a is compared with {printable(fact.b)} in b"
+        ),
+        SelectionIsEqual: lambda fact, of: (
+            f"nothing selected ({_globs(fact.asked)}) differs in the aligned events; this report "
+            "shows where the runs diverge"
+        ),
+        JobChanged: lambda fact, of: (
+            f"{fact.job} has changed since {fact.trace} was recorded, or the trace is of another "
+            "job"
+        ),
+        LogTimesIgnored: lambda fact, of: (
+            "log times are not compared (--by stamp matches messages by them)"
+        ),
+        UndecodedMessages: lambda fact, of: (
+            f"{fact.error}; compared byte by byte, padding included"
+        ),
+    }
+)

@@ -7,26 +7,26 @@ from collections.abc import Sequence
 
 from rsltrace.diff.facts.bags import MessageDivergence
 from rsltrace.diff.facts.evidence import (
+    CauseLink,
     FieldDifference,
     FieldNote,
     FieldNoteKind,
-    Link,
     LinkKind,
     MessageDifference,
-    Moved,
-    NoFields,
-    ParametersChanged,
-    ParametersSet,
+    NoFieldsReason,
+    OutputOrder,
+    ParameterChanges,
+    ParameterValues,
     Presence,
-    SentLater,
-    SentTimes,
+    SendCount,
+    SendDelay,
     Setting,
     SettingKind,
     StateDifference,
-    TimerCancelled,
-    TimerPeriodSet,
+    TimerCancellation,
+    TimerPeriod,
 )
-from rsltrace.diff.sentences import says, sentence
+from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import (
     durations_apart,
@@ -46,12 +46,12 @@ _NOTES = {
     FieldNoteKind.OTHER_TYPES: "different types",
     FieldNoteKind.NO_SUCH_FIELD: "only one of the types has this field",
     FieldNoteKind.LENGTHS: "length {a} and {b}",
-    FieldNoteKind.SAME_ELEMENTS: "the same elements in another order",
-    FieldNoteKind.SAME_WORDS: "the same words in another order",
+    FieldNoteKind.SAME_ELEMENTS: "the same elements in a different order",
+    FieldNoteKind.SAME_WORDS: "the same words in a different order",
     FieldNoteKind.FIRST_BYTE: "first at byte {a}",
     FieldNoteKind.FIRST_CHARACTER: "first at character {a}",
     FieldNoteKind.CONSTANTS: "{a} → {b}",
-    FieldNoteKind.NAN_PAYLOAD: "NaN with another payload",
+    FieldNoteKind.NAN_PAYLOAD: "NaN with a different payload",
     FieldNoteKind.NAN_IN_A: "NaN in a only",
     FieldNoteKind.NAN_IN_B: "NaN in b only",
     FieldNoteKind.INFINITE_IN_A: "infinite in a only",
@@ -65,11 +65,11 @@ _LINKS = {
     LinkKind.ANSWERED: "answered",
     LinkKind.LOGGED: "logged to",
     LinkKind.TRIGGERED: "triggered",
-    LinkKind.MADE_TASK: "made or resumed a task of",
+    LinkKind.MADE_TASK: "created or resumed a task of",
     LinkKind.CAUSED: "caused",
     LinkKind.CHANGED_STATE: "may have changed the state of",
     LinkKind.DRAWN_AGAIN: "draws a different value in",
-    LinkKind.MADE_RECEIVER: "made a receiver of",
+    LinkKind.MADE_RECEIVER: "created a receiver of",
     LinkKind.KEEPS_WAITING: "keeps waiting",
     LinkKind.ENDED_BEFORE: "ended before",
 }
@@ -92,14 +92,14 @@ def pair_text(a: str | None, b: str | None, nothing: str = "nothing") -> str:
 
 
 def listed(things: Sequence[str]) -> str:
-    """Return the first things with commas, each once, and how many more there are."""
+    """Return the first texts with commas, each once, and how many more there are."""
     unique = list(dict.fromkeys(things))
     more = len(unique) - NAMED_MAX
     return ", ".join(unique[:NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
 def joined(things: Sequence[str]) -> str:
-    """Return things with commas and an ``and`` before the last."""
+    """Return texts with commas and an ``and`` before the last."""
     unique = list(dict.fromkeys(things))
     if len(unique) > NAMED_MAX:
         return listed(unique)
@@ -185,19 +185,21 @@ def a_first(messages: Sequence[MessageDifference]) -> list[MessageDifference]:
 def what_differs(messages: Sequence[MessageDifference]) -> str:
     """Return `` (/odom: pose.x 1.0 → 1.5, call /plan only in b)``, "" if no output differs."""
     outputs = [m for m in messages if not m.is_input]
-    moved = [_label(m) for m in outputs if isinstance(m.fate, Moved)]
-    things = [_thing(m) for m in a_first([m for m in outputs if not isinstance(m.fate, Moved)])]
+    moved = [_label(m) for m in outputs if isinstance(m.fate, OutputOrder)]
+    things = [
+        _thing(m) for m in a_first([m for m in outputs if not isinstance(m.fate, OutputOrder)])
+    ]
     times = Counter(things)
     things = [f"{thing}, {n} times" if n > 1 else thing for thing, n in times.items()]
     if moved:
-        things.insert(0, f"{joined(moved)} {sentence(Moved())}")
+        things.insert(0, f"{joined(moved)} {sentence(OutputOrder())}")
     return f" ({listed(things)})" if things else ""
 
 
 def _thing(message: MessageDifference) -> str:
     label, fate = _label(message), message.fate
     if message.presence is Presence.BOTH:
-        if isinstance(fate, ParametersChanged):
+        if isinstance(fate, ParameterChanges):
             return f"parameter {sentence(fate)}"
         if fate is not None:
             return f"{label}: {sentence(fate)}"
@@ -205,7 +207,7 @@ def _thing(message: MessageDifference) -> str:
         return f"{label}: {fields}" if fields else label
     if message.kind is OutputKind.LOG and message.preview:
         label = f"log {message.preview}"
-    if fate is not None and not isinstance(fate, ParametersSet):
+    if fate is not None and not isinstance(fate, ParameterValues):
         return f"{label} {sentence(fate)}"
     if fate is not None:
         label = f"{label}: {sentence(fate)}"
@@ -216,75 +218,65 @@ def _label(message: MessageDifference) -> str:
     return f"{_LABELS.get(message.kind, '') if message.kind else ''}{message.topic}"
 
 
-@says(Moved)
-def _(fate: Moved, of: object) -> str:
-    return "in another order"
-
-
-@says(SentTimes)
-def _(fate: SentTimes, of: object) -> str:
+@says(SendCount)
+def _(fate: SendCount, of: object) -> str:
     times = {(1, 2): "twice in b", (2, 1): "twice in a"}
     return times.get((fate.a, fate.b), f"{fate.a} times in a, {fate.b} times in b")
 
 
-@says(SentLater)
-def _(fate: SentLater, of: object) -> str:
-    return f"{format_duration(fate.by_ns)} later in {fate.run}"
-
-
-@says(TimerCancelled)
-def _(fate: TimerCancelled, of: object) -> str:
-    return f"cancelled in {fate.run}"
-
-
-@says(TimerPeriodSet)
-def _(fate: TimerPeriodSet, of: object) -> str:
+@says(TimerPeriod)
+def _(fate: TimerPeriod, of: object) -> str:
     if fate.before_ns is None:
         return f"set to a period of {format_duration(fate.after_ns)} in {fate.run}"
     return f"period {durations(fate.before_ns, fate.after_ns)} in {fate.run}"
 
 
-@says(ParametersSet)
-def _(fate: ParametersSet, of: object) -> str:
-    return ", ".join(f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fate.values)
-
-
-@says(ParametersChanged)
-def _(fate: ParametersChanged, of: object) -> str:
-    return ", ".join(f"{name} {pair_text(a, b)}" for name, a, b in fate.values)
-
-
-def fate_text(message: MessageDifference) -> str:
+def output_change_text(message: MessageDifference) -> str:
     """Return what became of an output, "" if there is nothing to say."""
     return "" if message.fate is None else sentence(message.fate)
 
 
 def no_fields_text(message: MessageDifference | MessageDivergence) -> str:
     """Say why no field of a message is shown, and how to see it; "" where there are some."""
-    if isinstance(message, MessageDifference) and isinstance(message.fate, Moved):
-        return "sent in another order"
+    if isinstance(message, MessageDifference) and isinstance(message.fate, OutputOrder):
+        return "sent in a different order"
     return "" if message.no_fields is None else sentence(message.no_fields, message)
 
 
-@says(*NoFields)
-def _(why: NoFields, of: MessageDifference | MessageDivergence) -> str:
-    if why is NoFields.ALL_IGNORED:
+@says(*NoFieldsReason)
+def _(why: NoFieldsReason, of: MessageDifference | MessageDivergence) -> str:
+    if why is NoFieldsReason.ALL_IGNORED:
         return "all fields that differ are ignored"
-    if why is NoFields.EQUAL_FIELDS:
-        return "its fields are equal, but what the recorder hashed of it is not"
-    if why is NoFields.UNREADABLE:
+    if why is NoFieldsReason.EQUAL_FIELDS:
+        return "its fields are equal, but the recorded hashes differ"
+    if why is NoFieldsReason.UNREADABLE:
         return of.error
-    if why is NoFields.UNDESCRIBED_BYTES:
+    if why is NoFieldsReason.UNDESCRIBED_BYTES:
         return "the messages differ in bytes that their types do not describe"
-    where = "a" if why is NoFields.NOT_RECORDED_IN_A else "b"
+    where = "a" if why is NoFieldsReason.NOT_RECORDED_IN_A else "b"
     return (
         f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
         f"and a topic glob that matches {of.topic} (record: in the job)"
     )
 
 
-def link_text(link: Link) -> str:
+def link_text(link: CauseLink) -> str:
     """Return how an event led to the next one: ``published /odom``."""
     if link.kind is LinkKind.MORE_STEPS:
         return f"led, in {link.steps} more steps, to"
     return f"{_LINKS.get(link.kind, '')} {link.name}".strip()
+
+
+SENTENCES.update(
+    {
+        OutputOrder: lambda fact, of: "in a different order",
+        SendDelay: lambda fact, of: f"{format_duration(fact.by_ns)} later in {fact.run}",
+        TimerCancellation: lambda fact, of: f"cancelled in {fact.run}",
+        ParameterValues: lambda fact, of: ", ".join(
+            f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fact.values
+        ),
+        ParameterChanges: lambda fact, of: ", ".join(
+            f"{name} {pair_text(a, b)}" for name, a, b in fact.values
+        ),
+    }
+)

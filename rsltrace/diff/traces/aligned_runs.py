@@ -48,7 +48,7 @@ class AlignedRuns:
         self.take(block)
         if len(self.rows.divergences):
             self.first_place = int(self.rows.divergences[0])
-        # Where nodes were set up otherwise, what they then do is what one wants to see.
+        # If nodes were set up differently, show the first effect.
         if isinstance(block, AlignedBlock) and is_setup(block, first_item(block, first)):
             effect = first_effect(block)
             if effect is not None:

@@ -28,13 +28,13 @@ from rsltrace.diff.causes.propagation import (
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import (
-    ComparedAs,
-    Diverged,
     Identical,
     MoreDivergences,
-    NothingAskedFor,
-    ShownLater,
-    ShownPastTolerated,
+    RenamedProgram,
+    RunsDiverge,
+    SelectionDivergesLater,
+    SelectionIsEqual,
+    StartIsTolerated,
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff, Divergence, EntityCount
@@ -52,10 +52,10 @@ from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10
-"""Independent divergences told unless everything is asked for."""
+"""Independent divergences shown unless ``everything`` is set."""
 
 EVERY_DIVERGENCE_MAX = 1000
-"""Told even then; each takes some milliseconds and some lines."""
+"""The limit even then; each takes some milliseconds and some lines."""
 
 EFFECT_WITHIN = 100_000
 """Events after the first divergence among which its first effect is looked for."""
@@ -74,10 +74,10 @@ _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 def compare(a: Trace, b: Trace, start: int, options: DiffOptions) -> Diff:
     """Return the diff of two runs that differ from event ``start`` on.
 
-    Raises TraceError if neither run has a node or topic that is asked for.
+    Raises TraceError if neither run has a selected node or topic.
     """
     _check_names(a, b, options)
-    return _Comparison(a, b, start, options).run()
+    return _TraceComparison(a, b, start, options).run()
 
 
 def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
@@ -95,7 +95,7 @@ def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
                 )
 
 
-class _Comparison:
+class _TraceComparison:
     """Of two runs that differ from event ``start`` on."""
 
     def __init__(self, a: Trace, b: Trace, start: int, options: DiffOptions) -> None:
@@ -111,17 +111,17 @@ class _Comparison:
         self._environment = environment_settings(a, b)
         self._remarks = list(interruptions(a, b))
         self._only_names = False
-        """Whether the runs are the same but for names of programs."""
+        """Whether the runs are the same except for program names."""
         if self._matching.renamed:
             real = first_real_difference(self._run_a, self._run_b, start)
             self._only_names = real is None
             self._start = start if real is None else real
-            self._remarks += [ComparedAs(*names) for names in self._matching.renamed]
+            self._remarks += [RenamedProgram(*names) for names in self._matching.renamed]
         self._counts = _EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
         self._searched_to: int | None = None
-        """See ``Diverged``."""
+        """See ``RunsDiverge``."""
 
     def run(self) -> Diff:
         """Return the answer."""
@@ -170,12 +170,12 @@ class _Comparison:
             return first
         return replace(first, failed=failed)
 
-    def _outcome(self) -> Diverged:
+    def _outcome(self) -> RunsDiverge:
         foreign = None
         if self._matching.different_jobs:
             jobs = (trace.job.get("name") for trace in (self._a, self._b))
             foreign = tuple(name for name in jobs if name)
-        return Diverged(self._searched_to, foreign)
+        return RunsDiverge(self._searched_to, foreign)
 
     def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
@@ -249,9 +249,9 @@ class _Comparison:
             chosen.sort(key=lambda found: (found.place_a, found.place_b))
         if not chosen:
             chosen = propagation.found[:1]
-            self._remarks.append(NothingAskedFor(self._asked))
+            self._remarks.append(SelectionIsEqual(self._asked))
         elif self._asked and propagation.found[0] is not chosen[0]:
-            self._remarks.append(ShownLater(self._start, self._asked))
+            self._remarks.append(SelectionDivergesLater(self._start, self._asked))
         most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
         if len(chosen) > most:
             more = MoreDivergences(len(chosen) - most, all_shown=self._options.everything)
@@ -272,8 +272,8 @@ class _Comparison:
     ) -> list[FoundDivergence]:
         """Return what to show if the first divergence is ignored or within tolerance."""
         if search.found is None:
-            return chosen  # what all messages say of that is told beside it
-        self._remarks.append(ShownPastTolerated(self._start))
+            return chosen  # ``tolerance`` of the diff covers it
+        self._remarks.append(StartIsTolerated(self._start))
         place = search.found.place_a
         return [search.found, *(found for found in chosen if found.place_a > place)]
 
@@ -282,7 +282,7 @@ class _Comparison:
         return (*self._options.nodes, *self._options.topics)
 
     def _wanted(self, item: EventPair, block: AlignedBlock) -> bool:
-        """Whether an item is of a node and touches a topic that was asked for."""
+        """Whether an item is of a node and touches a topic that is selected."""
         options, keys = self._options, self._matching.keys
         a, b = block.rows_a, block.rows_b
         rows, index = (a, item.a) if item.a >= 0 else (b, item.b)

@@ -3,14 +3,14 @@
     first difference -> entities matched -> blocks aligned -> roots and consequences -> Diff
 
 Nothing is read of two identical runs but the ends of their files, and of others only what lies
-around the divergence, unless everything is asked for.
+around the divergence, unless ``everything`` is set.
 """
 
 from __future__ import annotations
 
 from rsltrace.diff.alignment.rows import first_difference
 from rsltrace.diff.facts.causes import Verdict
-from rsltrace.diff.facts.remarks import Identical, OtherEnd
+from rsltrace.diff.facts.remarks import DifferentEnd, Identical
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.tolerance import side
@@ -56,7 +56,7 @@ def _identical(a: Trace, b: Trace) -> Diff:
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
         remarks=tuple(
-            OtherEnd(what.replace("_", " "), a.result.get(what), b.result.get(what))
+            DifferentEnd(what.replace("_", " "), a.result.get(what), b.result.get(what))
             for what in ("stop_reason", "exit_code")
             if a.result.get(what) != b.result.get(what)
         ),

@@ -1,4 +1,4 @@
-"""Runs of which one is over where the other goes on, and did the same until then."""
+"""Runs of which one ends where the other continues."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.causes.environment import entity_settings, environment_settings
 from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.facts.causes import (
-    EndedBefore,
+    CauseFact,
+    CauseKind,
+    EarlierEnd,
     Judgement,
-    NothingLeft,
-    Reason,
+    NoEventsLeft,
     Root,
     RunEnd,
     Verdict,
-    Why,
 )
 from rsltrace.diff.facts.evidence import EventView, Setting
-from rsltrace.diff.facts.remarks import AgreeUntilCut, DifferentJobs, EndedByException, Remark
+from rsltrace.diff.facts.remarks import DifferentJobs, EndedByException, EqualUntilTruncated, Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.tolerance import interruptions, side, stop_reason
@@ -37,14 +37,14 @@ def agree_until_cut(a: Trace, b: Trace, options: DiffOptions) -> Diff:
     return Diff(
         a=side(a),
         b=side(b),
-        verdict=Verdict.AS_FAR_AS_THEY_GO,
-        outcome=AgreeUntilCut(events, cut),
+        verdict=Verdict.AGREE_UNTIL_TRUNCATED,
+        outcome=EqualUntilTruncated(events, cut),
         agreeing=events,
         settings=(*job_settings(a, b), *environment_settings(a, b)),
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
         remarks=tuple(interruptions(a, b)),
-        as_far_as_they_go=options.as_far_as_they_go,
+        allow_truncated=options.allow_truncated,
     )
 
 
@@ -209,18 +209,18 @@ def judge_end(
     verdict = Verdict.ENDED_EARLY if over is b else Verdict.RAN_LONGER
     name = "b" if over is b else "a"
     ends = _end_of("a", a), _end_of("b", b)
-    what = EndedBefore(*(ends[::-1] if over is b else ends))
+    what = EarlierEnd(*(ends[::-1] if over is b else ends))
     root = Root.UNKNOWN
     settings: tuple[Setting, ...] = ()
-    why: Why
+    why: CauseFact
     if not over.complete:
-        why = Reason.CUT_OFF
+        why = CauseKind.CUT_OFF
     elif stops := _stops(a, b, over, job):
-        root, why, settings = Root.JOB, Reason.STOPS_DIFFER, tuple(stops)
+        root, why, settings = Root.JOB, CauseKind.STOPS_DIFFER, tuple(stops)
     elif alone is not None:
-        why, settings = NothingLeft(name, alone), alone.settings
+        why, settings = NoEventsLeft(name, alone), alone.settings
     else:
-        why = Reason.ENDED
+        why = CauseKind.ENDED
         others = (one for one in job if one.part not in ("stop", "record", "livelock_limit"))
         settings = tuple(others)
     in_a, in_b = (view_a, None) if over is b else (None, view_a)

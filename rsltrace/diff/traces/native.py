@@ -18,14 +18,14 @@ from rsltrace.diff.alignment.rows import longest_increasing
 from rsltrace.diff.bags.comparison import compare_content
 from rsltrace.diff.facts.bags import (
     CallbackTimes,
-    MovedCallback,
+    ExtraMessages,
     NativeComparison,
-    Tail,
+    ReorderedCallback,
     TopicDiff,
 )
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Presence
-from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeCompared
+from rsltrace.diff.facts.remarks import LogTimesIgnored, NativeRuns
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.tolerance import interruptions, side
@@ -40,7 +40,7 @@ TIMES = ("stamp", "*.stamp")
 """Fields that are not compared: what they hold is real time, or was simulated."""
 
 _PARAMETERS = "/parameter_events"
-"""Nodes that are made at once mix there, with the times of it in their messages."""
+"""Nodes that are created at once mix there, in any order."""
 
 _CALLBACKS = tuple(
     int(kind)
@@ -90,7 +90,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
         a=side(a),
         b=side(b),
         verdict=_verdict(a, b, found),
-        outcome=NativeCompared(),
+        outcome=NativeRuns(),
         agreeing=0,
         aligned_to=(a.event_count, b.event_count),
         bytes_read=a.bytes_read + b.bytes_read,
@@ -98,7 +98,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
             *interruptions(a, b),
             *(one for one in content.remarks if not isinstance(one, LogTimesIgnored)),
         ),
-        as_far_as_they_go=options.as_far_as_they_go,
+        allow_truncated=options.allow_truncated,
         native=found,
     )
 
@@ -107,7 +107,7 @@ def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
     if found.differs:
         return Verdict.OTHER_CONTENT
     if not (a.complete and b.complete):
-        return Verdict.AS_FAR_AS_THEY_GO
+        return Verdict.AGREE_UNTIL_TRUNCATED
     return Verdict.SAME_CONTENT
 
 
@@ -132,7 +132,7 @@ def _says_something_else(topic: TopicDiff) -> bool:
     return bool(topic.differing or missing)
 
 
-def _tail(topic: TopicDiff) -> Tail | None:
+def _tail(topic: TopicDiff) -> ExtraMessages | None:
     """Return how many messages more one run has at the end of a topic, if that is all that
     differs."""
     first, more = topic.first, topic.only_a + topic.only_b
@@ -141,7 +141,7 @@ def _tail(topic: TopicDiff) -> Tail | None:
     shown = first.a if first.presence is Presence.ONLY_A else first.b
     if shown is None or shown.index != topic.agreeing:
         return None
-    return Tail(topic.topic, more, "a" if topic.only_a else "b")
+    return ExtraMessages(topic.topic, more, "a" if topic.only_a else "b")
 
 
 class _Callbacks:
@@ -183,7 +183,7 @@ def _keys(trace: Trace) -> dict[int, EntityKey]:
     return keys
 
 
-def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, MovedCallback | None]:
+def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, ReorderedCallback | None]:
     """Return how many callbacks both runs have, how many of them ran in another order, and the
     first of these. The n-th of an entity is compared with the n-th."""
     pairs: list[tuple[int, int, EntityKey]] = []
@@ -195,7 +195,7 @@ def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, MovedCallback | None
     first = None
     if moved:
         i, j, key = pairs[moved[0]]
-        first = MovedCallback(key, i, j)
+        first = ReorderedCallback(key, i, j)
     return len(pairs), len(moved), first
 
 

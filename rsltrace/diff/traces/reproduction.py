@@ -1,4 +1,4 @@
-"""Which of two runs that diverge a third one repeats, told at the event where they diverge."""
+"""Which of two diverging runs a third one repeats, at the event where they diverge."""
 
 from __future__ import annotations
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.facts.remarks import Interrupted, Remark
+from rsltrace.diff.facts.remarks import Remark, TruncatedRecording
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import Side
+from rsltrace.diff.result import ComparedRun
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
@@ -32,9 +32,9 @@ def stop_reason(trace: Trace) -> str:
     return trace.result.get("stop_reason") or "no reason given"
 
 
-def side(trace: Trace) -> Side:
+def side(trace: Trace) -> ComparedRun:
     """Return what there is to know of a run as a whole."""
-    return Side(
+    return ComparedRun(
         path=trace.name,
         digest="" if is_native(trace) else trace.digest,
         events=trace.event_count,
@@ -47,7 +47,7 @@ def side(trace: Trace) -> Side:
 def interruptions(a: Trace, b: Trace) -> list[Remark]:
     """Return a remark for each run whose recording was cut off."""
     return [
-        Interrupted(name, trace.name, trace.event_count, trace.end_ns)
+        TruncatedRecording(name, trace.name, trace.event_count, trace.end_ns)
         for name, trace in (("a", a), ("b", b))
         if not trace.complete
     ]
@@ -63,7 +63,7 @@ _AT_ONCE = 4096
 def messages_within(a: Trace, b: Trace, start: int, options: DiffOptions) -> BagDiff | None:
     """Compare all messages of two runs that diverge at event ``start``.
 
-    Return None if no tolerance is asked for, or if more than the contents of messages differs:
+    Return None if no tolerance is given, or if more than the contents of messages differs:
     events, their order and times, outputs that are no messages or were not recorded.
     """
     if not (options.tolerant or options.ignore) or not _alike_but_for_messages(a, b, start):

@@ -1,1 +1,1 @@
-"""Which commit changed what a job does: the job run at revisions of its repository."""
+"""Find the commit that changed a job's run: run the job at revisions of its repository."""

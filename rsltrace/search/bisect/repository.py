@@ -1,4 +1,4 @@
-"""The git repository that a job lies in, asked through ``git`` itself. Nothing here changes it."""
+"""The git repository of a job, read with ``git``. Nothing here changes it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rsltrace.errors import BisectError, SetupError
 
 _LOCAL = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE", "GIT_PREFIX", "GIT_COMMON_DIR")
 _QUIETLY = (
-    *("-c", f"core.hooksPath={os.devnull}"),  # a checkout of ours is nobody's business
+    *("-c", f"core.hooksPath={os.devnull}"),  # no hooks for our checkouts
     *("-c", "advice.detachedHead=false"),
     *("-c", "gc.auto=0"),
 )
@@ -36,15 +36,15 @@ class Commit:
 
 
 @dataclass(frozen=True, slots=True)
-class Done:
-    """What a git command said, both streams, and its exit status."""
+class GitOutput:
+    """Output and exit status of a git command."""
 
     exit_code: int
     output: str
     errors: str
 
 
-def git(folder: Path, *words: str, check: bool = True) -> Done:
+def git(folder: Path, *words: str, check: bool = True) -> GitOutput:
     """Run git in a folder, without hooks and in English.
 
     :raises SetupError: there is no git.
@@ -63,15 +63,12 @@ def git(folder: Path, *words: str, check: bool = True) -> Done:
     if check and done.returncode != 0:
         said = (done.stderr.strip() or done.stdout.strip()).replace("fatal: ", "")
         raise BisectError(f"git {words[0]} in {folder}: {said}")
-    return Done(done.returncode, done.stdout, done.stderr)
+    return GitOutput(done.returncode, done.stdout, done.stderr)
 
 
 @lru_cache
 def git_program() -> str:
-    """Return the path of git.
-
-    :raises SetupError: there is none.
-    """
+    """Return the path of git, or raise SetupError."""
     found = shutil.which("git")
     if found is None:
         raise SetupError("rsltrace bisect needs git, which is not on the PATH")
@@ -79,7 +76,7 @@ def git_program() -> str:
 
 
 def git_environment() -> dict[str, str]:
-    """Return an environment in which git takes the repository of its folder, and speaks English."""
+    """Return an environment in which git uses the repository of its folder, and English."""
     env = {name: value for name, value in os.environ.items() if name not in _LOCAL}
     return {**env, "LC_ALL": "C", "GIT_TERMINAL_PROMPT": "0"}
 
@@ -103,8 +100,8 @@ class Repository:
         if done.exit_code != 0 or not done.output.strip():
             said = done.errors.strip().removeprefix("fatal: ").splitlines()
             raise BisectError(
-                f"{file} lies in no checkout of a git repository, so there are no revisions to "
-                f"run it at ({said[0] if said else 'a bare repository'})"
+                f"{file} is not in a checkout of a git repository, so there are no revisions to "
+                f"run ({said[0] if said else 'a bare repository'})"
             )
         return cls(Path(done.output.removesuffix("\n")))
 

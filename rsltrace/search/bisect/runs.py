@@ -1,4 +1,4 @@
-"""Running a job at a revision: in a process of its own, with the code of the worktree."""
+"""Run a job at a revision: in a process with the code of the worktree, and judge the run."""
 
 from __future__ import annotations
 
@@ -24,10 +24,8 @@ from rsltrace.search.perturb import (
 from rsltrace.terminal import tell
 from rsltrace.trace.reader import Trace
 
-# When a revision is good: by its digest, by an expression, a function or a command.
-
 Judge = Callable[[Path, Path], bool]
-"""Takes a run's trace and the folder that it ran in. Raises BisectError for no answer."""
+"""Takes a trace and the folder of its run. Raises BisectError if it cannot decide."""
 
 _TARGET = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _SKIP = 125
@@ -36,7 +34,7 @@ _SKIP = 125
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What a run is judged by, and its words."""
+    """How a run is judged; ``words`` name it in messages."""
 
     words: str
     judge: Judge
@@ -97,10 +95,7 @@ def command(words: str, processes: Processes) -> Check:
 
 @dataclass(frozen=True, slots=True)
 class Runner:
-    """Runs a job in a worktree; ``arguments`` are those of ``rsltrace record``, with paths there.
-
-    ``cwd`` is the present folder, as seen there.
-    """
+    """Runs a job in a worktree; ``arguments`` are those of ``rsltrace record``, paths in it."""
 
     repository: Repository
     worktree: Worktree
@@ -109,7 +104,7 @@ class Runner:
     timeout_s: float | None = None
 
     def run(self, name: str) -> Recorded:
-        """Run what is in the worktree; the trace gets a name of its own."""
+        """Run the revision in the worktree; its trace is ``name``.mcap."""
         cwd = self.folder
         cwd.mkdir(parents=True, exist_ok=True)
         path = self.worktree.folder / f"{name}.mcap"
@@ -123,7 +118,7 @@ class Runner:
 
     @property
     def folder(self) -> Path:
-        """The present folder, in the worktree or as seen from there."""
+        """The working directory, in the worktree or as seen from there."""
         return self.worktree.path(Path.cwd())
 
     def _environment(self) -> Mapping[str, str]:
@@ -134,26 +129,26 @@ class Runner:
             **os.environ,
             "PYTHONPATH": os.pathsep.join(path),
             "PYTHONHASHSEED": "0",
-            # Sources of the same length within the same second: bytecode would be another's.
+            # Two versions of a source with the same size and second would share bytecode.
             "PYTHONDONTWRITEBYTECODE": "1",
         }
 
 
 def python_folders(repository: Repository) -> list[Path]:
-    """Return the folders of a checkout on Python's path, of packages that are installed in place
-    (``pip install -e``): those of a revision stand for them."""
+    """Return the checkout's folders on Python's path, also of packages installed in place
+    (``pip install -e``). A revision's own folders replace them."""
     found = []
     for entry in dict.fromkeys([*sys.path, *_known_to_finders()]):
         path = Path(entry or ".").resolve()
         if path == OWN_FOLDER or not path.is_relative_to(repository.top):
-            continue  # this program itself is the same at every revision
+            continue  # rsltrace itself is the same at every revision
         if not path.is_relative_to(Path(sys.prefix).resolve()) and repository.has_tracked(path):
             found.append(path)
     return found
 
 
 def _known_to_finders() -> Iterator[str]:
-    """Yield the folders of packages that setuptools' finders know, rather than Python's path."""
+    """Yield the folders of packages that only setuptools' finders know."""
     for finder in sys.meta_path:
         module = sys.modules.get(getattr(finder, "__module__", ""))
         for place in getattr(module, "MAPPING", {}).values():

@@ -1,4 +1,4 @@
-"""The search: both ends first, then the revisions between them that ``git bisect`` chooses."""
+"""Bisect: run both ends, then the revisions between them that ``git bisect`` chooses."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ _TIMEOUT_MIN_S = 120.0
 _TIMEOUT_FACTOR = 30
 
 
-class Answer(Enum):
-    """What a revision is, in git's words."""
+class RevisionVerdict(Enum):
+    """A revision's verdict, in git's words."""
 
     GOOD = "good"
     BAD = "bad"
@@ -36,17 +36,17 @@ class Tried:
 
     commit: Commit
     run: Recorded
-    answer: Answer
+    answer: RevisionVerdict
     why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search found.
+    """The result of a search.
 
     ``first`` is the first changed commit; None if it is one of ``candidates``, of which all but the
-    last were skipped. ``before`` and ``after`` are the runs to compare: of the revision before the
-    change and of the first one that has it. ``tried`` is all that was run, in order.
+    last were skipped. ``before`` and ``after`` are the runs before and after the change, ``tried``
+    all revisions that were run, in order.
     """
 
     first: Commit | None
@@ -60,7 +60,7 @@ class Found:
 class Search:
     """A search between two commits. ``check`` None: by the digest.
 
-    ``on_try`` is told each revision that was run, ``on_note`` what else there is to know.
+    ``on_try`` receives each revision that was run, ``on_note`` further notes.
     """
 
     def __init__(
@@ -82,13 +82,12 @@ class Search:
         self._tried: dict[str, Tried] = {}
         self._notes: list[str] = []
         self._failure_counts = False
-        """Whether a run in which a node raises is one like others: so it is at an end."""
+        """Whether a run in which a node raises is judged, not skipped: one end raises, too."""
 
     def find(self) -> Found:
         """Search.
 
-        :raises BisectError: an end does not run or is not what it is said to be, or a job is not
-            deterministic there.
+        :raises BisectError: an end does not run, is not good or bad, or is nondeterministic.
         """
         good, bad = self._ends()
         tree = self._runner.worktree
@@ -115,21 +114,21 @@ class Search:
         self._failure_counts = bool(good.failure or bad.failure)
         if self._check is None and good.outcome == bad.outcome:
             raise BisectError(
-                f"{self._good.short} and {self._bad.short} do the same ({good.events} events, "
-                f"digest {good.digest}): there is no change between them to be found; a change "
-                "that no digest shows may be found with --check or --run"
+                f"{self._good.short} and {self._bad.short} have the same run ({good.events} "
+                f"events, digest {good.digest}): there is no change to find; for a change that "
+                "the digest does not show, use --check or --run"
             )
         self._digest = good.outcome
         ends = []
         for commit, run, wanted in (
-            (self._good, good, Answer.GOOD),
-            (self._bad, bad, Answer.BAD),
+            (self._good, good, RevisionVerdict.GOOD),
+            (self._bad, bad, RevisionVerdict.BAD),
         ):
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
                 raise BisectError(
-                    f"the job is not deterministic at {commit}: two runs of it have the digests "
-                    f"{run.digest or '-'} and {again.digest or '-'}; rsltrace verify there says why"
+                    f"the job is not deterministic at {commit}: two runs have the digests "
+                    f"{run.digest or '-'} and {again.digest or '-'}; run rsltrace verify there"
                 )
             ends.append(self._tell(self._judged(commit, run)))
             self._expect(ends[-1], wanted)
@@ -145,21 +144,21 @@ class Search:
             raise BisectError(f"the {name} revision ({commit}) does not run: {self._why(run)}")
         return run
 
-    def _expect(self, tried: Tried, wanted: Answer) -> None:
+    def _expect(self, tried: Tried, wanted: RevisionVerdict) -> None:
         if tried.answer is wanted:
             return
         assert self._check is not None
-        if tried.answer is Answer.SKIP:
+        if tried.answer is RevisionVerdict.SKIP:
             raise BisectError(f"{wanted.value} revision {tried.commit}: {tried.why}")
-        does = "fails" if wanted is Answer.GOOD else "holds"
+        does = "fails" if wanted is RevisionVerdict.GOOD else "holds"
         raise BisectError(
-            f"{self._check.words!r} {does} at {tried.commit}, which is said to be {wanted.value}"
+            f"{self._check.words!r} {does} at {tried.commit}, the {wanted.value} revision"
         )
 
     # -- one revision ----------------------------------------------------------------------------
 
     def _at(self, commit_id: str) -> Tried:
-        """Run and judge the revision that is in the worktree, unless that has been done."""
+        """Run and judge the revision in the worktree, once."""
         if commit_id in self._tried:
             return self._tried[commit_id]
         commit = self._runner.repository.commit(commit_id)
@@ -168,22 +167,22 @@ class Search:
 
     def _judged(self, commit: Commit, run: Recorded) -> Tried:
         if not run.digest or (run.failure and not self._failure_counts):
-            return Tried(commit, run, Answer.SKIP, self._why(run))
+            return Tried(commit, run, RevisionVerdict.SKIP, self._why(run))
         if self._check is not None:
             try:
                 holds = self._check.judge(run.path, self._runner.folder)
             except BisectError as error:
-                return Tried(commit, run, Answer.SKIP, str(error))
-            return Tried(commit, run, Answer.GOOD if holds else Answer.BAD)
+                return Tried(commit, run, RevisionVerdict.SKIP, str(error))
+            return Tried(commit, run, RevisionVerdict.GOOD if holds else RevisionVerdict.BAD)
         if run.outcome == self._digest:
-            return Tried(commit, run, Answer.GOOD)
+            return Tried(commit, run, RevisionVerdict.GOOD)
         seen = any(run.outcome == known.run.outcome for known in self._tried.values())
         if not seen and commit != self._bad:
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
                 why = f"not deterministic: digests {run.digest} and {again.digest or '-'}"
-                return Tried(commit, run, Answer.SKIP, why)
-        return Tried(commit, run, Answer.BAD)
+                return Tried(commit, run, RevisionVerdict.SKIP, why)
+        return Tried(commit, run, RevisionVerdict.BAD)
 
     def _run(self, commit: Commit, more: str = "") -> Recorded:
         tree = self._runner.worktree
@@ -198,7 +197,7 @@ class Search:
         return tried
 
     def _why(self, run: Recorded) -> str:
-        """Return why a run is none, in the words of whoever knows it best."""
+        """Return why a run failed: its error message, if it printed one."""
         said = [line for line in run.errors.splitlines() if line.startswith(_ERROR)]
         why = run.failure if run.digest or not said else said[-1].removeprefix(_ERROR)
         return why.replace(f"{self._runner.worktree.tree}/", "")
@@ -213,7 +212,7 @@ class Search:
     def _found(self, ids: list[str]) -> Found:
         candidates = self._runner.repository.in_order(ids, self._good, self._bad)
         first = candidates[0] if len(candidates) == 1 else None
-        known = [one for one in self._tried.values() if one.answer is Answer.BAD]
+        known = [one for one in self._tried.values() if one.answer is RevisionVerdict.BAD]
         after = next((one for one in known if one.commit.id in ids), known[0])
         return Found(
             first,
@@ -228,6 +227,6 @@ class Search:
         """Return the run to compare with: of the commit's parent, if that runs."""
         if first is not None:
             found = self._at(first.parents[0])
-            if found.answer is not Answer.SKIP:
+            if found.answer is not RevisionVerdict.SKIP:
                 return found
-        return [one for one in self._tried.values() if one.answer is Answer.GOOD][-1]
+        return [one for one in self._tried.values() if one.answer is RevisionVerdict.GOOD][-1]

@@ -1,10 +1,9 @@
-"""A git worktree for one search, and what sees to it that nothing of it is left behind.
+"""A git worktree for one search.
 
-The worktree stands in a folder in which every path of this machine means what it means here: the
-repository's own are those of the revision, all others lead to the real ones. So a job's
-``../../data/drive`` is found, and so is what a node looks for beside its repository.
+It is in a folder that mirrors the paths of this machine: paths in the repository are those of the
+revision, all others are links to the real ones. So a job's ``../../data/drive`` is found.
 
-Another process takes the worktree away as soon as this one is over, however it ends.
+Another process removes the worktree when this one ends, however it ends.
 """
 
 from __future__ import annotations
@@ -20,8 +19,8 @@ from types import TracebackType
 from rsltrace.errors import BisectError
 from rsltrace.search.bisect.repository import Repository, git, git_environment, git_program
 
-# Waits until its stdin is closed: by whoever started it, or by the kernel. A git or a run that is
-# just ending may still write, so it looks again.
+# Waits until its stdin is closed by the parent or the kernel. A git or a run that is just ending
+# may still write, so it tries again.
 _CLEANER = """
 import os, shutil, subprocess, sys, time
 git, top, tree, folder = sys.argv[1:]
@@ -39,10 +38,10 @@ for _ in range(100):
 
 
 class Worktree:
-    """A worktree of a repository, detached, for the time of a ``with`` block.
+    """A detached worktree of a repository, for the time of a ``with`` block.
 
-    ``shared`` are files and folders of the checkout that are not tracked and that runs need: they
-    are there at every revision that has none of that name. ``folder`` is a place for traces.
+    ``shared`` are untracked files and folders of the checkout that runs need: they are linked
+    unless the revision has one of that name. ``folder`` is for traces.
     """
 
     def __init__(self, repository: Repository, shared: Iterable[Path] = ()) -> None:
@@ -83,24 +82,21 @@ class Worktree:
         self._clean()
 
     def path(self, path: Path | str) -> Path:
-        """Return where a path of this machine is found for a run."""
+        """Return where a run finds a path of this machine."""
         absolute = os.path.abspath(path)
         real = os.path.join(os.path.realpath(os.path.dirname(absolute)), os.path.basename(absolute))
         return self._root / os.path.relpath(real, "/")
 
     def check_out(self, revision: str) -> None:
-        """Put a revision there, and nothing else.
-
-        :raises BisectError: git cannot.
-        """
+        """Check out a clean revision. Raises BisectError if git cannot."""
         git(self.tree, "reset", "--quiet", "--hard", revision)
         git(self.tree, "clean", "-ffdxq")
         self._share()
 
     def bisect(self, *words: str) -> str:
-        """Do a step of ``git bisect`` and return what it says; another revision is there then.
+        """Run a step of ``git bisect``, which checks out the next revision; return its output.
 
-        :raises BisectError: git cannot go on.
+        :raises BisectError: git fails.
         """
         git(self.tree, "reset", "--quiet", "--hard")
         git(self.tree, "clean", "-ffdxq")
@@ -113,23 +109,23 @@ class Worktree:
 
     @property
     def head(self) -> str:
-        """The commit that is there."""
+        """The commit that is checked out."""
         return git(self.tree, "rev-parse", "HEAD").output.strip()
 
     def missing_submodules(self) -> tuple[str, ...]:
-        """Return the submodules of the revision, none of which is there."""
+        """Return the submodules of the revision: none is checked out."""
         listed = git(self.tree, "ls-files", "--stage", "-z").output.split("\0")
         return tuple(line.split("\t", 1)[1] for line in listed if line.startswith("160000 "))
 
     def _mirror(self, base: Path) -> None:
-        """Make the folders that lead to the repository, with links to all that is beside them."""
+        """Make the folders on the path to the repository, with links to all their siblings."""
         real, here = Path("/"), self._root
         for part in self._repository.top.relative_to("/").parts:
             here.mkdir()
             try:
                 beside = [entry.name for entry in os.scandir(real)]
             except OSError:
-                beside = []  # a folder that one may pass through, but not list
+                beside = []  # a folder that may be entered, but not listed
             for name in beside:
                 if name != part and real / name != base:
                     (here / name).symlink_to(real / name)

@@ -1,8 +1,8 @@
-"""Trials on the workers of a Dask cluster, beyond one machine.
+"""Trials on the workers of a Dask cluster.
 
-Every worker of Dask gets the files of the job once, under their hash, and runs trials in processes
-of rsltrace's own (``workers.Worker``), as many at a time as it has threads. Rows come back; the
-trace of a run that failed is fetched if it is one of those that are kept.
+Each Dask worker gets the files of the job once, under their hash, and runs trials in processes
+(``workers.Worker``), as many at a time as it has threads. Only rows, and the traces that are kept,
+come back.
 """
 
 from __future__ import annotations
@@ -22,26 +22,31 @@ import xxhash
 from rsltrace._version import __version__
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job
-from rsltrace.search.explore.kept_traces import KeptTraces
-from rsltrace.search.explore.outcome import Wants
-from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
+from rsltrace.search.explore.outcome import TrialOptions
+from rsltrace.search.explore.trial import (
+    CRASH,
+    Failure,
+    JobSource,
+    KeptTraces,
+    Trial,
+    TrialResult,
+    result_of,
+)
 from rsltrace.search.explore.workers import Worker
 
-# What a job needs on another machine: its text, its sources, its bags, each file with a hash.
-
 SHIPPED_MAX = 256 << 20
-"""Files of more bytes are not sent: they have to lie at the same place on every machine."""
+"""Larger files are not sent: they must be at the same path on every machine."""
 
 _RECORDINGS = (".mcap", ".db3", ".bag", ".rrd")
-"""Not sent for lying among the sources; those that the job plays are named by it."""
+"""Not sent with the sources; those that the job plays are sent because it names them."""
 _BUILT = frozenset(("__pycache__", "node_modules", "build", "install", "log"))
 _PIECE = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """The files of a job. ``root`` is the folder that all of them are below, on this machine;
-    ``folder`` (the job's), the keys of ``files`` and ``large`` are seen from there.
+    """The files of a job. ``root`` is their common folder on this machine; ``folder`` (the job's)
+    and the keys of ``files`` and ``large`` are relative to it.
 
     ``files`` has the contents of those that are sent, ``large`` the sizes of those that are not.
     """
@@ -55,15 +60,15 @@ class Bundle:
     large: Mapping[str, int]
 
     def source(self, root: str | Path) -> JobSource:
-        """Return the job, as it is where the bundle was unpacked."""
+        """Return the job in the folder where the bundle was unpacked."""
         folder = os.path.normpath(os.path.join(root, self.folder))
         return JobSource(os.path.join(folder, self.name), text=self.text, folder=folder)
 
     def unpack(self, root: Path) -> None:
         """Write the files below ``root``, and link to the large ones.
 
-        :raises ExploreError: a large one is not on this machine.
-        :raises OSError: the disk is full, say.
+        :raises ExploreError, OSError: a large one is not on this machine, or a file cannot be
+            written.
         """
         for name, data in self.files.items():
             path = root / name
@@ -115,7 +120,7 @@ def bundle_of(source: JobSource) -> Bundle:
 
 
 def _sources(job: Job) -> Iterator[Path]:
-    """Yield what lies in the folders of the nodes' modules, without what is built or recorded."""
+    """Yield the files of the modules' folders, except built and recorded ones."""
     for folder in job.search_path:
         for place, folders, names in os.walk(job.resolve(folder)):
             folders[:] = [one for one in folders if not one.startswith(".") and one not in _BUILT]
@@ -163,11 +168,11 @@ CONFIGURED = "dask"
 _CONNECT_S = 30
 _TRIES_MAX = 3
 _AHEAD = 2
-"""Tasks that a worker's thread has waiting, so that it need not wait for us."""
+"""Tasks queued per worker thread, so that it does not wait for us."""
 
 
-class _Place(WorkerPlugin):  # type: ignore[misc]
-    """What a worker of Dask has of a job: its files, and processes that run its trials."""
+class _WorkerJob(WorkerPlugin):  # type: ignore[misc]
+    """A job on a Dask worker: its files, and processes that run its trials."""
 
     idempotent = True
 
@@ -194,7 +199,9 @@ class _Place(WorkerPlugin):  # type: ignore[misc]
         for folder in (self.folder, self.traces):
             shutil.rmtree(folder, ignore_errors=True)
 
-    def run(self, trial: Trial, wants: Wants, timeout_s: float | None, name: str) -> TrialResult:
+    def run(
+        self, trial: Trial, wants: TrialOptions, timeout_s: float | None, name: str
+    ) -> TrialResult:
         """Run a trial in a process that is idle, or a new one."""
         try:
             one = self._idle.get_nowait()
@@ -212,16 +219,16 @@ class _Place(WorkerPlugin):  # type: ignore[misc]
 def _run(
     place: str, trial: Mapping[str, Any], wants: Mapping[str, Any], timeout_s: float | None
 ) -> tuple[dict[str, Any], str]:
-    """Run a trial: the task. Returns the result's values, and the worker's address."""
+    """Run a trial (the Dask task); return the result's values and the worker's address."""
     worker = get_worker()
-    held: _Place = worker.plugins[place]
+    job: _WorkerJob = worker.plugins[place]
     name = f"{trial['number']:06d}.mcap"
-    found = held.run(Trial(**trial), Wants(**wants), timeout_s, name)
+    found = job.run(Trial(**trial), TrialOptions(**wants), timeout_s, name)
     return found.as_values(), str(worker.address)
 
 
 def _take_trace(path: str, read: bool) -> bytes:
-    """Take a trace away from the worker, or only delete it."""
+    """Move a trace off the worker, or only delete it."""
     data = Path(path).read_bytes() if read else b""
     Path(path).unlink(missing_ok=True)
     return data
@@ -232,8 +239,8 @@ def _version() -> str:
 
 
 class Cluster:
-    """The workers of a cluster, as ``workers.Workers`` has those of this machine: ``submit`` while
-    ``idle``, ``results`` waits for the next ones. A context manager."""
+    """The workers of a cluster, used like ``workers.Workers``: ``submit`` while ``idle``;
+    ``results`` waits for the next ones. A context manager."""
 
     def __init__(self, source: JobSource, address: str, *, pins: bool = True) -> None:
         """``address``: of a scheduler (``tcp://host:8786``), the path of a scheduler file, or
@@ -242,7 +249,7 @@ class Cluster:
         :raises JobError: the job is wrong.
         :raises ExploreError: a file of it cannot be read.
         """
-        self._place = _Place(bundle_of(source), pins=pins)
+        self._job = _WorkerJob(bundle_of(source), pins=pins)
         self._address = address
         self._futures: dict[Future, tuple[Trial, Path]] = {}
         self._kept = KeptTraces()
@@ -251,13 +258,13 @@ class Cluster:
     def __enter__(self) -> Cluster:
         """Connect, and send the job's files to the workers there are.
 
-        :raises ExploreError: nobody answers, or a worker cannot run the job.
+        :raises ExploreError: the scheduler does not answer, or a worker cannot run the job.
         """
         try:
             self._client = _connected(self._address)
             self._client.wait_for_workers(1, timeout=_CONNECT_S)
             self._check_versions()
-            self._client.register_plugin(self._place)
+            self._client.register_plugin(self._job)
         except ExploreError:
             self.__exit__()
             raise
@@ -274,11 +281,11 @@ class Cluster:
         with suppress(Exception):
             client.cancel(list(self._futures), force=True)
         with suppress(Exception):
-            client.unregister_worker_plugin(self._place.name)
+            client.unregister_worker_plugin(self._job.name)
         client.close()
 
     def _check_versions(self) -> None:
-        """See that the workers have this rsltrace; one that cannot import it does not answer."""
+        """Check that the workers have this version of rsltrace."""
         assert self._client is not None
         answers = self._client.run(_version, on_error="return")
         for address, answer in answers.items():
@@ -289,8 +296,8 @@ class Cluster:
                 )
             if answer != __version__:
                 raise ExploreError(
-                    f"the worker {address} has rsltrace {answer}, and here is {__version__}: runs "
-                    "of one search need one version"
+                    f"the worker {address} has rsltrace {answer}, this machine {__version__}: "
+                    "install one version on all"
                 )
 
     @property
@@ -310,18 +317,18 @@ class Cluster:
         return len(self._futures)
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
-        """Have a worker run a trial. One that dies meanwhile is replaced by another."""
+        """Have a worker run a trial. A worker that dies is replaced."""
         assert self._client is not None
-        words = (self._place.name, asdict(trial), asdict(wants), timeout_s)
+        words = (self._job.name, asdict(trial), asdict(wants), timeout_s)
         future = self._client.submit(_run, *words, pure=False, retries=_TRIES_MAX - 1)
         self._futures[future] = (trial, trace)
 
     def results(self, wait_s: float | None = None) -> Iterator[TrialResult]:
-        """Wait until something has come, ``wait_s`` at most; yield the results of what is over.
+        """Wait for results, ``wait_s`` at most, and yield them.
 
-        :raises ExploreError: a run could not be made, or the cluster has gone.
+        :raises ExploreError: a run could not start, or the cluster has disconnected.
         """
         ready = self._ready(wait_s)
         for future in ready:
@@ -335,7 +342,7 @@ class Cluster:
         while True:
             assert self._client is not None
             if self._client.status not in ("running", "connecting"):
-                raise ExploreError(f"the cluster {self._address} has gone")
+                raise ExploreError(f"the cluster {self._address} has disconnected")
             found = [one for one in self._futures if one.done()]
             if found or (end_s is not None and time.monotonic() >= end_s):
                 return found
@@ -367,7 +374,7 @@ class Cluster:
         assert self._client is not None
         try:
             answer = self._client.run(_take_trace, found.trace, wanted, workers=[address])
-        except (OSError, CommClosedError, ValueError):  # the worker has gone: the run repeats it
+        except (OSError, CommClosedError, ValueError):  # the worker has gone
             return replace(found, trace=None)
         if not wanted:
             return replace(found, trace=None)

@@ -1,4 +1,4 @@
-"""One run of a search, in the process that makes it: its trace, its checks, what is new in it."""
+"""Run one trial of a search: its trace, its checks and metrics, what is new in it."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ from rsltrace.errors import (
 from rsltrace.job import Job
 from rsltrace.run.process import kept_process, search_path
 from rsltrace.run.session import RunResult, Session
-from rsltrace.search.explore.behaviour import behaviours_of, final_state_of
-from rsltrace.search.explore.steps import Watch
+from rsltrace.search.explore.steps import TrialObserver, behaviours_of, final_state_of
 from rsltrace.search.explore.trial import (
     CHECK,
     DEADLOCK,
@@ -46,12 +45,12 @@ _TEXT_MAX = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Wants:
-    """What is asked for of a trial beside how it went.
+class TrialOptions:
+    """What a trial records.
 
-    ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be held against
-    the run is an error, not a failure of the run. ``fork_ns``: how much of the run, in simulated
-    time, is that of the job as it is, so that it may be forked from that (-1: nothing).
+    ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be evaluated is an
+    error, not a failure of the run. ``fork_ns``: up to which simulated time the run equals the
+    plain one and may be forked from it (-1: not at all).
     """
 
     keep: bool = False
@@ -62,22 +61,20 @@ class Wants:
 
 
 def run_trial(
-    source: JobSource, trial: Trial, trace: Path, wants: Wants | None = None
+    source: JobSource, trial: Trial, trace: Path, wants: TrialOptions | None = None
 ) -> TrialResult:
-    """Run a trial in this process; its trace at ``trace`` is there afterwards if it failed, or is
-    wanted.
+    """Run a trial in this process; its trace stays at ``trace`` if it failed, or is wanted.
 
-    For a process that makes one trial: modules and numbers of objects are then those of a run
-    that ``rsltrace record`` makes. See ``workers`` for whoever wants many.
+    For a process that runs one trial, as ``rsltrace record`` does. ``workers`` runs many.
 
     :raises JobError, SetupError, BagError, OutputError: the run could not start or be written.
-    :raises CheckError: a check cannot be held against it, and ``wants`` is strict.
+    :raises CheckError: a check cannot be evaluated, and ``wants`` is strict.
     """
-    wants = wants or Wants()
+    wants = wants or TrialOptions()
     began = time.perf_counter()
     job = source.job(trial)
     with kept_process(), Session(job, trace, force=True) as session:
-        watch = Watch(session, steps=wants.steps, fork_ns=wants.fork_ns)
+        watch = TrialObserver(session, steps=wants.steps, fork_ns=wants.fork_ns)
         session.begin()
         if not session.ended:
             session.go_on()
@@ -86,10 +83,15 @@ def run_trial(
 
 
 def result_of_run(
-    job: Job, trial: Trial, ran: RunResult, watch: Watch, wants: Wants, began_s: float
+    job: Job,
+    trial: Trial,
+    ran: RunResult,
+    watch: TrialObserver,
+    wants: TrialOptions,
+    began_s: float,
 ) -> TrialResult:
-    """Return what came of a run that is over, which ``watch`` has seen. It began at ``began_s`` of
-    ``time.perf_counter``. Its trace goes unless it failed, or is wanted."""
+    """Return the result of a finished run. It began at ``began_s`` of ``time.perf_counter``. Its
+    trace is deleted unless it failed, or is wanted."""
     assert ran.path is not None, "it has been recorded"
     with Trace.open(ran.path) as opened:
         failure = _failure(job, ran, opened, wants)
@@ -118,8 +120,8 @@ def result_of_run(
     return replace(found, trace=str(ran.path) if kept else None, wall_s=round(wall_s, 6))
 
 
-def _failure(job: Job, ran: RunResult, trace: Trace, wants: Wants) -> Failure | None:
-    """Return what is wrong with a run, the run's own failure before those of checks."""
+def _failure(job: Job, ran: RunResult, trace: Trace, wants: TrialOptions) -> Failure | None:
+    """Return the failure of a run, its own before those of checks."""
     if ran.error is not None:
         return _of_error(job, ran.error, trace)
     try:
@@ -141,13 +143,13 @@ def _failure(job: Job, ran: RunResult, trace: Trace, wants: Wants) -> Failure | 
 
 
 def _not_held(error: CheckError | JobError) -> Failure:
-    """Return the failure of a run that a check or metric cannot be held against."""
+    """Return the failure of a run for which a check or metric cannot be evaluated."""
     text = str(error)
     return Failure(ERROR, shortened(text, _TEXT_MAX), f"a check: {text.splitlines()[0]}")
 
 
 def _metrics(
-    job: Job, trace: Trace, failure: Failure | None, wants: Wants
+    job: Job, trace: Trace, failure: Failure | None, wants: TrialOptions
 ) -> tuple[Failure | None, dict[str, float]]:
     """Return the run's metrics that have a value, and its failure, which may be one of them."""
     if not job.metrics:
@@ -204,7 +206,7 @@ def _last_line(job: Job, text: str) -> str:
 
 
 def _relative(job: Job, file: str) -> str:
-    """Return a path as seen from the job, the same wherever both lie."""
+    """Return a path relative to the job's folder."""
     if not os.path.isabs(file):
         return file
     return os.path.relpath(file, job.base_dir)

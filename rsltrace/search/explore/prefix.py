@@ -1,8 +1,8 @@
-"""Runs that begin alike: a process makes the beginning once, and each run goes on in a copy of it.
+"""Runs with a common prefix: a process runs the prefix once, and each run continues in a fork.
 
-A worker has one such process for runs in other orders and one for those with faults. It stands
-still after the prefix, between two time steps, and is asked for copies; what cannot be copied, or
-differs before that (which the copy finds), is run from the beginning, and the answer says why.
+A worker has one such process for runs in other orders and one for those with faults. It pauses
+after the prefix, between two time steps, and is forked for each run. A run that cannot be forked,
+or that differs in the prefix, runs from the beginning, and the answer says why.
 """
 
 from __future__ import annotations
@@ -28,24 +28,22 @@ from rsltrace.search.explore.trial import JobSource, Trial
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
-    from rsltrace.search.explore.outcome import Wants
-    from rsltrace.search.explore.steps import Watch
+    from rsltrace.search.explore.outcome import TrialOptions
+    from rsltrace.search.explore.steps import TrialObserver
 
-# What a copy of a worker's process does: it makes one run, answers, and ends.
 
 _HIGH = 900
 """Descriptors from here on are not those that nodes get first."""
 
 
 def take_ends(tell: int, say: int) -> int:
-    """Have what is printed go to ``say``; return a high descriptor that answers as ``tell`` does.
-    Both stay open."""
+    """Redirect stderr to ``say``; return a high duplicate of ``tell``. Both stay open."""
     os.dup2(say, 2)
     return fcntl.fcntl(tell, fcntl.F_DUPFD_CLOEXEC, _HIGH)
 
 
 def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
-    """Write what a run answers, or what it was in trouble with, and end this process."""
+    """Write the answer of a run, or its error, and end this process."""
     status = 1
     try:
         try:
@@ -69,7 +67,7 @@ def answer_and_end(run: Callable[[], dict[str, Any]], tell: int) -> None:
 
 
 def source_of(task: dict[str, Any]) -> JobSource:
-    """Return the job that a task is about."""
+    """Return the job of a task."""
     job = task["job"]
     return JobSource(**{**job, "overrides": tuple((one, two) for one, two in job["overrides"])})
 
@@ -78,21 +76,21 @@ _IN_COMMON: dict[str, Mapping[str, Any]] = {
     "policy": {"policy": {"departures": []}},
     "faults": {},
 }
-"""The overlay of the run that those with one of these begin like."""
+"""By kind of trial, the overlay of its common prefix."""
 
 
 class Prefixes:
-    """The processes of one worker that stand at the end of a prefix."""
+    """The processes of one worker that are paused at the end of a prefix."""
 
     def __init__(self) -> None:
         self._all: dict[str, _Prefix] = {}
 
     def fork(self, task: dict[str, Any], tell: int, say: int) -> tuple[int | None, str]:
-        """Begin a trial in a copy of the process that has made its prefix, which answers at
-        ``tell``; return its id, or None and why there is none."""
+        """Begin a trial in a fork of its prefix process, which answers at ``tell``; return its id,
+        or None and why there is none."""
         kinds = list(task["trial"]["overlay"])
         if len(kinds) != 1 or kinds[0] not in _IN_COMMON:
-            return None, "what is set for it counts from the beginning" if kinds else ""
+            return None, "its settings apply from the beginning" if kinds else ""
         prefix = self._all.get(kinds[0])
         if prefix is None:
             prefix = self._all[kinds[0]] = _Prefix(task, _IN_COMMON[kinds[0]])
@@ -106,13 +104,13 @@ class _Prefix:
         ours, theirs = socket.socketpair()
         worker = os.getpid()
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # the threads beside do nothing
+            warnings.simplefilter("ignore", DeprecationWarning)  # the other threads are idle
             self._pid = os.fork()
         if self._pid == 0:
             os.setsid()
             die_with_parent(worker)
             ours.close()
-            _stand(task, overlay, Lines(theirs), worker)
+            _serve_forks(task, overlay, Lines(theirs), worker)
         theirs.close()
         self._lines = Lines(ours)
         self._lines.move_high()
@@ -128,7 +126,7 @@ class _Prefix:
             return None, self._why
         timeout_s = task.get("timeout_s")
         self._end_s = None if timeout_s is None else time.monotonic() + timeout_s
-        with suppress(OSError):  # it has died meanwhile: there is no answer
+        with suppress(OSError):  # it has died: there is no answer
             self._lines.send(task, tell, say)
         answer = self._receive()
         if "gone" in answer:
@@ -145,11 +143,11 @@ class _Prefix:
                 if self._end_s is not None:
                     left_ms = max(self._end_s - time.monotonic(), 0) * 1000
                 if not poll.poll(left_ms):
-                    return {"gone": True, "why": "the part in common takes too long"}
+                    return {"gone": True, "why": "the common prefix takes too long"}
                 self._lines.read()
         except DebugError as error:
             return {"gone": True, "why": str(error)}
-        return message or {"gone": True, "why": "the process that made the part in common has died"}
+        return message or {"gone": True, "why": "the process that ran the common prefix has died"}
 
     def _end(self) -> None:
         self._lines.close()
@@ -161,8 +159,10 @@ class _Prefix:
 # -- in the process itself -------------------------------------------------------------------------
 
 
-def _stand(task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worker: int) -> None:
-    """Make the prefix, and copies of this process from then on. Never returns."""
+def _serve_forks(
+    task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worker: int
+) -> None:
+    """Run the prefix, then fork this process on request. Never returns."""
     from rsltrace.guard.guard import engage
 
     lines.move_high()
@@ -173,11 +173,11 @@ def _stand(task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worke
     try:
         with ExitStack() as stack:
             try:
-                standing = _Standing(task, overlay, stack)
-            except Exception as error:  # a run from the beginning says more of it
-                lines.send({"why": f"the part in common cannot be made: {error}"})
+                paused = _PausedRun(task, overlay, stack)
+            except Exception as error:  # a run from the beginning reports it in full
+                lines.send({"why": f"the common prefix fails: {error}"})
                 return
-            why = standing.why or why_not(kept, frozenset(), standing.session.inner_pairs())
+            why = paused.why or why_not(kept, frozenset(), paused.session.inner_pairs())
             if why:
                 lines.send({"why": why})
                 return
@@ -187,28 +187,28 @@ def _stand(task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worke
                     request = lines.receive()
                     if request is None:
                         return
-                    if not standing.serve(request, lines, worker):
+                    if not paused.serve(request, lines, worker):
                         continue
-                standing.make(request)
+                paused.make(request)
     finally:
         end_process(0)
 
 
-class _Standing:
-    """A run that stands still after its prefix."""
+class _PausedRun:
+    """A run that is paused after its prefix."""
 
     def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any], stack: ExitStack) -> None:
         from rsltrace.run.branching import run_up_to, why_never
         from rsltrace.run.process import end_with_run, kept_process
         from rsltrace.run.session import Session
-        from rsltrace.search.explore.outcome import Wants
-        from rsltrace.search.explore.steps import Watch
+        from rsltrace.search.explore.outcome import TrialOptions
+        from rsltrace.search.explore.steps import TrialObserver
         from rsltrace.trace.writer import TraceWriter
 
         end_with_run()
         self._stack = stack
         self._source = source_of(task)
-        wants = Wants(**task["wants"])
+        wants = TrialOptions(**task["wants"])
         job = self._source.job(Trial(0, overlay))
         self.why = why_never(job)
         writer = TraceWriter(None, force=True, events_per_segment=job.record.segment_events)
@@ -216,16 +216,17 @@ class _Standing:
         self.session: Session = Session(job, None, force=True, writer=writer)
         self.session.may_become = True
         stack.enter_context(self.session)
-        self._watch: Watch = Watch(self.session, steps=wants.steps, fork_ns=wants.fork_ns)
+        self._watch: TrialObserver = TrialObserver(
+            self.session, steps=wants.steps, fork_ns=wants.fork_ns
+        )
         if not self.why and not run_up_to(self.session, self.session.start_ns + wants.fork_ns):
-            self.why = "the part in common ends before that"
+            self.why = "the common prefix ends before that"
         self._answer_at = -1
 
     def serve(self, task: dict[str, Any], lines: Lines, worker: int) -> bool:
-        """Answer a request with a copy of this process, if there can be one. True in the copy.
+        """Answer a request with a fork of this process, if possible. True in the fork.
 
-        Nothing else is done here: garbage is not collected any more, and would be there in every
-        copy.
+        Nothing else happens here: garbage is not collected and would be in every fork.
         """
         tell, say = task["with"]
         try:
@@ -247,12 +248,12 @@ class _Standing:
             os.close(say)
 
     def make(self, task: dict[str, Any]) -> None:
-        """Go on as the run of a trial, and end this process. Never returns."""
-        from rsltrace.search.explore.outcome import Wants
+        """Continue as the run of a trial, and end this process. Never returns."""
+        from rsltrace.search.explore.outcome import TrialOptions
 
-        answer_and_end(lambda: self._made(task, Wants(**task["wants"])), self._answer_at)
+        answer_and_end(lambda: self._made(task, TrialOptions(**task["wants"])), self._answer_at)
 
-    def _made(self, task: dict[str, Any], wants: Wants) -> dict[str, Any]:
+    def _made(self, task: dict[str, Any], wants: TrialOptions) -> dict[str, Any]:
         from rsltrace.run.branching import why_not as why_no_branch
         from rsltrace.search.explore.outcome import result_of_run
 

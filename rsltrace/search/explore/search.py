@@ -1,4 +1,4 @@
-"""A search: what a strategy proposes is run and written down, until the budget is used up."""
+"""A search: run what a strategy proposes and write it down, until the budget is used up."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rsltrace.job import Job
-from rsltrace.search.explore.kept_traces import KeptTraces
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.strategy import Strategy
 from rsltrace.search.explore.table import Table
-from rsltrace.search.explore.trial import Trial, TrialResult
+from rsltrace.search.explore.trial import KeptTraces, Trial, TrialResult
 from rsltrace.trace.mcap.sink import unfinished
 
 _TIMEOUT_MIN_S = 60.0
@@ -24,14 +23,14 @@ _TIMEOUT_FACTOR = 30
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """How much is tried: so many trials, or so many seconds of real time (None: any)."""
+    """Limits of a search: trials, or seconds of real time (None: no limit)."""
 
     trials: int | None = None
     seconds: float | None = None
 
 
 class Pool(Protocol):
-    """Where trials are run: ``workers.Workers``, or something like it elsewhere."""
+    """Where trials run: ``workers.Workers``, or a cluster."""
 
     @property
     def idle(self) -> int:
@@ -42,7 +41,7 @@ class Pool(Protocol):
         """How many trials are under way."""
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         """Begin a trial."""
 
@@ -52,7 +51,7 @@ class Pool(Protocol):
 
 @dataclass
 class Tally:
-    """What has come of a search so far, without anything that grows with each run."""
+    """The results of a search so far, without anything that grows with each run."""
 
     runs: int = 0
     events: int = 0
@@ -63,9 +62,9 @@ class Tally:
     """The first run of each cause."""
     plain: TrialResult | None = None
     forked: int = 0
-    """How many runs went on from the prefix that they have in common."""
+    """How many runs were forked from their common prefix."""
     not_forked: Counter[str] = field(default_factory=Counter)
-    """How many should have been, by why they could not."""
+    """How many should have been, by the reason why they were not."""
 
     def add(self, result: TrialResult) -> None:
         """Count a run."""
@@ -87,8 +86,7 @@ class Tally:
 class Search:
     """One search; a context manager, around that of its pool.
 
-    ``run`` goes on until the budget is used up, nothing is left to try, or ``stop`` is called; what
-    has ended by then is in the table.
+    ``run`` returns when the budget is used up, nothing is left to try, or ``stop`` is called.
     """
 
     def __init__(
@@ -107,7 +105,7 @@ class Search:
         self.strategy = strategy
         self.began_s = time.monotonic()
         self.runs_here = 0
-        """How many runs have ended since ``began_s``: not those of a search that is resumed."""
+        """How many runs have ended since ``began_s``, without those of a resumed search."""
         self.is_exhausted = False
         """Whether the strategy has nothing left to try."""
         self._table = table
@@ -126,7 +124,11 @@ class Search:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number in self._under_way:  # they have ended with the pool, and have no row
+        self._delete_unfinished()
+
+    def _delete_unfinished(self) -> None:
+        """Delete the traces of runs that ended with the pool and have no row."""
+        for number in self._under_way:
             path = self._table.trace_of(number)
             for one in (path, unfinished(path)):
                 one.unlink(missing_ok=True)
@@ -136,9 +138,9 @@ class Search:
         self._stopped = True
 
     def run(self, pool: Pool, on_result: Callable[[TrialResult], None] = lambda one: None) -> None:
-        """Search; ``on_result`` is told of each run that has ended.
+        """Search; ``on_result`` receives each run that has ended.
 
-        :raises ExploreError: a run cannot be made, or a result not be written.
+        :raises ExploreError: a run cannot start, or a result cannot be written.
         """
         self.began_s = time.monotonic()
         try:
@@ -146,12 +148,7 @@ class Search:
                 self._run_plain(pool, on_result)
             self._go_on(pool, on_result)
         finally:
-            for number in self._under_way:  # they are ended with the pool, and have no row
-                for path in (
-                    self._table.trace_of(number),
-                    unfinished(self._table.trace_of(number)),
-                ):
-                    path.unlink(missing_ok=True)
+            self._delete_unfinished()
 
     def _go_on(self, pool: Pool, on_result: Callable[[TrialResult], None]) -> None:
         while True:
@@ -166,10 +163,10 @@ class Search:
             for result in pool.results(self._left_s()):
                 self._take(result, on_result)
             if self._left_s() == 0:
-                return  # what is under way is not waited for: it may take long
+                return  # runs under way may take long: do not wait for them
 
     def _recall(self) -> TrialResult | None:
-        """Take up the results that are there; return the plain run's, if it is among them."""
+        """Load the existing results; return that of the plain run, if it is there."""
         learned = {one.trial.number: one for one in self._table.learned}
         plain = None
         for row in self._table.earlier:
@@ -195,7 +192,7 @@ class Search:
         self._begin(found[0])
         self._keep(found[0], found[0], on_result)
 
-    def _submit(self, pool: Pool, trial: Trial, wants: Wants) -> None:
+    def _submit(self, pool: Pool, trial: Trial, wants: TrialOptions) -> None:
         self._under_way.add(trial.number)
         pool.submit(trial, self._table.trace_of(trial.number), wants, self._timeout_s)
 
@@ -219,7 +216,7 @@ class Search:
         return max(self._budget.seconds - (time.monotonic() - self.began_s), 0)
 
     def _next(self) -> Trial | None:
-        """Return the next trial, of the first number that has none."""
+        """Return the next trial, with the first free number."""
         while self._number in self._done:
             self._number += 1
         proposal = self.strategy.propose(self._number)
@@ -228,9 +225,11 @@ class Search:
         self._done.add(self._number)
         return Trial(self._number, proposal.overlay, proposal.why)
 
-    def _wants(self) -> Wants:
+    def _wants(self) -> TrialOptions:
         strategy = self.strategy
-        return Wants(behaviours=strategy.behaviours, steps=strategy.steps, fork_ns=self._fork_ns)
+        return TrialOptions(
+            behaviours=strategy.behaviours, steps=strategy.steps, fork_ns=self._fork_ns
+        )
 
     def _take(self, result: TrialResult, on_result: Callable[[TrialResult], None]) -> None:
         self._keep(result, self.strategy.learn(result), on_result)
@@ -249,7 +248,7 @@ class Search:
         on_result(result)
 
     def _count(self, result: TrialResult) -> TrialResult:
-        """Count a run; return it as it is written down, without a trace that is not kept."""
+        """Count a run; return its row, without a trace that is not kept."""
         self.tally.add(result)
         if result.failure is None:
             return result
@@ -262,7 +261,7 @@ class Search:
 
 
 def _plain_trial(job: Job) -> Trial:
-    """Return the trial of a job as it is. Where it has no order of its own, choices are counted."""
+    """Return the trial of a job as it is. If it has no policy, choices are counted."""
     policy = job.policy
     is_plain = policy is None or policy.order == "fifo"
     overlay: dict[str, Any] = {"policy": {"departures": []}} if is_plain else {}

@@ -1,9 +1,8 @@
-"""What a run had to choose from, what it chose, and what each thing that ran has touched.
+"""The choices of a run, and what each step touched.
 
 A search that changes the order of a run needs to know which changes could matter. Two steps commute
-unless one of them writes what the other reads or writes: a node (its own callbacks), a topic or
-service (a message that arrives, in the queue of its subscription), or everything (an entity is made
-or destroyed, an exception ends the run).
+unless one writes what the other reads or writes: a node (its own callbacks), a topic or service
+(the queue of its subscription), or everything (an entity is created or destroyed, an exception).
 """
 
 from __future__ import annotations
@@ -11,16 +10,116 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+import numpy.typing as npt
+
 from rsltrace.run.session import Session
-from rsltrace.search.explore.behaviour import identities
-from rsltrace.search.explore.trial import Step
+from rsltrace.search.explore.trial import TrialStep
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.policy import Candidate, Moment
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.finding import Source
 from rsltrace.trace.reader import Trace
+
+# What a run did, as hashes that other runs of the job can be compared with.
+
+Hashes = npt.NDArray[np.uint64]
+
+_FACTORS = tuple(
+    np.uint64(factor)
+    for factor in (
+        0x9E3779B97F4A7C15,
+        0xC2B2AE3D27D4EB4F,
+        0x165667B19E3779F9,
+        0x27D4EB2F165667C5,
+        0x94D049BB133111EB,
+    )
+)
+_SHIFT = np.uint64(29)
+
+
+def identities(trace: Trace) -> dict[int, str]:
+    """Return a name for each entity that it has in other runs, too: node, kind, name, and which
+    one of several that are called alike."""
+    names: dict[int, str] = {}
+    seen: dict[str, int] = {}
+    for entity in trace.entities.values():
+        name = f"{_node(trace, entity)} {entity.kind.label} {entity.name}"
+        seen[name] = seen.get(name, 0) + 1
+        names[entity.id] = name if seen[name] == 1 else f"{name} ({seen[name]})"
+    return names
+
+
+def _node(trace: Trace, entity: Entity) -> str:
+    return trace.node_of(entity).name if entity.node else ""
+
+
+def events_of(trace: Trace) -> npt.NDArray[np.void]:
+    """Return the events of a run before its nodes were destroyed."""
+    pieces = list(trace.events(0, trace.ended_after))
+    return np.concatenate(pieces) if pieces else np.empty(0, dtype=[("entity", "<u4")])
+
+
+def behaviours_of(trace: Trace) -> tuple[int, ...]:
+    """Return a hash for each kind of thing that happened: an event with its content and the state
+    of its node after it, and two events of a node one after the other."""
+    events = events_of(trace)
+    if not len(events):
+        return ()
+    by_id, nodes = _tables(trace)
+    entity = events["entity"]
+    name = by_id[entity]
+    kind = events["kind"].astype(np.uint64)
+    done = _mixed(name, kind, events["input_hash"], events["output_hash"], events["state_hash"])
+    node = nodes[entity]
+    order = np.argsort(node, kind="stable")
+    same = node[order][1:] == node[order][:-1]
+    first, second = name[order][:-1][same], name[order][1:][same]
+    return tuple(np.unique(np.concatenate([done, _mixed(first, second)])).tolist())
+
+
+def final_state_of(trace: Trace) -> str:
+    """Return a hash of how the nodes were at the end: 16 hex digits.
+
+    A node counts with the hash of its state where that is made (``guard: state``), else with all
+    of its events in their order: two runs with the same hash have left the same nodes then.
+    """
+    events = events_of(trace)
+    if not len(events):
+        return ""
+    by_id, nodes = _tables(trace)
+    owner = nodes[events["entity"]]
+    total, names = 0, identities(trace)
+    for node in np.unique(owner).tolist():
+        own = events[owner == node]
+        last = int(own["state_hash"][-1])
+        if last == 0:
+            done = _mixed(by_id[own["entity"]], own["input_hash"], own["output_hash"])
+            last = hash64(done.tobytes())
+        total ^= hash64(f"{names[node]}\0{last:016x}".encode())
+    return f"{total:016x}"
+
+
+def _tables(trace: Trace) -> tuple[Hashes, npt.NDArray[np.int64]]:
+    """Return a hash of the name, and the node, of each entity by its id."""
+    size = max(trace.entities) + 1
+    hashes, nodes = np.zeros(size, dtype=np.uint64), np.zeros(size, dtype=np.int64)
+    for number, name in identities(trace).items():
+        hashes[number] = hash64(name.encode())
+        nodes[number] = trace.entity(number).node
+    return hashes, nodes
+
+
+def _mixed(*columns: npt.NDArray[np.uint64]) -> Hashes:
+    """Return one hash for each row."""
+    total = np.zeros(len(columns[0]), dtype=np.uint64)
+    for column, factor in zip(columns, _FACTORS, strict=False):
+        total = (total ^ column) * factor
+        total ^= total >> _SHIFT
+    return total
+
 
 EVERYTHING = "*"
 _TALK = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
@@ -33,8 +132,8 @@ _Timers = tuple[tuple[str, int, bool], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class _Asked:
-    """One asking of the policy: (entity id, kind, node, entity) of all that could run."""
+class _PolicyChoice:
+    """One choice of the policy: (entity id, kind, node, entity) of all that could run."""
 
     ready: tuple[tuple[int, str, str, str], ...]
     chosen: int
@@ -43,29 +142,29 @@ class _Asked:
 
 
 @dataclass(frozen=True, slots=True)
-class _Lull:
-    """The end of a phase: how many events there were, when, and the timers then."""
+class _PhaseEnd:
+    """The end of a phase: number of events, time, and state of the timers."""
 
     events: int
     now_ns: int
     timers: _Timers
 
 
-class Watch:
-    """Looks over the shoulder of a run's policy, from before it begins."""
+class TrialObserver:
+    """Observes the choices of a run's policy, from before it begins."""
 
     def __init__(self, session: Session, *, steps: bool, fork_ns: int = -1) -> None:
         """``fork_ns``: since the start of the run, when others are forked from it (-1: never)."""
         self.order: list[tuple[int, int]] = []
         """Of each choice, which of how many was taken."""
         self.entities: set[tuple[int, int]] = set()
-        """Whatever could run at some time: entities, and which of their callbacks under way."""
+        """All that could run at some time: entity and thread."""
         self.choices_before = 0
         """How many choices there have been up to ``fork_ns``."""
         self._fork_ns = fork_ns
         self._session = session
-        self._asked: list[_Asked] = []
-        self._lulls: list[_Lull] = []
+        self._asked: list[_PolicyChoice] = []
+        self._lulls: list[_PhaseEnd] = []
         loop = session.loop
         if isinstance(loop, OrderedLoop):
             loop.on_choice = self._note
@@ -82,7 +181,7 @@ class Watch:
         if not self._keeps:
             return
         what = tuple((one.entity_id, one.kind, one.node, one.entity) for one in ready)
-        self._asked.append(_Asked(what, chosen, len(self._lulls), moment.events))
+        self._asked.append(_PolicyChoice(what, chosen, len(self._lulls), moment.events))
 
     def _note_lull(self) -> None:
         domain, loop = self._session.world.domain, self._session.loop
@@ -91,16 +190,16 @@ class Watch:
             for node in domain.graph.nodes
             for timer in node.timers
         )
-        self._lulls.append(_Lull(loop.events, loop.now_ns, timers))
+        self._lulls.append(_PhaseEnd(loop.events, loop.now_ns, timers))
 
     # -- after the run ---------------------------------------------------------------------------
 
-    def steps(self, trace: Trace) -> tuple[Step, ...]:
+    def steps(self, trace: Trace) -> tuple[TrialStep, ...]:
         """Return the steps of the run, whose trace this is."""
         if not self._asked:
             return ()
         names = identities(trace)
-        touches = _Touches(trace, self._programs())
+        touches = _TouchedNames(trace, self._programs())
         states = _states(trace, self._lulls, self._may_merge(trace))
         counts: dict[str, int] = {}
         found = []
@@ -113,7 +212,7 @@ class Watch:
             ready = [_name(names, *what) for what in one.ready]
             chosen = ready[one.chosen]
             found.append(
-                Step(
+                TrialStep(
                     tuple(_numbered(ready, counts)),
                     one.chosen,
                     one.phase,
@@ -137,10 +236,10 @@ class Watch:
         }
 
     def _may_merge(self, trace: Trace) -> bool:
-        """Say whether the hashes of nodes' states tell all that a node goes on from."""
+        """Whether the hashes of nodes' states cover all that later behaviour depends on."""
         job = self._session.job
         if job.delay is not None or job.execution is not None or job.executors is not None:
-            return False  # messages may be on their way, workers busy
+            return False  # messages may be in transit, workers busy
         if any(entity.kind in _COMES_AND_GOES for entity in trace.entities.values()):
             return False
         return not any(met.source is Source.RANDOM for met in trace.guarded)
@@ -150,12 +249,11 @@ def _name(names: dict[int, str], entity_id: int, kind: str, node: str, entity: s
     named = names.get(entity_id) if entity_id else None
     if named is None:
         return f"{node} {kind} {entity}"
-    return f"{named}, which goes on" if kind == "resume" else named
+    return f"{named}, resumed" if kind == "resume" else named
 
 
 def _numbered(ready: list[str], counts: dict[str, int]) -> list[str]:
-    """Say which event of its entity each is: a second message of one topic comes after the
-    first."""
+    """Number the events of each entity: a second message of a topic comes after the first."""
     here: dict[str, int] = {}
     found = []
     for name in ready:
@@ -164,8 +262,8 @@ def _numbered(ready: list[str], counts: dict[str, int]) -> list[str]:
     return found
 
 
-class _Touches:
-    """What events touch: True for what they write."""
+class _TouchedNames:
+    """The names that events touch: True for those they write."""
 
     def __init__(self, trace: Trace, programs: dict[str, str]) -> None:
         self._trace = trace
@@ -207,11 +305,11 @@ class _Touches:
         return self._programs.get(node, node)
 
 
-def _states(trace: Trace, lulls: list[_Lull], may_merge: bool) -> list[str]:
+def _states(trace: Trace, lulls: list[_PhaseEnd], may_merge: bool) -> list[str]:
     """Return a hash of everything at the beginning of each phase.
 
-    A node counts with the hash of its state where there is one and it says all, else with all that
-    it has done; what was published on a topic that keeps messages for late ones counts, too.
+    A node counts with its state hash if that covers everything, else with all its events; what was
+    published on transient-local topics counts, too.
     """
     done: dict[int, int] = {}
     states = [hash64(b"begin")]

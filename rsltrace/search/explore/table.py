@@ -1,12 +1,12 @@
-"""The results of a search: a folder with a line for each finished run, which a kill does not harm.
+"""The results of a search: a folder with a row for each finished run, safe against kills.
 
 search.json      what is searched, and how
 results.jsonl    a row for each trial, in the order in which they ended
-strategy.json    what a strategy has to remember, as of the last row
+learned.jsonl    what the strategy has to remember of some runs
 traces/          the traces of runs that failed: those of the lowest numbers of each cause
 
-A trace that a row names may be displaced by that of an earlier trial which ends later: whoever
-reads the rows finds the traces that are there.
+A trace that a row names may be displaced by that of an earlier trial which ends later. Reading the
+rows finds the traces that still exist.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ class Table:
         return _trace_of(self.folder, number)
 
     def add(self, result: TrialResult, learned: TrialResult | None = None) -> None:
-        """Append a row, and what the strategy needs to know beside it.
+        """Append a row, and what the strategy has to remember.
 
         :raises ExploreError: it cannot be written; the rows before it are whole.
         """
@@ -111,18 +111,18 @@ class Table:
             return
         if not self._resume:
             raise ExploreError(
-                f"{self.folder} has the results of a search: --resume goes on with it, --force "
+                f"{self.folder} has the results of a search: --resume continues it, --force "
                 "replaces it, -o names another folder"
             )
         try:
             about = json.loads(read_regular(there))
         except ValueError:
-            raise ExploreError(f"{there}: this is no search of rsltrace explore") from None
+            raise ExploreError(f"{there} was not written by rsltrace explore") from None
         for key, value in self._about.items():
             if about.get(key) != value:
                 raise ExploreError(
-                    f"{self.folder}: its search was another one ({key} differs); -o names another "
-                    "folder"
+                    f"{self.folder} has a different search ({key} differs); choose another folder "
+                    "with -o"
                 )
 
     def _delete(self) -> None:
@@ -143,7 +143,7 @@ def rows(folder: Path) -> Iterator[TrialResult]:
     try:
         yield from _read(folder / RESULTS)
     except FileNotFoundError:
-        raise ExploreError(f"{folder}: there is no {RESULTS}: no search was made here") from None
+        raise ExploreError(f"{folder} has no {RESULTS}: it is not the folder of a search") from None
     except OSError as error:
         raise ExploreError(f"{folder / RESULTS} cannot be read: {error.strerror}") from None
 
@@ -155,7 +155,7 @@ def _read(path: Path) -> Iterator[TrialResult]:
         try:
             found = result_of(json.loads(line))
         except (ValueError, KeyError, TypeError):
-            raise ExploreError(f"{path}:{number}: this is no row of a search") from None
+            raise ExploreError(f"{path}:{number} is not a row of a search") from None
         trace = _trace_of(path.parent, found.trial.number)
         yield found if found.trace is None else replace(found, trace=_if_there(trace))
 
@@ -187,6 +187,6 @@ def _replace(path: Path, text: str) -> None:
 def _cannot_write(folder: Path, error: OSError) -> ExploreError:
     of = error.filename or folder
     return ExploreError(
-        f"{of} cannot be written: {error.strerror}; what was found so far is kept in {folder}, and "
-        "--resume goes on"
+        f"{of} cannot be written: {error.strerror}; the results so far are kept in {folder}, "
+        "--resume continues"
     )

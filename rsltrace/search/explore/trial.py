@@ -1,29 +1,53 @@
-"""One run of a search: what sets it apart from the job, and what came of it.
+"""One run of a search: its changes to the job, and its result.
 
-What sets a trial apart is an *overlay*, plain JSON values:
+The changes are an *overlay* of plain JSON values:
 
     {"seed": 7, "policy": {…}, "faults": […], "set": {"nodes.0.parameters.speed": 1.2},
      "until": "3s"}
 
-``seed``, ``policy`` and ``faults`` stand for these keys of the job, ``set`` for any other, by the
-paths of ``--set``, ``until`` for ``stop.time``. So a trial is its job with the overlay, and
-``JobSource.job(trial).to_yaml()`` is the job file that repeats it: ``rsltrace record`` of that file
-has the trial's digest.
+``seed``, ``policy`` and ``faults`` replace these keys of the job, ``set`` any other, by the paths
+of ``--set``, ``until`` replaces ``stop.time``. ``JobSource.job(trial).to_yaml()`` is the job file
+that repeats a trial: ``rsltrace record`` of that file has its digest.
 """
 
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from rsltrace.job import Job, job_from_text, load_job
 
+# Which traces of runs that failed are kept: the choice does not depend on who is faster.
+#
+# Rejected: the traces that come first. Several runs are under way at a time, so the trace of the
+# first trial of a cause, which is made small, could come when there were enough.
+
+_KEPT_OF_A_CAUSE = 3
+
+
+class KeptTraces:
+    """Keeps, of each cause of failures, the traces of the trials with the lowest numbers."""
+
+    def __init__(self) -> None:
+        self._numbers: dict[str, list[int]] = {}
+
+    def add(self, cause: str, number: int) -> int | None:
+        """Take note of a trial that failed; return the trial whose trace is not kept (any more):
+        this one, an earlier one that it displaces, or None."""
+        kept = self._numbers.setdefault(cause, [])
+        place = bisect_left(kept, number)
+        if kept[place : place + 1] != [number]:
+            kept.insert(place, number)
+        return kept.pop() if len(kept) > _KEPT_OF_A_CAUSE else None
+
+
 CHECK, EXCEPTION, DEADLOCK, LIVELOCK = "check", "exception", "deadlock", "livelock"
 UNFINISHED, EXIT, ERROR, CRASH, TIMEOUT = "unfinished", "exit", "error", "crash", "timeout"
 """Kinds of failures. ``unfinished``: the job's ``stop.timeout`` came first. ``exit``: the run ended
-with a status of its own. ``error``: it did what a simulation cannot do, or its order could not be
+with an exit status. ``error``: it did what a simulation does not support, or its order could not be
 followed. ``crash``: its process died; ``timeout``: it was killed for taking too long."""
 
 _KEYS = ("seed", "policy", "faults")
@@ -32,9 +56,9 @@ _NOT_KEPT = ("behaviours", "order", "steps")
 
 @dataclass(frozen=True, slots=True)
 class JobSource:
-    """A job as a command line names it: the file, and texts of ``--set`` with what they are called.
+    """A job as a command line names it: the file, and overrides (name for messages, text).
 
-    ``text`` stands for the file where there is none (a launch file alone).
+    ``text`` replaces the file where there is none (a launch file alone).
     """
 
     path: str
@@ -64,7 +88,7 @@ class Trial:
 
 
 def overrides_of(trial: Trial) -> Iterator[tuple[str, str]]:
-    """Yield an overlay as overrides of a job: what messages call one, and its text."""
+    """Yield an overlay as overrides of a job: (name for messages, text)."""
     label = f"trial {trial.number}"
     for key, value in trial.overlay.items():
         if key == "set":
@@ -93,10 +117,10 @@ def _literal(value: Any) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """What is wrong with a run.
+    """Why a run failed.
 
     ``kind`` is one of the words above. ``key`` is the same for failures of one cause (a check's
-    name; an exception's type and line), ``event`` where it shows, if anywhere.
+    name; an exception's type and line), ``event`` the event that shows it, if any.
     """
 
     kind: str
@@ -106,14 +130,14 @@ class Failure:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
-    """What ran next at one asking of the policy, for a search that changes the order.
+class TrialStep:
+    """One choice of the policy, for a search that changes the order.
 
     ``ready`` are the names of all that could run, ``chosen`` is the index of the one that did; the
-    n-th event of an entity is ``name #n``, so it is called the same in another order. ``phase``
-    counts the stretches of a run at whose ends nothing was left to run. ``touches`` are the things
-    that what ran has read (False) or written (True): the steps of one phase commute unless one
-    writes what the other touches. ``state`` is a hash of everything at the beginning of the phase.
+    n-th event of an entity is ``name #n`` in every order. A ``phase`` ends when nothing is left to
+    run. ``touches`` are the names that the step read (False) or wrote (True): steps of one phase
+    commute unless one writes what the other touches. ``state`` is a hash of everything at the
+    beginning of the phase.
     """
 
     ready: tuple[str, ...]
@@ -125,16 +149,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class TrialResult:
-    """What came of a trial. Times are simulated nanoseconds, ``wall_s`` is real time.
+    """The result of a trial. Times are simulated nanoseconds, ``wall_s`` is real time.
 
-    ``choices`` is how often more than one could run; ``entities`` how many
-    there were that could run, ``choices_before`` how many of the choices there were up to the time
-    after which runs are forked. ``is_forked``: this one was, or else ``why_not_forked`` says why
-    not, if it should have been.
-    ``behaviours`` are hashes of what happened (an event with its content and its node's state
-    after it, and pairs of events of one node in their order), ``order`` is of each choice which of
-    how many was taken, ``steps`` says more of that; they are only there if asked for. ``trace`` is
-    where the trace is, if it was kept.
+    ``choices`` is how often more than one entity could run, ``entities`` how many could,
+    ``choices_before`` the choices up to the time after which runs are forked. ``why_not_forked``:
+    why it was not forked, if it should have been. Only on request: ``behaviours`` are hashes of
+    what happened (an event with content and state, pairs of events of a node), ``order`` is (taken,
+    of how many) for each choice, ``steps`` more of that. ``trace`` is the path, if it was kept.
     """
 
     trial: Trial
@@ -153,14 +174,14 @@ class TrialResult:
     final_state: str = ""
     behaviours: tuple[int, ...] = ()
     order: tuple[tuple[int, int], ...] = ()
-    steps: tuple[Step, ...] = ()
+    steps: tuple[TrialStep, ...] = ()
 
     def as_values(self) -> dict[str, Any]:
         """Return the result as JSON values."""
         return asdict(self)
 
     def row(self) -> dict[str, Any]:
-        """Return what a table keeps of it: without behaviours, order and steps."""
+        """Return the row of a table: without behaviours, order and steps."""
         values = asdict(replace(self, behaviours=(), order=(), steps=()))
         return {key: value for key, value in values.items() if key not in _NOT_KEPT}
 
@@ -174,7 +195,7 @@ def result_of(values: Mapping[str, Any]) -> TrialResult:
     given["behaviours"] = tuple(given.get("behaviours", ()))
     given["order"] = tuple((one, two) for one, two in given.get("order", ()))
     given["steps"] = tuple(
-        Step(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
+        TrialStep(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
         for one in given.get("steps", ())
     )
     return TrialResult(**given)

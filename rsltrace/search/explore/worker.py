@@ -214,11 +214,11 @@ def _make(task: dict[str, Any], tell: int, *, tells: bool) -> None:
     """Run the trial here, from its beginning, and end this process. Never returns."""
     before = frozenset(sys.modules)
     from rsltrace.run.process import end_with_run
-    from rsltrace.search.explore.outcome import Wants, run_trial
+    from rsltrace.search.explore.outcome import TrialOptions, run_trial
 
     def run() -> dict[str, Any]:
         end_with_run()
-        trial, wants = Trial(**task["trial"]), Wants(**task["wants"])
+        trial, wants = Trial(**task["trial"]), TrialOptions(**task["wants"])
         result = run_trial(source_of(task), trial, Path(task["trace"]), wants)
         answer: dict[str, Any] = {"result": result.as_values()}
         if tells:

@@ -21,7 +21,7 @@ from rsltrace.line_protocol import Lines
 from rsltrace.search.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
 
 if TYPE_CHECKING:
-    from rsltrace.search.explore.outcome import Wants
+    from rsltrace.search.explore.outcome import TrialOptions
 
 _MAIN = "rsltrace.search.explore.worker"
 _TRIES_MAX = 2
@@ -60,7 +60,7 @@ class Worker:
         return self._lines.fileno()
 
     def begin(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         """Begin to run a trial, which ends with ``result``."""
         assert self._task is None, "one trial at a time"
@@ -94,7 +94,7 @@ class Worker:
         return self._again() if self._lines.ended else None
 
     def run(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> TrialResult:
         """Run a trial to its end.
 
@@ -172,7 +172,7 @@ class Workers:
         return len(self._workers) - self.idle
 
     def submit(
-        self, trial: Trial, trace: Path, wants: Wants, timeout_s: float | None = None
+        self, trial: Trial, trace: Path, wants: TrialOptions, timeout_s: float | None = None
     ) -> None:
         """Have an idle worker run a trial."""
         next(one for one in self._workers if not one.is_busy).begin(trial, trace, wants, timeout_s)

@@ -1,9 +1,7 @@
-"""What a search has found, for people and for machines.
+"""Reports of a search.
 
-exploration   the results of a search, put in order: causes, settings, commands
-effects       which setting matters
-charts        small pictures, as SVG
-page          a page of HTML that needs nothing beside it
-formats       JSON, JUnit, annotations for GitHub
-parquet       a table of all runs
+exploration   its results: failures by cause, effects of settings, commands
+charts        charts as SVG
+page          a self-contained page of HTML
+formats       JSON, JUnit, annotations for GitHub, a Parquet table of all runs
 """

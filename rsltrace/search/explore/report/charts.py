@@ -1,4 +1,4 @@
-"""Small pictures as SVG elements: a histogram, points over a setting, what came with the runs."""
+"""Charts as SVG elements: a histogram, points over a setting, progress over the runs."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34
 _BINS = 24
 _POINTS_MAX = 1500
 _ASIDE = 17
-"""Points over a text lie side by side in so many places."""
+"""Columns in which points over a text are spread."""
 
 Points = Sequence[tuple[float, float, bool]]
 """x, y, and whether the run failed."""
 
 
 class _Chart:
-    """A picture with two axes."""
+    """A chart with two axes."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], says: str) -> None:
         self._x, self._y = _wide(x), _wide(y)
@@ -40,7 +40,7 @@ class _Chart:
         return round(_LEFT + across, 1), round(HEIGHT - _BOTTOM - up, 1)
 
     def axes(self, name: str, below: Sequence[tuple[float, str]] = ()) -> None:
-        """Draw the axes; ``below`` names places on the x axis, else its ends are."""
+        """Draw the axes; ``below`` labels places on the x axis, else its ends are labelled."""
         floor, wall = HEIGHT - _BOTTOM, _LEFT
         self._line(wall, floor, WIDTH - _RIGHT, floor)
         self._line(wall, floor, wall, _TOP)
@@ -82,13 +82,13 @@ class _Chart:
 
 
 def histogram(values: Sequence[tuple[float, bool]], name: str) -> Element:
-    """Draw how often a metric has which value; runs that failed stand on top of the others."""
+    """Draw the distribution of a metric; failed runs are stacked on the others."""
     low, high = _wide((min(v for v, _ in values), max(v for v, _ in values)))
     counts = [[0, 0] for _ in range(_BINS)]
     for value, failed in values:
         counts[min(int((value - low) / (high - low) * _BINS), _BINS - 1)][failed] += 1
     most = max(map(sum, counts))
-    chart = _Chart((low, high), (0, most), f"how often {name} has which value")
+    chart = _Chart((low, high), (0, most), f"distribution of {name}")
     width = (high - low) / _BINS
     for index, (good, bad) in enumerate(counts):
         if good:
@@ -120,8 +120,8 @@ def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()
 
 
 def progress(new: Sequence[bool], failed: Sequence[bool]) -> Element:
-    """Draw, over the runs, how many have done something new and how many have failed."""
-    chart = _Chart((0, len(new)), (0, max(sum(new), sum(failed), 1)), "what came with the runs")
+    """Draw, over the runs, how many were new and how many failed."""
+    chart = _Chart((0, len(new)), (0, max(sum(new), sum(failed), 1)), "new and failed runs so far")
     for flags, kind in ((new, "good"), (failed, "bad")):
         step = max(1, len(flags) // 400)
         totals = [(0, 0), *enumerate(accumulate(map(int, flags)), 1)]

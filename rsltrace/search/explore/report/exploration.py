@@ -1,4 +1,4 @@
-"""The results of a search, put in order: its failures by cause, the settings of its runs."""
+"""The results of a search: failures by cause, effects of settings, commands to repeat a run."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _COMMAND_MAX = 400
 _AT_LINE = re.compile(r" at (?P<file>[^:\s]+):(?P<line>\d+)")
 
 NO_CHECKS = (
-    "the job has no checks: only exceptions, deadlocks, livelocks, crashes and runs that do not "
-    "end in time were looked for. What has to be true of every run goes into the job, as in "
-    "checks: [never: log error] (docs/checks.md)"
+    "the job has no checks: only exceptions, deadlocks, livelocks, crashes and timeouts are "
+    "found. Add what must hold in every run to the job, e.g. checks: [never: log error] "
+    "(docs/checks.md)"
 )
-"""What somebody has to know of a search in which nothing else could fail."""
+"""A warning for searches of jobs without checks."""
 
 Value = float | str
 
 
 @dataclass(frozen=True, slots=True)
 class Reduced:
-    """A failing run made small: its folder, and the one difference that decides."""
+    """A reduced failing run: its folder, and the one difference that decides."""
 
     folder: str
     decides: str = ""
@@ -35,12 +35,11 @@ class Reduced:
 
 @dataclass(frozen=True, slots=True)
 class Exploration:
-    """A search that has ended, or stopped.
+    """A search that has ended.
 
-    ``job`` is the job file as it was named, ``arguments`` what else a command needs to mean the
-    same job (``--set``, ``--launch``). ``coverage`` says in sentences what was tried and what was
-    not, ``units`` has the units of metrics, ``reduced`` the runs made small by their failure's key.
-    ``checks`` is how many checks the job has.
+    ``job`` is the job file as it was named, ``arguments`` what else names the job in a command
+    (``--set``, ``--launch``). ``coverage`` are sentences on what was tried, ``units`` the units of
+    metrics, ``reduced`` the reduced runs by their failure's key, ``checks`` the number of checks.
     """
 
     job: str
@@ -55,7 +54,7 @@ class Exploration:
 
     @property
     def caution(self) -> str:
-        """What was not looked for, in a sentence; empty if the job says what has to be true."""
+        """A warning if the job has no checks, else empty."""
         return "" if self.checks else NO_CHECKS
 
     @property
@@ -65,12 +64,12 @@ class Exploration:
 
     @property
     def digests(self) -> int:
-        """How many runs did what no other did."""
+        """How many different runs there were."""
         return len({one.digest for one in self.results if one.digest})
 
 
 @dataclass(frozen=True, slots=True)
-class Cause:
+class FailureCause:
     """Failures of one cause: a check, or a line where an exception is raised.
 
     ``first`` is the run with the lowest number, ``shortest`` that with the fewest events.
@@ -93,12 +92,12 @@ class Cause:
 
     @property
     def place(self) -> tuple[str, int] | None:
-        """File (as seen from the job) and line that the failure names."""
+        """File (relative to the job) and line that the failure names."""
         found = _AT_LINE.search(self.key)
         return None if found is None else (found["file"], int(found["line"]))
 
 
-def causes(explored: Exploration) -> list[Cause]:
+def causes(explored: Exploration) -> list[FailureCause]:
     """Return the failures of a search by cause, the most frequent first."""
     groups: dict[str, list[TrialResult]] = {}
     for one in sorted(explored.failed, key=lambda one: one.trial.number):
@@ -108,12 +107,12 @@ def causes(explored: Exploration) -> list[Cause]:
     for key, runs in groups.items():
         failure = runs[0].failure
         assert failure is not None
-        found.append(Cause(key, failure, runs, explored.reduced.get(key)))
+        found.append(FailureCause(key, failure, runs, explored.reduced.get(key)))
     return sorted(found, key=lambda cause: (-len(cause.runs), cause.first.trial.number))
 
 
 def settings(trial: Trial) -> dict[str, Value]:
-    """Return what a trial sets that a metric could depend on: what was varied, and its fault."""
+    """Return the settings of a trial that a metric could depend on, its faults included."""
     given: dict[str, Value] = {}
     for path, value in trial.overlay.get("set", {}).items():
         given[path] = _value(value)
@@ -135,7 +134,7 @@ def _fault(fault: Mapping[str, Any]) -> str:
 
 
 def repeat_command(explored: Exploration, result: TrialResult) -> str | None:
-    """Return the command that makes a run again, None if it would be too long to read."""
+    """Return the command that repeats a run, None if it would be too long to read."""
     words = ["rsltrace", "record", explored.job, *explored.arguments]
     for _, override in overrides_of(result.trial):
         path, _, value = override.partition("=")
@@ -157,29 +156,26 @@ def view_command(result: TrialResult) -> str | None:
     return shlex.join(words)
 
 
-# Which setting matters: how much of a metric, or of failing, goes with each setting.
-#
-# A setting with many values is ranked against the outcome (Spearman); one with few is a factor
-# (Kruskal and Wallis). Neither takes for granted that anything is linear or normal. With many
-# pairs some look related by chance: the p-values are Holm's, of all pairs together.
+# Which setting matters: a setting with many values is ranked against the outcome (Spearman), one
+# with few is a factor (Kruskal and Wallis). Neither assumes that anything is linear or normal. The
+# p-values are corrected for the number of pairs (Holm).
 
 FAILS = "fails"
 """The outcome that a run fails (1) or does not (0)."""
 
 _FEW = 6
-"""So many values of a setting, or fewer, are a factor."""
+"""Up to so many values, a setting is a factor."""
 _RUNS_MIN = 5
 _SURE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Effect:
-    """What a setting has to do with an outcome (a metric, or ``fails``).
+class SettingEffect:
+    """The effect of a setting on an outcome (a metric, or ``fails``).
 
-    ``strength`` is the share of the ranks' variance that goes with it, 0 to 1; ``sign`` says
-    whether more of a number is more (1) or less (-1), 0 for texts. ``p`` is how likely a
-    strength like this is by chance, corrected for the number of pairs; ``runs`` how many were
-    compared.
+    ``strength`` is the share of the ranks' variance that it explains, 0 to 1; ``sign`` says whether
+    a larger value gives more (1) or less (-1), 0 for texts. ``p`` is the corrected p-value,
+    ``runs`` the number of runs compared.
     """
 
     setting: str
@@ -191,11 +187,11 @@ class Effect:
 
     @property
     def is_sure(self) -> bool:
-        """Whether chance is no likely explanation."""
+        """Whether it is statistically significant."""
         return self.p < _SURE
 
 
-def effects(results: Sequence[TrialResult]) -> list[Effect]:
+def effects(results: Sequence[TrialResult]) -> list[SettingEffect]:
     """Return the effects of all settings, the surest first.
 
     :raises ExploreError: scipy is not installed.
@@ -231,7 +227,7 @@ def _pairs(
     return [pair for pair in pairs if pair[1] == pair[1]]  # NaN says nothing
 
 
-def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> Effect | None:
+def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> SettingEffect | None:
     values = {value for value, _ in pairs}
     if len(pairs) < _RUNS_MIN or len(values) < 2 or len({y for _, y in pairs}) < 2:
         return None
@@ -247,14 +243,14 @@ def _effect(name: str, outcome: str, pairs: Sequence[tuple[Value, float]]) -> Ef
         related = float(ranked.statistic)
         sign = (related > 0) - (related < 0)
         if len(values) > _FEW:
-            return Effect(name, outcome, related**2, sign, float(ranked.pvalue), len(pairs))
+            return SettingEffect(name, outcome, related**2, sign, float(ranked.pvalue), len(pairs))
     groups = [[y for x, y in pairs if x == value] for value in sorted(values, key=str)]
     tested = stats.kruskal(*groups)
     strength = min(float(tested.statistic) / (len(pairs) - 1), 1.0)
-    return Effect(name, outcome, strength, sign, float(tested.pvalue), len(pairs))
+    return SettingEffect(name, outcome, strength, sign, float(tested.pvalue), len(pairs))
 
 
-def _corrected(found: Sequence[Effect]) -> list[Effect]:
+def _corrected(found: Sequence[SettingEffect]) -> list[SettingEffect]:
     """Return effects, in order of p, with Holm's correction."""
     corrected, least = [], 0.0
     for index, effect in enumerate(found):

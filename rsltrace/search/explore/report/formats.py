@@ -10,8 +10,8 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.report.exploration import (
-    Cause,
     Exploration,
+    FailureCause,
     causes,
     effects,
     repeat_command,
@@ -129,7 +129,7 @@ def json_text(explored: Exploration) -> str:
     return json.dumps(json_values(explored))
 
 
-def _cause_values(explored: Exploration, cause: Cause) -> dict[str, Any]:
+def _cause_values(explored: Exploration, cause: FailureCause) -> dict[str, Any]:
     shown = cause.shortest
     reduced = cause.reduced
     return {
@@ -195,7 +195,7 @@ def _case(suite: Element, explored: Exploration, name: str) -> Element:
     return SubElement(suite, "testcase", {"classname": _text(explored.job), "name": _text(name)})
 
 
-def _details(explored: Exploration, cause: Cause) -> str:
+def _details(explored: Exploration, cause: FailureCause) -> str:
     lines = [cause.failure.text]
     if cause.reduced is not None:
         lines += [cause.reduced.decides, f"made small in {cause.reduced.folder}"]
@@ -223,7 +223,7 @@ def github_text(explored: Exploration) -> str:
     return "\n".join(lines)
 
 
-def _place(explored: Exploration, cause: Cause) -> tuple[str, int | None]:
+def _place(explored: Exploration, cause: FailureCause) -> tuple[str, int | None]:
     if cause.place is None:
         return _from_here(explored.job), None
     file, line = cause.place

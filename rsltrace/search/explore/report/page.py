@@ -1,4 +1,4 @@
-"""A search as a page of HTML that needs nothing beside it: no network, no scripts."""
+"""A search as a self-contained page of HTML: no network, no scripts."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from rsltrace.errors import ExploreError
 from rsltrace.search.explore.report.charts import histogram, number, progress, scatter
 from rsltrace.search.explore.report.exploration import (
     FAILS,
-    Cause,
-    Effect,
     Exploration,
+    FailureCause,
+    SettingEffect,
     Value,
     causes,
     effects,
@@ -95,7 +95,7 @@ def _numbers(body: Element, explored: Exploration) -> None:
         (f"{runs:,}", "runs"),
         (f"{failed:,}", "failed"),
         (f"{len(causes(explored)):,}", "causes"),
-        (f"{explored.digests:,}", "different runs (digests)"),
+        (f"{explored.digests:,}", "different digests"),
         (format_duration(round(explored.wall_s * 1e9)), "of real time"),
         (f"{rate:.1f}", "runs per second"),
         (explored.strategy or "-", "strategy"),
@@ -115,7 +115,7 @@ def _failures(body: Element, explored: Exploration) -> None:
         _cause(SubElement(body, "div", {"class": "cause"}), explored, cause)
 
 
-def _cause(box: Element, explored: Exploration, cause: Cause) -> None:
+def _cause(box: Element, explored: Exploration, cause: FailureCause) -> None:
     count, runs = len(cause.runs), len(explored.results)
     _add(box, "h3", f"{cause.failure.kind}: {cause.key}")
     first = cause.first
@@ -126,7 +126,7 @@ def _cause(box: Element, explored: Exploration, cause: Cause) -> None:
     if cause.reduced is not None:
         if cause.reduced.decides:
             _add(box, "p", cause.reduced.decides, "decides")
-        _add(box, "p", f"Made small in {cause.reduced.folder}:")
+        _add(box, "p", f"Reduced in {cause.reduced.folder}:")
     shown = cause.shortest
     lines = [line for line in (repeat_command(explored, shown), view_command(shown)) if line]
     if cause.reduced is not None:
@@ -156,7 +156,7 @@ def _metrics(body: Element, explored: Exploration) -> None:
         named = _with_unit(explored, name)
         rows.append((named, f"{len(values):,}", *map(number, cells)))
         drawn.append(histogram(values, named))
-    _table(body, ("metric", "runs", "least", "median", "mean", "most"), rows)
+    _table(body, ("metric", "runs", "min", "median", "mean", "max"), rows)
     _charts(body, drawn)
 
 
@@ -175,7 +175,7 @@ def _settings(body: Element, explored: Exploration) -> None:
             one.setting,
             one.outcome,
             f"{one.strength:.0%}",
-            {1: "more with more", -1: "less with more", 0: ""}[one.sign],
+            {1: "increases", -1: "decreases", 0: ""}[one.sign],
             "< 0.0001" if one.p < 0.0001 else f"{one.p:.4f}",
             f"{one.runs:,}",
         )
@@ -186,13 +186,13 @@ def _settings(body: Element, explored: Exploration) -> None:
         _table(body, head, rows)
         _charts(body, _drawn(explored, varied, found))
     else:
-        _add(body, "p", "Nothing varied, or all runs came out alike.")
+        _add(body, "p", "No setting varied, or all runs had the same outcome.")
 
 
 def _drawn(
-    explored: Exploration, varied: Sequence[dict[str, Value]], found: Sequence[Effect]
+    explored: Exploration, varied: Sequence[dict[str, Value]], found: Sequence[SettingEffect]
 ) -> Iterator[Element]:
-    """Yield pictures of the effects on metrics, the surest first."""
+    """Yield charts of the effects on metrics, the surest first."""
     for effect in found[:_CHARTS_MAX]:
         if effect.outcome == FAILS:
             continue
@@ -221,7 +221,7 @@ def _coverage(body: Element, explored: Exploration) -> None:
     for sentence in explored.coverage:
         _add(body, "p", sentence)
     if new:
-        _key(body, "runs that did what none had done", "runs that failed")
+        _key(body, "new runs", "runs that failed")
         _charts(body, [progress(new, [one.failure is not None for one in explored.results])])
 
 
@@ -249,7 +249,7 @@ def _row(result: TrialResult) -> tuple[str, ...]:
 
 
 def _add(parent: Element, tag: str, text: str, kind: str = "") -> Element:
-    """Add an element with a text that may be anybody's."""
+    """Add an element with untrusted text."""
     one = SubElement(parent, tag, {"class": kind} if kind else {})
     one.text = printable_lines(text)
     return one

@@ -1,4 +1,4 @@
-"""Making the failures of a search small: one run of each cause."""
+"""Reduce the failures of a search, one run of each cause, each to a folder that reproduces it."""
 
 from __future__ import annotations
 
@@ -13,18 +13,16 @@ from typing import Any
 
 from rsltrace.errors import ExploreError
 from rsltrace.job import Job, job_from_text, load_job
-from rsltrace.search.explore.outcome import Wants
-from rsltrace.search.explore.small.reduction import Parts, Reduced, Reduction
+from rsltrace.search.explore.outcome import TrialOptions
+from rsltrace.search.explore.small.reduction import OverlayParts, ReducedTrial, TrialReduction
 from rsltrace.search.explore.table import SMALL
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult, overrides_of
 from rsltrace.search.explore.workers import Worker
 from rsltrace.trace.model.texts import format_seconds, printable
 
-# What is written beside a failing run: a README for people, and a test for pytest.
+_TEST = '''"""The run in this folder still fails: {why}
 
-_TEST = '''"""The run in this folder fails as it did when it was found: {why}
-
-Once the bug is mended the run is another one, and this test has done its work.
+When the bug is fixed this test fails: delete it then.
 """
 
 import json
@@ -51,12 +49,14 @@ def test_module(failing: TrialResult) -> str:
     return _TEST.format(why=_one_line(failing).replace('"', "'"), digest=failing.digest)
 
 
-def readme(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> str:
+def readme(reduced: ReducedTrial, failing: TrialResult, passing: TrialResult | None) -> str:
     """Return what the folder is, how to see it fail, and what the failure needs."""
     return "\n".join(_lines(reduced, failing, passing)) + "\n"
 
 
-def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) -> Iterator[str]:
+def _lines(
+    reduced: ReducedTrial, failing: TrialResult, passing: TrialResult | None
+) -> Iterator[str]:
     yield "# A run that fails"
     yield ""
     assert failing.failure is not None
@@ -72,19 +72,19 @@ def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) 
         yield "rsltrace diff failing.mcap passing.mcap"
     yield "```"
     yield ""
-    yield "What this run needs to fail, beside the job it was found with:"
+    yield "Besides the job, this run needs the following to fail:"
     yield ""
     needed = list(_needed(reduced))
     yield from needed or ["- nothing: the job fails as it is"]
     yield ""
     if not reduced.is_minimal:
-        yield f"(There may be less to it: {reduced.runs} runs were made to find out, no more.)"
+        yield f"(It may need less: the reduction stopped after {reduced.runs} runs.)"
     else:
-        yield f"None of it can be left out alone ({reduced.runs} runs were made to find out)."
+        yield f"None of it can be left out alone ({reduced.runs} runs were tried)."
     yield ""
     if passing is not None:
         yield f"`passing.mcap` is the nearest run that passes: {printable(reduced.passing_words)}."
-        yield "`diff.txt` says where the two diverge."
+        yield "`diff.txt` shows where the two diverge."
     else:
         yield "No run with one part less passes, so there is no `passing.mcap`."
     yield ""
@@ -92,7 +92,7 @@ def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) 
     yield "sources that `job.yaml` names."
 
 
-def _needed(reduced: Reduced) -> Iterator[str]:
+def _needed(reduced: ReducedTrial) -> Iterator[str]:
     parts = reduced.parts
     if parts.seed is not None:
         yield f"- seed {parts.seed}"
@@ -100,7 +100,7 @@ def _needed(reduced: Reduced) -> Iterator[str]:
         yield f"- {printable(f'{name} = {value}')}"
     for one, names in zip(parts.departures or (), reduced.chosen, strict=True):
         what = f": {printable(names)}" if names else ""
-        yield f"- another order at choice {one['choice']} (number {one['run']} in line){what}"
+        yield f"- a different order at choice {one['choice']} (ready entity {one['run']}){what}"
     for fault in parts.faults or ():
         words = ", ".join(f"{key}: {value}" for key, value in fault.items())
         yield f"- the fault {{{printable(words)}}}"
@@ -115,23 +115,21 @@ def _one_line(result: TrialResult) -> str:
     return printable(result.failure.text.splitlines()[0]).rstrip(".") + "."
 
 
-# The folder of a failing run: everything that somebody else needs to see it fail.
-
 JOB, FAILING, PASSING, DIFF = "job.yaml", "failing.mcap", "passing.mcap", "diff.txt"
 README, TEST = "README.md", "test_reproduces.py"
 _OF_FOLDER = re.compile(r"[^\s()]*/((?:failing|passing)\.mcap)")
 
 
 def write_small(
-    source: JobSource, reduced: Reduced, folder: Path, *, timeout_s: float | None = None
+    source: JobSource, reduced: ReducedTrial, folder: Path, *, timeout_s: float | None = None
 ) -> str:
-    """Write a reduced trial to ``folder``, which is made; return in a sentence where it parts from
-    the nearest run that passes, "" if there is none.
+    """Write a reduced trial to ``folder``; return a sentence on where it diverges from the nearest
+    passing run, "" if there is none.
 
-    The job in it is the whole job with what sets the trial apart, and names the same sources, bags
-    and files as the original, relative to the folder. Its run has been made from that very file.
+    The job in the folder is the job with the trial's changes; its paths are relative to the folder.
+    The failing trace is recorded from that file.
 
-    :raises ExploreError: the run from there is another one, or the folder cannot be written.
+    :raises ExploreError: that run is a different one, or the folder cannot be written.
     """
     folder = folder.resolve()
     try:
@@ -141,14 +139,14 @@ def write_small(
         raise ExploreError(f"{error.filename or folder}: {error.strerror}") from None
 
 
-def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float | None) -> str:
+def _write(source: JobSource, reduced: ReducedTrial, folder: Path, timeout_s: float | None) -> str:
     job = moved_job(source, reduced.parts, folder)
     _put(folder / JOB, job.to_yaml())
     failing = _recorded(JobSource(str(folder / JOB)), job, folder / FAILING, timeout_s)
     if failing.digest != reduced.result.digest:
         raise ExploreError(
-            f"{folder / JOB} does not do what the trial did (digest {failing.digest}, not "
-            f"{reduced.result.digest}): what differs is not in the job"
+            f"{folder / JOB} does not repeat the trial (digest {failing.digest}, not "
+            f"{reduced.result.digest}): they differ in something outside of the job"
         )
     passing, decides = None, ""
     for name in (PASSING, DIFF):
@@ -164,15 +162,12 @@ def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float |
     return decides
 
 
-def moved_job(source: JobSource, parts: Parts, folder: Path) -> Job:
-    """Return the job of a trial as one whose file is in ``folder``: paths in it start there.
-
-    :raises JobError: it is wrong.
-    """
+def moved_job(source: JobSource, parts: OverlayParts, folder: Path) -> Job:
+    """Return the job of a trial with paths relative to ``folder``. Raises JobError."""
     trial = Trial(0, parts.overlay())
     own = [*source.overrides, *overrides_of(trial)]
     name = str(folder / JOB)
-    if source.text is not None:  # there is no file: what it is stands in the overrides
+    if source.text is not None:  # there is no file: the overrides have everything
         return job_from_text(source.text, name, folder, overrides=own)
     original = os.path.abspath(source.path)
     base = json.dumps({"base": os.path.relpath(original, folder)})
@@ -193,7 +188,7 @@ def _recorded(source: JobSource, job: Job, path: Path, timeout_s: float | None) 
     """Run the job of a file; its trace is at ``path`` afterwards."""
     path.unlink(missing_ok=True)
     with Worker(source, pins=job.guard.pins) as worker:
-        return worker.run(Trial(0, {}), path, Wants(keep=True), timeout_s)
+        return worker.run(Trial(0, {}), path, TrialOptions(keep=True), timeout_s)
 
 
 def _diff(folder: Path) -> tuple[str, str]:
@@ -216,8 +211,8 @@ _CAUSES_MAX = 10
 
 @dataclass(frozen=True, slots=True)
 class SmallRun:
-    """A cause of failures made small: its folder, and the one difference that decides (empty if
-    there is none). ``trouble`` says why there is no folder."""
+    """A reduced cause of failures: its folder, and the one difference that decides (empty if there
+    is none). ``trouble`` says why there is no folder."""
 
     folder: Path
     decides: str = ""
@@ -233,9 +228,9 @@ def make_small(
     timeout_s: float | None = None,
     on_begin: Callable[[str], None] = lambda cause: None,
 ) -> dict[str, SmallRun]:
-    """Reduce the first run of each cause; ``folder`` of the search gets a folder for each.
+    """Reduce the first run of each cause, each to a folder in ``folder`` of the search.
 
-    ``on_begin`` is told which cause is next.
+    ``on_begin`` receives the key of the cause that is next.
     """
     found = {}
     by_number = sorted(first.items(), key=lambda item: item[1].trial.number)
@@ -247,7 +242,7 @@ def make_small(
                 tempfile.TemporaryDirectory(dir=folder) as scratch,
                 Worker(source, pins=pins) as worker,
             ):
-                reduced = Reduction(
+                reduced = TrialReduction(
                     source, result, worker, Path(scratch), timeout_s=timeout_s
                 ).reduce()
                 decides = write_small(source, reduced, place, timeout_s=timeout_s)

@@ -1,4 +1,4 @@
-"""Reducing a trial that fails: whatever can be left out of it while it fails for the same cause."""
+"""Reduce a failing trial: leave out all that it does not need to fail for the same cause."""
 
 from __future__ import annotations
 
@@ -11,24 +11,21 @@ from typing import Any, TypeVar
 
 from rsltrace.errors import ExploreError, RsltraceError
 from rsltrace.run.plans.recorded_order import ATTACHMENT_CHOICES
-from rsltrace.search.explore.outcome import Wants
+from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import ERROR, Failure, JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
 from rsltrace.simulation.loop.policy import decoded
 from rsltrace.trace.reader import Trace
 
-# Delta debugging (Zeller and Hildebrandt, 2002): which of many things does a failure need?
-
 T = TypeVar("T")
 
 
 def ddmin(items: Sequence[T], fails: Callable[[list[T]], bool]) -> list[T]:
-    """Return some of ``items``, in their order, with which ``fails`` says that it still does, and
-    of which none can be left out alone (or none at all, if it fails without any).
+    """Return a minimal selection of ``items``, in their order, for which ``fails`` is true: none of
+    it can be left out alone (delta debugging: Zeller and Hildebrandt, 2002).
 
-    All of them have to fail; they are not asked again. ``fails`` need not be monotonic: what fails
-    with few things may pass with more. It is asked about each selection once, at most about
-    n^2 + 3n, and about 2 log2(n) if one thing is to blame.
+    ``fails`` must be true for all items and need not be monotonic. It is called once for each
+    selection: at most about n^2 + 3n times, about 2 log2(n) if a single item is the cause.
     """
     known: dict[tuple[int, ...], bool] = {tuple(range(len(items))): True}
 
@@ -70,10 +67,10 @@ _PASSING_TRIED = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
-    """What sets a failing trial apart from its job, part by part.
+class OverlayParts:
+    """The overlay of a failing trial, part by part.
 
-    ``departures`` is None where the job's own policy stays; ``without`` are the places of the
+    ``departures`` is None where the job's own policy stays; ``without`` are the indexes of the
     entries of ``nodes`` that are left out, ``until_ns`` is a simulated time.
     """
 
@@ -100,8 +97,8 @@ class Parts:
             found["until"] = f"{self.until_ns}ns"
         return found
 
-    def one_fewer(self) -> list[tuple[str, Parts]]:
-        """Return, with its words, each that has one departure, fault or setting less."""
+    def one_fewer(self) -> list[tuple[str, OverlayParts]]:
+        """Return (description, parts) of each that has one departure, fault or setting less."""
         found = []
         for key, word in (
             ("departures", "departure"),
@@ -117,28 +114,27 @@ class Parts:
 
 
 @dataclass(frozen=True, slots=True)
-class Reduced:
-    """A trial made small: ``result`` is its run. ``runs`` have been made for it; ``is_minimal``
-    says that nothing more can be left out alone. ``passing`` are the parts of the nearest run that
-    passes, None if there is none, and ``passing_words`` what is different in it. ``chosen`` says
-    of each departure what runs and what would have, ``left_out`` which entries of ``nodes`` are.
+class ReducedTrial:
+    """A reduced trial: ``result`` is its run, found in ``runs`` runs; ``is_minimal`` says that
+    nothing more can be left out alone. ``passing`` are the parts of the nearest passing run, None
+    if there is none; ``passing_words`` says what differs in it. ``chosen`` says for each departure
+    what runs before what, ``left_out`` names the entries of ``nodes`` that are.
     """
 
-    parts: Parts
+    parts: OverlayParts
     result: TrialResult
     runs: int
     is_minimal: bool
-    passing: Parts | None
+    passing: OverlayParts | None
     passing_words: str
     chosen: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
 
 
-class Reduction:
-    """Reduces ``result``, a trial of ``source`` that has failed. If its trace is not there, its run
-    is made once more.
+class TrialReduction:
+    """Reduces ``result``, a failed trial of ``source``. If its trace is missing, it is run again.
 
-    ``scratch`` is a folder for traces, ``runs_max`` how many runs may be made.
+    ``scratch`` is a folder for traces, ``runs_max`` limits the runs.
     """
 
     def __init__(
@@ -162,7 +158,7 @@ class Reduction:
         self.runs = 0
         self._numbers = itertools.count(1)
 
-    def reduce(self) -> Reduced:
+    def reduce(self) -> ReducedTrial:
         """Return the trial with as little as it needs to fail for the same cause.
 
         :raises ExploreError: it does not fail again, or is no trial of this job.
@@ -172,9 +168,8 @@ class Reduction:
         if not self._is_same(first):
             got = "nothing fails" if first.failure is None else first.failure.text
             raise ExploreError(
-                f"trial {self._given.trial.number} does not fail once more with its order written "
-                f"down ({got}): what makes it fail is not in the simulation; rsltrace verify says "
-                "what runs of this job have not in common"
+                f"trial {self._given.trial.number} does not fail again in the same order ({got}): "
+                "the job is not deterministic; run rsltrace verify to see why"
             )
         while True:
             before = parts
@@ -190,7 +185,7 @@ class Reduction:
         last = self._run(parts, keep=True, steps=True)
         passing, words = self._nearest_passing(parts, last)
         nodes = self._source.job().nodes
-        return Reduced(
+        return ReducedTrial(
             parts,
             last,
             self.runs,
@@ -201,9 +196,9 @@ class Reduction:
             tuple(nodes[place].name or nodes[place].target for place in parts.without),
         )
 
-    def _given_parts(self) -> Parts:
+    def _given_parts(self) -> OverlayParts:
         overlay = self._given.trial.overlay
-        parts = Parts(
+        parts = OverlayParts(
             overlay.get("seed"),
             None,
             tuple(overlay["faults"]) if "faults" in overlay else None,
@@ -225,16 +220,16 @@ class Reduction:
             return Path(self._given.trace)
         self.runs += 1
         place = self._scratch / "given.mcap"
-        again = self._worker.run(trial, place, Wants(keep=True), self._timeout_s)
+        again = self._worker.run(trial, place, TrialOptions(keep=True), self._timeout_s)
         if again.trace is None:
             said = "it did not fail" if again.failure is None else again.failure.text
             raise ExploreError(f"trial {trial.number} leaves no trace: {said}")
         return Path(again.trace)
 
-    def _fewer(self, parts: Parts, key: str) -> Parts:
+    def _fewer(self, parts: OverlayParts, key: str) -> OverlayParts:
         """Leave out departures, faults or settings."""
 
-        def with_some(some: Sequence[Any]) -> Parts:
+        def with_some(some: Sequence[Any]) -> OverlayParts:
             changed: Any = {key: tuple(some)}
             return replace(parts, **changed)
 
@@ -243,14 +238,14 @@ class Reduction:
             with_some(ddmin(items, lambda some: self._fails(with_some(some)))) if items else parts
         )
 
-    def _fewer_nodes(self, parts: Parts) -> Parts:
+    def _fewer_nodes(self, parts: OverlayParts) -> OverlayParts:
         """Leave out entries of ``nodes``."""
         count = len(self._source.job().nodes)
         present = [place for place in range(count) if place not in parts.without]
         if len(present) < 2:
             return parts
 
-        def with_some(some: Sequence[int]) -> Parts:
+        def with_some(some: Sequence[int]) -> OverlayParts:
             return replace(parts, without=tuple(p for p in range(count) if p not in some))
 
         def fails(some: Sequence[int]) -> bool:
@@ -258,20 +253,19 @@ class Reduction:
 
         return with_some(ddmin(present, fails))
 
-    def _fails_for_its_parts(self, parts: Parts) -> bool:
-        """Whether a trial fails for the same cause, and the same nodes pass in the same time
-        without what sets it apart. Where they do not, it fails because a node is missing, or
-        because it ends too soon, which is something else."""
+    def _fails_for_its_parts(self, parts: OverlayParts) -> bool:
+        """Whether a trial fails for the same cause, while the same nodes pass in the same time
+        without its changes. Else it fails because a node is missing, or because it ends too soon.
+        """
         if not self._fails(parts):
             return False
         if parts.seed is None and not parts.one_fewer():
             return True
-        plain = Parts(until_ns=parts.until_ns, without=parts.without)
+        plain = OverlayParts(until_ns=parts.until_ns, without=parts.without)
         return self._run(plain).failure is None
 
-    def _shorter(self, parts: Parts) -> Parts:
-        """Let the run end as soon as it may: at the event that fails, or as early as halving the
-        time finds."""
+    def _shorter(self, parts: OverlayParts) -> OverlayParts:
+        """End the run as early as possible: at the failing event, or by bisection of the time."""
         result = self._run(parts, keep=True)
         if not self._is_same(result) or result.trace is None or result.failure is None:
             return parts
@@ -293,13 +287,15 @@ class Reduction:
                 passes_ns = middle_ns
         return parts if fails_ns == end_ns else replace(parts, until_ns=fails_ns)
 
-    def _nearest_passing(self, parts: Parts, failing: TrialResult) -> tuple[Parts | None, str]:
-        """Return the one that agrees longest with the failing run of those that pass with one part
-        less, or else the plain run."""
+    def _nearest_passing(
+        self, parts: OverlayParts, failing: TrialResult
+    ) -> tuple[OverlayParts | None, str]:
+        """Return the run with one part less (or the plain run) that passes and agrees longest with
+        the failing run."""
         from rsltrace.diff import diff_files
 
-        best: tuple[int, Parts, str] | None = None
-        candidates = parts.one_fewer()[:_PASSING_TRIED] or [("the job as it is", Parts())]
+        best: tuple[int, OverlayParts, str] | None = None
+        candidates = parts.one_fewer()[:_PASSING_TRIED] or [("the job as it is", OverlayParts())]
         for words, fewer in candidates:
             result = self._run(fewer, keep=True)
             if result.failure is not None or result.trace is None or failing.trace is None:
@@ -309,8 +305,8 @@ class Reduction:
                 best = agreeing, fewer, words
         return (None, "") if best is None else best[1:]
 
-    def _fails(self, parts: Parts) -> bool:
-        """Whether a trial fails for the same cause; if no more runs may be made, it does not."""
+    def _fails(self, parts: OverlayParts) -> bool:
+        """Whether a trial fails for the same cause; False if no more runs are allowed."""
         if self._left <= 0:
             return False
         self._left -= 1
@@ -320,14 +316,16 @@ class Reduction:
         found, wanted = result.failure, self._failure
         return found is not None and (found.kind, found.key) == (wanted.kind, wanted.key)
 
-    def _run(self, parts: Parts, *, keep: bool = False, steps: bool = False) -> TrialResult:
-        """Run a trial; one that cannot be made at all fails for a cause of its own."""
+    def _run(self, parts: OverlayParts, *, keep: bool = False, steps: bool = False) -> TrialResult:
+        """Run a trial; one that cannot start counts as a failure of another cause."""
         number = next(self._numbers)
         trial = Trial(number, parts.overlay(), "made smaller")
         trace = self._scratch / f"{number}.mcap"
         self.runs += 1
         try:
-            result = self._worker.run(trial, trace, Wants(keep=keep, steps=steps), self._timeout_s)
+            result = self._worker.run(
+                trial, trace, TrialOptions(keep=keep, steps=steps), self._timeout_s
+            )
         except RsltraceError as error:
             failure = Failure(ERROR, str(error), "it cannot be made")
             return TrialResult(trial, failure=failure)
@@ -336,7 +334,7 @@ class Reduction:
         return result
 
 
-def _chosen(parts: Parts, result: TrialResult) -> Iterator[str]:
+def _chosen(parts: OverlayParts, result: TrialResult) -> Iterator[str]:
     """Yield what each departure lets run, and what would have run in the plain order."""
     choices = [step for step in result.steps if len(step.ready) > 1]
     for departure in parts.departures or ():

@@ -27,7 +27,6 @@ from rsltrace.trace.reader import Trace
 if TYPE_CHECKING:
     from rsltrace.trace.leaves import Leaf
 
-# What a bag could have played instead: other values, another order, a message once more.
 
 _KINDS = ("change", "change", "change", "change", "swap", "repeat")
 _SCALES = (-1, 0.1, 0.5, 1.1, 2, 10, 1000)
@@ -36,9 +35,9 @@ _BEYOND_INTEGERS = 1e20
 
 
 @dataclass(frozen=True, slots=True)
-class Played:
-    """A topic that a bag plays: which of its messages may be disturbed, its fields, and how long
-    the arrays of its first message are, by their names."""
+class BagContents:
+    """A topic that a bag plays: the messages that may be changed, its fields, and the lengths of
+    the arrays of its first message, by name."""
 
     messages: range
     leaves: Sequence[Leaf]
@@ -72,26 +71,26 @@ class Played:
         return {"field": name, "length": min(lengths[draw.below(5)], leaf.length_max)}
 
     def _place(self, array: str, draw: Stream) -> str:
-        """Draw which items of an array change."""
+        """Draw which elements of an array change."""
         count = max(self.lengths.get(array, 1), 1)
         return ("*", "0", "-1", str(draw.below(count)))[draw.below(4)]
 
 
-def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, Played]:
-    """Return what bags have played in a run, of those topics of which some messages may be
-    disturbed."""
+def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, BagContents]:
+    """Return the contents of the bags played in a run, for topics with messages that may be
+    changed."""
     found = {}
     for name in sorted({one.name for one in trace.entities.values() if is_played(trace, one)}):
         if name in messages:
             leaves: list[Leaf] = []
             lengths: dict[str, int] = {}
-            with suppress(TraceError):  # it keeps none of them: they can change places
+            with suppress(TraceError):  # without payloads, messages can still be swapped
                 leaves = trace.leaves(name)
                 first = next(trace.messages(name), None)
                 if first is not None:
                     lengths.update(_lengths(trace.decode(name, first[-1]), leaves))
             there = [leaf for leaf in leaves if _is_there(leaf, lengths)]
-            found[name] = Played(messages[name], there, lengths)
+            found[name] = BagContents(messages[name], there, lengths)
     return found
 
 
@@ -102,7 +101,7 @@ def is_played(trace: Trace, entity: Entity) -> bool:
 
 
 def _lengths(message: Any, leaves: Sequence[Leaf]) -> Iterator[tuple[str, int]]:
-    """Yield how long the arrays of a message are; of those within others, the first one."""
+    """Yield the lengths of a message's arrays; of nested ones, the first."""
     for leaf in leaves:
         value, name = message, ""
         if leaf.length_max is None:
@@ -126,7 +125,7 @@ def _is_there(leaf: Leaf, lengths: dict[str, int]) -> bool:
 
 
 def _another(kind: str, draw: Stream) -> dict[str, Any]:
-    """Draw another value for a field of a type."""
+    """Draw a different value for a field of a type."""
     if kind == "string":
         return {"value": _TEXTS[draw.below(len(_TEXTS))]}
     if kind == "bool":
@@ -141,7 +140,7 @@ def _another(kind: str, draw: Stream) -> dict[str, Any]:
     if is_float:
         values = ("nan", "inf", "-inf", 0, 3e38 * sign)
         return {"value": values[draw.below(len(values))]}
-    # Beyond all limits is the limit of the field's type.
+    # Values beyond the type's limits are clipped to them.
     return {"offset": _BEYOND_INTEGERS * sign} if draw.below(2) else {"value": 0}
 
 
@@ -151,23 +150,20 @@ _OF_MESSAGES = ("drop", "delay", "duplicate")
 
 
 class FaultWalk:
-    """Up to three random faults a run, beside those of the job: of what there is in the plain run.
-
-    Order and seed are the job's.
-    """
+    """Up to three random faults per run, besides those of the job. Order and seed are the job's."""
 
     behaviours = False
     steps = False
 
     def __init__(self, job: Job, seed: int = 0, *, fork_ns: int = -1) -> None:
-        """``fork_ns``: the simulated time up to which nothing is disturbed."""
+        """``fork_ns``: the simulated time up to which there are no faults."""
         self._own = [plain_part(fault) for fault in job.faults]
         self._seed = seed
         self._fork_ns = fork_ns
         self._topics: dict[str, range] = {}
-        """Of each topic the messages that may be disturbed."""
-        self._played: dict[str, Played] = {}
-        """Of each topic that a bag plays what it could play instead."""
+        """By topic, the messages that may have a fault."""
+        self._played: dict[str, BagContents] = {}
+        """By topic that a bag plays, its contents."""
         self._progress = job.progress
         self._nodes: dict[str, bool] = {}
         self._events = range(1)
@@ -176,9 +172,9 @@ class FaultWalk:
         self._tried = 0
 
     def begin(self, plain: TrialResult) -> None:
-        """See which nodes and messages there are, and when the nodes are all made."""
+        """Find the nodes and messages of the plain run."""
         if plain.trace is None:
-            raise ExploreError("the run of the job as it is has no trace: nothing to disturb")
+            raise ExploreError("the plain run has no trace, so there is nothing to apply faults to")
         with Trace.open(plain.trace) as trace:
             self._longest_ns = max(trace.end_ns - trace.start_ns, 2 * _SHORTEST_NS)
             first, first_output = _first_after(trace, self._fork_ns)
@@ -198,9 +194,11 @@ class FaultWalk:
             self._played = played_in(trace, _to_come(played))
         self._topics = _to_come(names)
         if not self._events:
-            raise ExploreError("the run of the job as it is ends before runs would be forked")
+            raise ExploreError("the plain run ends before the time of --fork-after")
         if not self._nodes and not self._topics:
-            raise ExploreError("there are neither nodes nor messages that could be disturbed")
+            raise ExploreError(
+                "the plain run has neither nodes nor messages that could have a fault"
+            )
 
     def propose(self, number: int) -> Proposal | None:
         draw = Stream(self._seed, f"faults\0{number}")
@@ -210,7 +208,6 @@ class FaultWalk:
         return Proposal({"faults": [*self._own, *faults]}, why)
 
     def learn(self, result: TrialResult) -> TrialResult | None:
-        """Learn nothing."""
         return None
 
     def recall(self, result: TrialResult) -> None:
@@ -244,19 +241,19 @@ class FaultWalk:
         return fault if kind == "crash" else {**fault, "for": self._time(draw)}
 
     def _time(self, draw: Stream) -> str:
-        """Draw how long something lasts, evenly in its logarithm, in whole milliseconds."""
+        """Draw a duration, log-uniform, in whole milliseconds."""
         ratio = self._longest_ns / _SHORTEST_NS
         return f"{max(round(math.exp(draw.uniform() * math.log(ratio))), 1)}ms"
 
 
 def _to_come(counts: dict[str, tuple[int, int]]) -> dict[str, range]:
-    """Return the numbers of a topic's messages that follow those before; nothing where none do."""
+    """Return the numbers of each topic's later messages; no topics without any."""
     return {name: range(1 + one, 1 + one + two) for name, (one, two) in counts.items() if two}
 
 
 def _first_after(trace: Trace, fork_ns: int) -> tuple[int, int]:
-    """Return which event is the first after a time since the start of the run, and how many outputs
-    there are before."""
+    """Return the first event after a time since the start of the run, and the number of outputs
+    before it."""
     if fork_ns < 0:
         return 0, 0
     events = outputs = 0
@@ -271,7 +268,7 @@ def _first_after(trace: Trace, fork_ns: int) -> tuple[int, int]:
 
 
 def _sent(trace: Trace, first_output: int) -> tuple[Counter[int], Counter[int]]:
-    """Return how many messages each publisher has sent among the first outputs, and after them."""
+    """Return how many messages each publisher sent among the first outputs, and after them."""
     sent: tuple[Counter[int], Counter[int]] = Counter(), Counter()
     seen = 0
     for rows in trace.outputs():

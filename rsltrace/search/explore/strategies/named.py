@@ -287,7 +287,9 @@ def strategy_named(
     pct = PctWalk(depth or 3, seed, after)
     if name == "pct":
         return pct
-    return Mixed([pct, Feedback(seed, is_forked=after is not None), RandomWalk(seed, after)])
+    return MixedStrategy(
+        [pct, Feedback(seed, is_forked=after is not None), RandomWalk(seed, after)]
+    )
 
 
 def _check_forks(name: str, job: Job) -> None:
@@ -302,7 +304,7 @@ def _check_forks(name: str, job: Job) -> None:
         )
 
 
-class Mixed:
+class MixedStrategy:
     """Several strategies in turn. Those whose trials follow from their numbers, or that always have
     something to propose."""
 

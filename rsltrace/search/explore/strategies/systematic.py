@@ -1,14 +1,13 @@
 """All orders that could matter, each once: dynamic partial-order reduction over phases of a run.
 
-A phase is a stretch of a run at whose end nothing is left that could run: nothing can change places
-with what is in another phase. So the phases are searched one by one. Of a phase that begins in a
-state that has been met before nothing new can come, and it is left out.
+A phase ends when nothing is left to run: steps of different phases cannot swap. So the phases are
+searched one by one, and a phase that begins in a known state is skipped.
 
 Within a phase, two orders that differ only in neighbours that commute (see ``steps``) end in the
-same state, and one of them is run. Which others have to be is found as by Abdulla et al. (Optimal
-dynamic partial order reduction, POPL 2014): where two steps of a run that do not commute could have
-come the other way round, what has to come first for that is tried there (source sets), and what
-has been tried before is not tried again after what it commutes with (sleep sets).
+same state, and one of them is run. Which others to run is decided as by Abdulla et al. (Optimal
+dynamic partial order reduction, POPL 2014): where two steps that do not commute could be swapped,
+the step that must come first for that is tried (source sets), and what has been tried before is
+not tried again after steps that it commutes with (sleep sets).
 """
 
 from __future__ import annotations
@@ -22,17 +21,17 @@ from typing import Any
 
 from rsltrace.search.explore.steps import EVERYTHING
 from rsltrace.search.explore.strategies.strategy import Proposal, choices_left
-from rsltrace.search.explore.trial import Step, TrialResult
+from rsltrace.search.explore.trial import TrialResult, TrialStep
 
 Touches = Mapping[str, bool]
 _Departures = tuple[tuple[int, int], ...]
 
 
 @dataclass(slots=True)
-class _Node:
-    """A place in the tree of orders of one phase: a step. ``departures`` lead there."""
+class _OrderNode:
+    """A step in the tree of orders of one phase. ``departures`` lead to it."""
 
-    parent: _Node | None
+    parent: _OrderNode | None
     departures: _Departures
     choice: int
     ready: tuple[str, ...]
@@ -40,8 +39,8 @@ class _Node:
     begun: set[str] = field(default_factory=set)
     tried: dict[str, Touches] = field(default_factory=dict)
 
-    def path(self) -> list[_Node]:
-        """Return the places from the beginning of the phase up to this one."""
+    def path(self) -> list[_OrderNode]:
+        """Return the nodes from the beginning of the phase up to this one."""
         found = [self]
         while found[-1].parent is not None:
             found.append(found[-1].parent)
@@ -56,16 +55,16 @@ class _Node:
 
 
 @dataclass(frozen=True, slots=True)
-class _Item:
-    """An order to be tried: at ``node`` this runs next. ``asleep`` was tried there before."""
+class _Order:
+    """An order to try: at ``node``, ``key`` runs next. ``asleep`` was tried there before."""
 
-    node: _Node
+    node: _OrderNode
     key: str
     asleep: Mapping[str, Touches]
 
 
 class Systematic:
-    """Runs orders with few departures from the plain one first, with up to ``departures_max``."""
+    """Tries orders with the fewest departures from the plain one first (``departures_max``)."""
 
     behaviours = False
     steps = True
@@ -73,10 +72,10 @@ class Systematic:
     def __init__(self, departures_max: int | None = None) -> None:
         self._max = departures_max
         self._first = 0
-        """The first choice that may be another one."""
+        """The first choice that may be changed."""
         self._count = itertools.count()
-        self._waiting: list[tuple[int, int, _Node, str]] = []
-        self._under_way: dict[str, _Item] = {}
+        self._waiting: list[tuple[int, int, _OrderNode, str]] = []
+        self._under_way: dict[str, _Order] = {}
         self._again: list[Proposal] = []
         """What was under way when the search was left."""
         self._states: set[str] = set()
@@ -88,7 +87,7 @@ class Systematic:
     # -- the interface ---------------------------------------------------------------------------
 
     def begin(self, plain: TrialResult) -> None:
-        """Find in the plain run what is to be tried."""
+        """Find the orders to try in the plain run."""
         choices_left(plain)
         self._first = plain.choices_before
         self.runs += 1
@@ -110,7 +109,7 @@ class Systematic:
                 continue
             overlay = {"policy": {"departures": [{"choice": c, "run": r} for c, r in taken]}}
             asleep = {**node.sleep, **node.tried}
-            self._under_way[_key(overlay)] = _Item(node, key, asleep)
+            self._under_way[_key(overlay)] = _Order(node, key, asleep)
             return Proposal(overlay, f"systematic, {len(taken)} departures")
         return None
 
@@ -143,12 +142,12 @@ class Systematic:
         all_orders = all_orders or f"about {10**self.orders_log10:.0f}"
         lines = [
             f"systematic: {self.runs} runs stand for {all_orders} orders, {len(self.finals)} "
-            f"different ends; {self.merged} phases began as one before, {self.redundant} runs "
-            "were another order of one before"
+            f"different ends; {self.merged} phases began in a known state, {self.redundant} runs "
+            "repeated one before in an equivalent order"
         ]
         left = len(self._waiting) + len(self._under_way)
         if self._first:
-            lines.append(f"not covered: other orders of the first {self._first} choices")
+            lines.append(f"not covered: orders that change the first {self._first} choices")
         if self.beyond:
             lines.append(f"not covered: {self.beyond} orders with more than {self._max} departures")
         lines.append(f"not covered: {left} orders yet to try" if left else "covered: all others")
@@ -156,7 +155,7 @@ class Systematic:
 
     # -- what is to be tried ---------------------------------------------------------------------
 
-    def _follow(self, steps: Sequence[Step], item: _Item | None) -> None:
+    def _follow(self, steps: Sequence[TrialStep], item: _Order | None) -> None:
         """Go through a run, from the phase of the item (None: from the beginning)."""
         self._estimate(steps)
         departures: list[tuple[int, int]] = []
@@ -185,16 +184,16 @@ class Systematic:
                 self._search(phase, nodes_before, first, None)
 
     def _search(
-        self, phase: Sequence[Step], departures: _Departures, choice: int, item: _Item | None
+        self, phase: Sequence[TrialStep], departures: _Departures, choice: int, item: _Order | None
     ) -> bool:
-        """Follow a phase, and find where it could go otherwise; False: it is not new."""
+        """Follow a phase, and find where it could continue differently; False: it is not new."""
         path, is_new = self._path(phase, departures, choice, item)
         self._reverse(phase[: len(path)], path)
         return is_new
 
     def _path(
-        self, phase: Sequence[Step], departures: _Departures, choice: int, item: _Item | None
-    ) -> tuple[list[_Node], bool]:
+        self, phase: Sequence[TrialStep], departures: _Departures, choice: int, item: _Order | None
+    ) -> tuple[list[_OrderNode], bool]:
         """Return the nodes of a phase, from that of the item on, up to what has been tried."""
         path = [] if item is None else item.node.path()
         known = len(path)
@@ -204,7 +203,7 @@ class Systematic:
             key = step.ready[step.chosen]
             if index >= known:
                 parent = path[-1] if path else None
-                node = _Node(parent, tuple(taken), choice, step.ready, sleep, {key})
+                node = _OrderNode(parent, tuple(taken), choice, step.ready, sleep, {key})
                 if key in sleep:
                     self.redundant += 1
                     self._instead(node)
@@ -220,21 +219,21 @@ class Systematic:
                 choice += 1
         return path, True
 
-    def _instead(self, node: _Node) -> None:
-        """Something runs that has been tried: try what has not, if there is anything."""
+    def _instead(self, node: _OrderNode) -> None:
+        """What runs has been tried: try a step that has not, if there is one."""
         others = [name for name in node.enabled() if name not in node.sleep]
         if others:
             self._try(node, others[0])
 
-    def _try(self, node: _Node, key: str) -> None:
+    def _try(self, node: _OrderNode, key: str) -> None:
         if key not in node.begun and len(node.ready) > 1 and node.choice >= self._first:
             node.begun.add(key)
             index = node.ready.index(key)
             count = len(node.departures) + (index > 0)
             heapq.heappush(self._waiting, (count, next(self._count), node, key))
 
-    def _reverse(self, steps: Sequence[Step], path: Sequence[_Node]) -> None:
-        """Where two steps do not commute, see to it that the second is tried first, too."""
+    def _reverse(self, steps: Sequence[TrialStep], path: Sequence[_OrderNode]) -> None:
+        """Where two steps do not commute, also try the second one first."""
         after = _happens_after(steps)
         for second in range(len(steps)):
             for first in _races(steps, after, second):
@@ -248,13 +247,13 @@ class Systematic:
                     for key in possible[:1] or node.enabled():
                         self._try(node, key)
 
-    def _estimate(self, steps: Sequence[Step]) -> None:
+    def _estimate(self, steps: Sequence[TrialStep]) -> None:
         log10 = sum(math.log10(len({_entity(name) for name in step.ready})) for step in steps)
         self.orders_log10 = max(self.orders_log10, log10)
 
 
 def commute(one: Touches, other: Touches) -> bool:
-    """Say whether two steps can change places: neither writes what the other touches."""
+    """Whether two steps can swap: neither writes what the other touches."""
     if EVERYTHING in one or EVERYTHING in other:
         return False
     if len(other) < len(one):
@@ -262,8 +261,8 @@ def commute(one: Touches, other: Touches) -> bool:
     return not any(place in other and (writes or other[place]) for place, writes in one.items())
 
 
-def _happens_after(steps: Sequence[Step]) -> list[set[int]]:
-    """Return, for each step of a phase, those before that it cannot come before."""
+def _happens_after(steps: Sequence[TrialStep]) -> list[set[int]]:
+    """Return, for each step of a phase, the earlier ones that must stay before it."""
     after: list[set[int]] = []
     for index, step in enumerate(steps):
         before: set[int] = set()
@@ -275,7 +274,7 @@ def _happens_after(steps: Sequence[Step]) -> list[set[int]]:
     return after
 
 
-def _races(steps: Sequence[Step], after: Sequence[set[int]], second: int) -> Iterator[int]:
+def _races(steps: Sequence[TrialStep], after: Sequence[set[int]], second: int) -> Iterator[int]:
     """Yield the steps that do not commute with ``second``, with nothing between them."""
     entity = _entity(_ran(steps[second]))
     for first in after[second]:
@@ -286,19 +285,19 @@ def _races(steps: Sequence[Step], after: Sequence[set[int]], second: int) -> Ite
 
 
 def _initials(
-    steps: Sequence[Step], after: Sequence[set[int]], chosen: Sequence[int]
+    steps: Sequence[TrialStep], after: Sequence[set[int]], chosen: Sequence[int]
 ) -> frozenset[str]:
-    """Return the steps among ``chosen`` that no other of them has to come before."""
+    """Return the steps among ``chosen`` that none of the others must precede."""
     there = set(chosen)
     return frozenset(_ran(steps[k]) for k in chosen if not after[k] & there)
 
 
-def _phases(steps: Sequence[Step]) -> Iterator[list[Step]]:
+def _phases(steps: Sequence[TrialStep]) -> Iterator[list[TrialStep]]:
     for _, phase in itertools.groupby(steps, key=lambda step: step.phase):
         yield list(phase)
 
 
-def _ran(step: Step) -> str:
+def _ran(step: TrialStep) -> str:
     return step.ready[step.chosen]
 
 
