@@ -67,7 +67,7 @@ def test_rows_and_plots_of_two_runs_show_what_differs(
         assert session.plots().first() == plot
         rows = [row for row in range(comparison.count) if comparison.sign(row) is Sign.DIFFERS]
         list(session.read_values(rows))
-        assert any(session.row(row)[0].outputs.startswith(text) for row in rows)
+        assert any(session.row(row).event.outputs.startswith(text) for row in rows)
     finally:
         session.close()
 
@@ -75,12 +75,12 @@ def test_rows_and_plots_of_two_runs_show_what_differs(
 def test_rows_have_values_once_they_are_read(made: Path) -> None:
     run = Run.open(made)
     session = Session(run)
-    assert session.row(2)[0].outputs == "/count"
+    assert session.row(2).event.outputs == "/count"
     assert list(session.read_values(range(20))) == list(range(1, 21))
-    sent = session.row(2)[0].outputs.split()
+    sent = session.row(2).event.outputs.split()
     assert sent[0] == "/count"
-    assert session.row(3)[0].outputs == f"got {sent[1]}"
-    assert session.row(11)[0].outputs == "call /check"  # a request without fields
+    assert session.row(3).event.outputs == f"got {sent[1]}"
+    assert session.row(11).event.outputs == "call /check"  # a request without fields
     session.close()
 
 
@@ -88,10 +88,10 @@ def test_rows_say_how_much_later_run_b_was() -> None:
     folder = SAMPLES / "delayed_input"
     session = Session(Run.open(folder / "a.mcap"), Run.open(folder / "b.mcap"))
     assert session.comparison is not None
-    names = [column.name for column in session.columns(120).columns]
+    names = [column.name for column, _ in session.columns(120).columns]
     assert "delta" in names
-    assert session.row(session.row_of_place())[0].delta == "+15 ms"
-    assert session.row(0)[0].delta == ""
+    assert session.row(session.row_of_place()).event.delta == "+15 ms"
+    assert session.row(0).event.delta == ""
     session.close()
 
 
