@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+from rsltrace_viewer.model.plots.series import Source, most_telling
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.message_values import message_values, samples, varying_values
 from rsltrace_viewer.session import Session
@@ -136,9 +137,22 @@ def test_values_that_vary_on_a_topic_come_first() -> None:
     assert message_values(message(x=0.0, ω=1.0), {"x"}) == "x=0 ω=1"
 
 
+def test_a_plot_begins_with_a_field_that_differs_or_varies() -> None:
+    fields = [Source("field", "/pose", name) for name in ("stamp", "x", "turn", "value")]
+
+    def run(*rows: tuple[int, int, int, int]) -> list[object]:
+        return [message(stamp=s, x=x, turn=t, value=v) for s, x, t, v in rows]
+
+    a = run((0, 1, 5, 7), (1, 2, 5, 7))
+    assert most_telling(fields, [a]).field == "x"
+    assert most_telling(fields, [a, run((0, 1, 6, 7), (1, 2, 6, 7))]).field == "turn"
+    assert most_telling(fields, [run((0, 1, 5, 7))]).field == "value"
+    assert most_telling(fields, []).field == "value"
+
+
 @given(st.integers(0, 10**6))
 def test_samples_are_messages_of_the_topic(count: int) -> None:
-    found = samples(count)
+    found = samples(count, 4)
     assert all(0 <= number < count for number in found)
     assert not count or {0, count - 1} <= set(found)
 

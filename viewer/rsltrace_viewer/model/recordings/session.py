@@ -18,6 +18,7 @@ from rsltrace_viewer.model.inspector.message_tree import Line, Openness, Role, m
 from rsltrace_viewer.model.recordings.filter import Condition, Mask, read_filter, steps_of
 from rsltrace_viewer.model.recordings.recording import Pairs, Recording, Topic
 from rsltrace_viewer.model.timeline.message_values import (
+    SAMPLES_MAX,
     differing_values,
     message_values,
     samples,
@@ -286,7 +287,7 @@ class RecordingSession:
         count, found = self._known_varying.get(key, (0, frozenset()))
         if len(topic.data) >= 2 * max(count, 1):
             count = len(topic.data)
-            read = (topic.data[number] for number in samples(count))
+            read = (topic.data[number] for number in samples(count, SAMPLES_MAX))
             found = varying_values(
                 recording.decode(topic, data)
                 for data in read

@@ -24,7 +24,8 @@ _NOT_SHOWN = PLACEHOLDERS | {"header", "stamp"}
 _VALUES_MAX = 5
 _LEAVES_MAX = 60
 _TEXT_MAX = 30
-_SAMPLES = 4
+SAMPLES_MAX = 4
+"""Messages of a topic that are read to find out which values vary."""
 _BYTES_MAX, _FLAT_BYTES_MAX = 1 << 16, 1 << 24
 _FLAT = frozenset(
     f"sensor_msgs/msg/{name}" for name in ("CompressedImage", "Image", "LaserScan", "PointCloud2")
@@ -61,9 +62,9 @@ def varying_values(messages: Iterable[object]) -> frozenset[str]:
     return frozenset(found)
 
 
-def samples(count: int) -> list[int]:
-    """Return the numbers of the messages that stand for ``count`` on a topic."""
-    return sorted({place * (count - 1) // (_SAMPLES - 1) for place in range(_SAMPLES)} - {-1})
+def samples(count: int, most: int) -> list[int]:
+    """Return up to ``most`` numbers of ``count`` messages, from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist() if count else []
 
 
 def _values(message: object, varying: Collection[str] = ()) -> str:
@@ -342,7 +343,9 @@ class RowValues:
         known = self._varying.get(channel.id)
         if known is None:
             count = 0 if channel.type in _SUMMARIES else trace.message_counts.get(channel.id, 0)
-            payloads = (trace.payload(replace(output, sequence=n)) for n in samples(count))
+            payloads = (
+                trace.payload(replace(output, sequence=n)) for n in samples(count, SAMPLES_MAX)
+            )
             known = self._varying[channel.id] = varying_values(
                 trace.decode(channel, one[2])
                 for one in payloads
