@@ -283,9 +283,12 @@ def test_a_wrong_filter_says_where(made: Path, drive: Drive) -> None:
         await viewer.press("F")
         await viewer.type("kind:timer quux:3")
         assert viewer.app.prompt.asking
-        line = next(line for line in viewer.text.splitlines() if "no field 'quux'" in line)
-        above = viewer.text.splitlines()[viewer.text.splitlines().index(line) - 1]
-        assert line.index("^") == above.index("quux")
+        shown = viewer.text.splitlines()
+        place = next(place for place, line in enumerate(shown) if "quux:3" in line)
+        assert shown[place + 1].index("^") == shown[place].index("quux")
+        error = " ".join(shown[place + 1 : -1])  # wrapped: nothing of it is cut off
+        assert "no field 'quux'" in error
+        assert error.rstrip().endswith("where")
 
     drive(made, steps)
 

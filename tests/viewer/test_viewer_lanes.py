@@ -14,7 +14,15 @@ from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.lanes import Lanes, axis_text, drawn
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.view import OneRun, Window, ends_of, spread, step_below, step_from
+from rsltrace_viewer.model.view import (
+    OneRun,
+    Window,
+    ends_of,
+    fine_step_from,
+    spread,
+    step_below,
+    step_from,
+)
 
 from rsltrace.trace.model.texts import format_seconds
 
@@ -26,6 +34,19 @@ def test_steps_are_one_two_or_five(least: int) -> None:
     step = step_from(least)
     assert step >= least > step_below(step) or least == 1
     assert str(step).rstrip("0") in ("1", "2", "5")
+
+
+@given(st.integers(20, 10**15))
+def test_a_fine_step_is_hardly_longer_than_needed(least: int) -> None:
+    step = fine_step_from(least)
+    assert least <= step <= least * 1.1 + 1
+    assert fine_step_from(step_from(least)) == step_from(least)  # zooming keeps its steps
+
+
+@given(st.floats(0.5, 1000), st.integers(40, 200))
+def test_a_whole_run_fills_the_lanes(length_s: float, columns: int) -> None:
+    run = Window(0, round(length_s * _S))
+    assert run.fitted(columns).length <= run.length * 1.1
 
 
 @given(st.integers(30, 150), st.booleans(), st.floats(-0.5, 1.5), st.sets(st.integers(0, 149)))
@@ -53,7 +74,7 @@ def test_windows_hold_all_in_columns_of_whole_steps(start: int, length: int, col
     fitted = Window(start, start + length).fitted(columns)
     step = fitted.step(columns)
     assert step * columns == fitted.length
-    assert step_from(step) == step
+    assert fine_step_from(step) == step
     assert fitted.start % step == 0
     assert fitted.start <= start
     assert start + length <= fitted.end

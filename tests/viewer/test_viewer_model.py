@@ -17,7 +17,15 @@ from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.rows import FilteredRows
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.events import EventTexts, ShortNames, layout
+from rsltrace_viewer.model.timeline import columns as columns_module
+from rsltrace_viewer.model.timeline.columns import (
+    EventColumn,
+    EventRow,
+    ListSpace,
+    ShortNames,
+    layout,
+)
+from rsltrace_viewer.model.timeline.events import EventTexts
 from rsltrace_viewer.model.view import OneRun, Window, cells, fit, wrap
 from rsltrace_viewer.terminal.screens.help import help_text
 
@@ -72,10 +80,20 @@ def test_a_cut_name_has_the_width_it_should_have(words: list[str], width: int) -
 @pytest.mark.parametrize("signs", [False, True])
 def test_columns_never_exceed_the_width(run: Run, width: int, signs: bool) -> None:
     texts = EventTexts(run)
-    columns = layout(width, index_width=5, time_width=12, node_width=12, names={}, signs=signs)
-    row = columns.cells(texts.of(7))
+    columns = layout(ListSpace(width, 5, 12, 12, signs=signs), {})
+    row = columns.cells(EventRow(texts.of(7)))
     assert sum(cells(text) + 1 for _, text in row) <= width
-    assert {"index", "mark"} <= {name for name, _ in row}
+    assert {"index", "mark"} <= {column.name for column, _ in row}
+
+
+def test_a_column_is_one_line_of_the_table(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    letters = EventColumn(
+        "length", "length", width=lambda _: 6, text=lambda row, _: str(len(row.event.node))
+    )
+    monkeypatch.setattr(columns_module, "COLUMNS", (letters, *columns_module.COLUMNS))
+    found = layout(ListSpace(80, 5, 12, 12), {})
+    assert found.header().startswith(" length ")
+    assert found.cells(EventRow(EventTexts(run).of(3)))[0][1] == "9     "
 
 
 def test_rows_say_what_happened(run: Run) -> None:

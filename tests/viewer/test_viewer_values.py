@@ -9,8 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+from rsltrace_viewer.model.plots.series import Source, most_telling
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.message_values import message_values
+from rsltrace_viewer.model.timeline.message_values import message_values, samples, varying_values
 from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
@@ -45,6 +50,113 @@ def test_messages_in_a_few_words(made: Any, text: str | None) -> None:
     assert message_values(made) == (text or 'ok=true text="a\\x1b[2J"')
 
 
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+
+
+def ros_message(name: str, /, **fields: Any) -> Any:
+    """Return a message of a type of ROS, zero but for some fields."""
+    made = STORE.types[name](**{field: zero(kind) for field, kind in STORE.fielddefs[name][1]})
+    for field, value in fields.items():
+        setattr(made, field, value)
+    return made
+
+
+def zero(kind: Any) -> Any:
+    node, detail = kind
+    if node is Nodetype.NAME:
+        return ros_message(detail)
+    if node is Nodetype.BASE:
+        return "" if detail[0] == "string" else 0
+    return np.zeros(detail[1] if node is Nodetype.ARRAY else 0)
+
+
+def transform(x: float) -> Any:
+    made = ros_message("geometry_msgs/msg/TransformStamped", child_frame_id="base_link")
+    made.header.frame_id, made.transform.translation.x = "odom", x
+    return made
+
+
+def test_common_messages_say_what_one_wants_to_know() -> None:
+    sensor, nav = "sensor_msgs/msg", "nav_msgs/msg"
+    ranges = np.array([0.4, 8.9, np.inf], dtype=np.float32)
+    pose = ros_message("geometry_msgs/msg/PoseStamped")
+    pose.pose.position.y = 3.0
+    status = [
+        ros_message("diagnostic_msgs/msg/DiagnosticStatus", level=level, name=name, message="low")
+        for level, name in ((1, "battery"), (0, "lidar"))
+    ]
+    cases = [
+        (transform(1.2), "odom→base_link x=1.2"),
+        (
+            ros_message("tf2_msgs/msg/TFMessage", transforms=[transform(1.2), transform(3.0)]),
+            "odom→base_link x=1.2 and 1 more",
+        ),
+        (ros_message("tf2_msgs/msg/TFMessage"), "none"),
+        (ros_message(f"{sensor}/LaserScan", ranges=ranges), "3 ranges 0.4–8.9 m"),
+        (ros_message(f"{sensor}/LaserScan", ranges=ranges[2:]), "1 ranges, none finite"),
+        (ros_message(f"{sensor}/Image", width=640, height=480, encoding="rgb8"), "640x480 rgb8"),
+        (
+            ros_message(f"{sensor}/CompressedImage", format="jpeg", data=np.zeros(2500, np.uint8)),
+            "jpeg 2.5 kB",
+        ),
+        (ros_message(f"{sensor}/PointCloud2", width=6000, height=2), "12,000 points"),
+        (
+            ros_message(f"{sensor}/JointState", name=["arm", "hand"], position=np.array([0.5, 1])),
+            "arm=0.5 hand=1",
+        ),
+        (ros_message(f"{sensor}/JointState", name=list("abcdefg")), "a b c d e and 2 more"),
+        (ros_message(f"{nav}/Path", poses=[pose, pose]), "2 poses to y=3"),
+        (ros_message(f"{nav}/Path"), "0 poses"),
+        (ros_message(f"{nav}/OccupancyGrid"), "0x0 cells of 0 m"),
+        (
+            ros_message("diagnostic_msgs/msg/DiagnosticArray", status=status),
+            "WARN battery: low and 1 more",
+        ),
+        (ros_message("visualization_msgs/msg/MarkerArray"), "0 markers"),
+        (
+            ros_message("trajectory_msgs/msg/JointTrajectory", joint_names=["arm"]),
+            "0 points for arm",
+        ),
+    ]
+    for made, text in cases:
+        assert message_values(made) == text
+
+
+def test_a_type_of_that_name_with_other_fields_is_shown_as_any() -> None:
+    made = make_dataclass("Made", ["size"], namespace={"__msgtype__": "sensor_msgs/msg/Image"})
+    assert message_values(made(size=7)) == "7"
+
+
+def test_values_that_vary_on_a_topic_come_first() -> None:
+    def battery(percentage: float) -> Any:
+        return message(a=1, b=2, c=3, d=4, e=5, present=True, percentage=percentage, cell=0)
+
+    varying = varying_values(battery(percentage) for percentage in (0.5, 0.0))
+    assert varying == {"percentage"}
+    assert message_values(battery(0.0), varying) == "percentage=0 a=1 b=2 c=3 d=4"
+    assert message_values(message(x=0.0, ω=1.0), {"x"}) == "x=0 ω=1"
+
+
+def test_a_plot_begins_with_a_field_that_differs_or_varies() -> None:
+    fields = [Source("field", "/pose", name) for name in ("stamp", "x", "turn", "value")]
+
+    def run(*rows: tuple[int, int, int, int]) -> list[object]:
+        return [message(stamp=s, x=x, turn=t, value=v) for s, x, t, v in rows]
+
+    a = run((0, 1, 5, 7), (1, 2, 5, 7))
+    assert most_telling(fields, [a]).field == "x"
+    assert most_telling(fields, [a, run((0, 1, 6, 7), (1, 2, 6, 7))]).field == "turn"
+    assert most_telling(fields, [run((0, 1, 5, 7))]).field == "value"
+    assert most_telling(fields, []).field == "value"
+
+
+@given(st.integers(0, 10**6))
+def test_samples_are_messages_of_the_topic(count: int) -> None:
+    found = samples(count, 4)
+    assert all(0 <= number < count for number in found)
+    assert not count or {0, count - 1} <= set(found)
+
+
 @pytest.mark.parametrize(
     ("name", "plot", "text"),
     [
@@ -67,7 +179,7 @@ def test_rows_and_plots_of_two_runs_show_what_differs(
         assert session.plots().first() == plot
         rows = [row for row in range(comparison.count) if comparison.sign(row) is Sign.DIFFERS]
         list(session.read_values(rows))
-        assert any(session.row(row)[0].outputs.startswith(text) for row in rows)
+        assert any(session.row(row).event.outputs.startswith(text) for row in rows)
     finally:
         session.close()
 
@@ -75,12 +187,12 @@ def test_rows_and_plots_of_two_runs_show_what_differs(
 def test_rows_have_values_once_they_are_read(made: Path) -> None:
     run = Run.open(made)
     session = Session(run)
-    assert session.row(2)[0].outputs == "/count"
+    assert session.row(2).event.outputs == "/count"
     assert list(session.read_values(range(20))) == list(range(1, 21))
-    sent = session.row(2)[0].outputs.split()
+    sent = session.row(2).event.outputs.split()
     assert sent[0] == "/count"
-    assert session.row(3)[0].outputs == f"got {sent[1]}"
-    assert session.row(11)[0].outputs == "call /check"  # a request without fields
+    assert session.row(3).event.outputs == f"got {sent[1]}"
+    assert session.row(11).event.outputs == "call /check"  # a request without fields
     session.close()
 
 
@@ -88,10 +200,10 @@ def test_rows_say_how_much_later_run_b_was() -> None:
     folder = SAMPLES / "delayed_input"
     session = Session(Run.open(folder / "a.mcap"), Run.open(folder / "b.mcap"))
     assert session.comparison is not None
-    names = [column.name for column in session.columns(120).columns]
+    names = [column.name for column, _ in session.columns(120).columns]
     assert "delta" in names
-    assert session.row(session.row_of_place())[0].delta == "+15 ms"
-    assert session.row(0)[0].delta == ""
+    assert session.row(session.row_of_place()).event.delta == "+15 ms"
+    assert session.row(0).event.delta == ""
     session.close()
 
 

@@ -33,14 +33,14 @@ from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.events import (
-    Columns,
-    EventText,
-    EventTexts,
+from rsltrace_viewer.model.timeline.columns import (
+    ColumnLayout,
+    EventRow,
+    ListSpace,
     ShortNames,
     layout,
-    node_of,
 )
+from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
 from rsltrace_viewer.model.timeline.message_values import RowValues
 from rsltrace_viewer.model.timeline.pair_values import PairValues
 from rsltrace_viewer.model.view import OneRun, View
@@ -226,21 +226,21 @@ class Session:
 
     # Rows.
 
-    def columns(self, width: int) -> Columns:
+    def columns(self, width: int) -> ColumnLayout:
         """Return the columns for a timeline of ``width`` cells."""
         texts = [self._texts[name] for name in self.shown]
         two = len(texts) > 1
-        return layout(
+        space = ListSpace(
             width,
             index_width=_numbers_width(self.shown.values()) if two else texts[0].index_width,
             time_width=max(t.time_width for t in texts),
             node_width=max(t.node_width for t in texts),
-            names=self._names,
             signs=self.b is not None,
             two=two,
             deltas=two and self.comparison is not None and self.comparison.rows.shifted,
             relative=bool(self.base_ns),
         )
+        return layout(space, self._names)
 
     def _short_names(self) -> dict[str, ShortNames]:
         return {
@@ -248,15 +248,16 @@ class Session:
             for column in ("node", "entity")
         }
 
-    def row(self, row: int) -> tuple[EventText, Sign | None, bool, str]:
-        """Return the event of a row in words, its sign, whether it is marked, its relation."""
+    def row(self, row: int) -> EventRow:
+        """Return a row of the event list."""
         place = self.rows.at(row)
         events = self._events(place)
         other, index = events[0]
         event = self._with_values(RUN_B if other else RUN_A, index)
         if self.view is self.comparison:
             event = self._of_two(event, self.comparison.row(place), place)
-        return event, self.view.sign(place), self.marks.of(events), self._relation(place)
+        sign, marked = self.view.sign(place), self.marks.of(events)
+        return EventRow(event, sign, marked, self._relation(place))
 
     def _with_values(self, name: str, index: int) -> EventText:
         return self.values[name].known(self._texts[name].of(index))

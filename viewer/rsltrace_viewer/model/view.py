@@ -76,7 +76,8 @@ def ends_of(starts: Floats, counts: Floats) -> Floats:
     return np.where(silent, starts + counts * usual, np.append(starts[1:], 0.0))
 
 
-# What part of a run the lanes show, in columns whose length is 1, 2 or 5 times a power of ten.
+# What part of a run the lanes show. Zooming goes in steps of 1, 2 or 5 times a power of ten. A
+# whole run gets a step of two digits, so that it fills at least nine tenths of the columns.
 
 _DIGITS = (1, 2, 5)
 
@@ -109,9 +110,9 @@ class Window:
         columns = max(columns, 1)
         if self.order:
             return self
-        step = step_from(-(-self.length // columns))
+        step = fine_step_from(-(-self.length // columns))
         while self.start // step * step + columns * step < self.end:
-            step = step_from(step + 1)
+            step = fine_step_from(step + 1)
         start = self.start // step * step
         return Window(start, start + columns * step)
 
@@ -128,6 +129,16 @@ def step_from(least: int) -> int:
             if digit * power >= least:
                 return digit * power
         power *= 10
+
+
+def fine_step_from(least: int) -> int:
+    """Return the shortest step of two digits that is at least so long: … 18, 19, 20, 22, … 100."""
+    power = 1
+    while least > 100 * power:
+        power *= 10
+    digits = -(-least // power)
+    unit = 1 if digits <= 20 else 2 if digits <= 50 else 5
+    return -(-digits // unit) * unit * power
 
 
 def step_below(step: int) -> int:

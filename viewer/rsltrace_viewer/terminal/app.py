@@ -345,7 +345,7 @@ class ViewerApp(Stepping):
             line = inspector.current
             text = f"{line.label} {line.value}".strip()
         elif self.session.rows.count:
-            event = self.session.row(self.session.row_of_place())[0]
+            event = self.session.row(self.session.row_of_place()).event
             numbers = " / ".join(filter(None, event.numbers)) or str(event.index)
             parts = (numbers, event.time, event.node, event.kind, event.entity)
             text = " ".join((*parts, event.outputs)).strip()

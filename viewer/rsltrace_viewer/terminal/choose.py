@@ -41,7 +41,7 @@ def question_of(kind: str, session: Session) -> Question:
         "search": Question(
             "search",
             "search",
-            "a word, or node: topic: kind: text: level: … as in a filter; Enter finds the next",
+            "a word, or node: topic: kind: text: … as in a filter; Enter finds the next",
             "",
             check_query,
             complete,

@@ -31,7 +31,7 @@ from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt
 from rsltrace_viewer.terminal.widgets.source import SourceView
-from rsltrace_viewer.terminal.widgets.timeline import Row, Timeline
+from rsltrace_viewer.terminal.widgets.timeline import Timeline
 
 WIDE = 110
 _VALUES_S = 0.12
@@ -261,14 +261,10 @@ class Shell(App[None]):
 
     def _show_rows(self, *, centre: bool = False) -> None:
         timeline, session = self.timeline, self.session
-        timeline.show(self._row, session.rows.count, session.columns(timeline.row_width))
+        timeline.show(session.row, session.rows.count, session.columns(timeline.row_width))
         if session.rows.count:
             timeline.go(session.row_of_place(), centre=centre)
         self._show_footer()
-
-    def _row(self, row: int) -> Row:
-        event, sign, marked, related = self.session.row(row)
-        return Row(event, sign, marked, related)
 
     def _show_lanes(self) -> None:
         lanes, session = self.lanes, self.session

@@ -11,14 +11,17 @@ from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace_viewer.model.plots.series import (
     CHAIN_AGE,
     CHAIN_LATENCY,
+    TELLING_MAX,
     Series,
     Source,
+    channel_of,
     fields_of,
     series_of,
     sources_of,
     topics_with_messages,
 )
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.timeline.message_values import samples
 
 _NOTHING = Series(np.zeros(0), np.zeros(0), "")
 
@@ -67,6 +70,18 @@ class RunPlots:
         )
         return list(dict.fromkeys(field for fields in of_runs for field in fields))
 
+    def messages(self, topic: str) -> list[list[object]]:
+        """Return some messages of a topic in each run, as many in each. Raises TraceError."""
+        found = [(run.trace, channel) for run in self._runs if (channel := channel_of(run, topic))]
+        count = min((trace.message_counts[channel.id] for trace, channel in found), default=0)
+        return [
+            [
+                trace.decode(channel, trace.message(channel.id, number)[1])
+                for number in samples(count, TELLING_MAX)
+            ]
+            for trace, channel in found
+        ]
+
     def first(self) -> tuple[str, str]:
         """Return the field that differs first; otherwise the topic of the selected event."""
         known = self.topics()
@@ -74,15 +89,17 @@ class RunPlots:
         if diff is not None:
             divergences = [one for one in (diff.shown, *diff.divergences) if one is not None]
             differing = [
-                (message.topic, message.fields[0].path)
+                (message.topic, field.path)
                 for divergence in divergences
                 for message in divergence.messages
-                if message.topic in known and message.fields
+                if message.topic in known
+                for field in message.fields
             ]
             # A parameter that differs is no curve; what a node then sends is.
             if differing:
-                return min(differing, key=lambda one: one[0] in NODE_TOPICS)
-        return (self._topic if self._topic in known else ""), ""
+                return min(differing, key=lambda one: (one[0] in NODE_TOPICS, "stamp" in one[1]))
+        wanted = self._topic in known and self._topic not in NODE_TOPICS
+        return (self._topic if wanted else ""), ""
 
     def cursor_s(self) -> float | None:
         """Return the time of the selected event."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -12,14 +12,18 @@ import numpy.typing as npt
 
 from rsltrace.checks.latency.measure import measuring
 from rsltrace.errors import TraceError
+from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, Output, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.model.texts import PLACEHOLDERS
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 
 SAMPLES_MAX = 1500
 """Messages decoded for a plot; of more, every n-th is taken, and the plot says so."""
+
+TELLING_MAX = 16
+"""Messages of a topic that are read to choose the field to plot first."""
 
 _RATE_BINS = 240
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
@@ -137,6 +141,44 @@ def numeric_paths(value: Any, path: str = "") -> Iterator[str]:
                 yield from numeric_paths(getattr(value, field.name), inner)
 
 
+def most_telling(fields: Sequence[Source], messages: Sequence[Sequence[object]]) -> Source:
+    """Return the field of a topic to plot first, given some of its messages in each run.
+
+    A field that differs between the runs comes before one that varies, and that before constants;
+    then a position or a velocity before others."""
+    values = np.array(
+        [[[_number_at(one, f.field) for f in fields] for one in run] for run in messages if run]
+        or [[[0.0] * len(fields)]]
+    )
+    differs = (values != values[:1]).any(axis=(0, 1))
+    varies = (values != values[:, :1]).any(axis=(0, 1))
+
+    def rank(place: int) -> tuple[bool, bool, bool, int, bool, int]:
+        field = fields[place].field
+        likely = next((n for n, word in enumerate(_LIKELY) if field.endswith(word)), len(_LIKELY))
+        return (
+            "stamp" in field,
+            not differs[place],
+            not varies[place],
+            likely,
+            "[" in field,
+            place,
+        )
+
+    return fields[min(range(len(fields)), key=rank)]
+
+
+_LIKELY = ("position.x", "linear.x", "linear_acceleration.x", "latitude", "data", "value")
+
+
+def _number_at(message: object, path: str) -> float:
+    try:
+        found = value_at(message, path)
+    except (AttributeError, TypeError, ValueError):
+        return 0.0
+    return found if np.isfinite(found) else 0.0
+
+
 def value_at(message: Any, path: str) -> float:
     """Return a number by its path; NaN where an array is shorter."""
     value = message
@@ -151,11 +193,16 @@ def value_at(message: Any, path: str) -> float:
     return float(value)
 
 
+def channel_of(run: Run, topic: str) -> ChannelInfo | None:
+    """Return the channel with the messages of a topic; None if there is none."""
+    channels = run.trace.channels.values()
+    counts = run.trace.message_counts
+    return next((c for c in channels if c.topic == topic and counts.get(c.id)), None)
+
+
 def _field_series(run: Run, source: Source) -> Iterator[Series]:
     trace = run.trace
-    publisher = next((e for e in _publishers(run) if e.name == source.name), None)
-    probe = Output(0, publisher.id if publisher else 0, OutputKind.MESSAGE, 0, 0)
-    channel = trace.channel_of(probe) if publisher is not None else None
+    channel = channel_of(run, source.name)
     if channel is None:
         return
     count = trace.message_counts.get(channel.id, 0)
@@ -163,11 +210,9 @@ def _field_series(run: Run, source: Source) -> Iterator[Series]:
     note = f"every {step}th of {count:,} messages" if step > 1 else f"{count:,} messages"
     times, values = [], []
     for sequence in range(0, count, step):
-        found = trace.payload(dataclasses.replace(probe, sequence=sequence))
-        if found is None:
-            continue
-        times.append(found[0] / 1e9)
-        values.append(value_at(trace.decode(channel, found[2]), source.field))
+        stamp_ns, data = trace.message(channel.id, sequence)
+        times.append(stamp_ns / 1e9)
+        values.append(value_at(trace.decode(channel, data), source.field))
         if len(times) % 100 == 0:
             yield Series(np.array(times), np.array(values), f"{note}, {sequence / count:.0%} read")
     yield Series(np.array(times), np.array(values), note)
@@ -359,6 +404,10 @@ class PlotData(Protocol):
 
     def fields(self, topic: str) -> list[Source]:
         """Return the numeric fields of a topic."""
+        ...
+
+    def messages(self, topic: str) -> list[list[object]]:
+        """Return some messages of a topic in each run, as many in each. Raises TraceError."""
         ...
 
     def first(self) -> tuple[str, str]:

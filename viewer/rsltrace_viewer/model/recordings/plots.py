@@ -7,9 +7,17 @@ from collections.abc import Iterator
 import numpy as np
 
 from rsltrace.errors import TraceError
-from rsltrace_viewer.model.plots.series import SAMPLES_MAX, Series, Source, numeric_paths, value_at
+from rsltrace_viewer.model.plots.series import (
+    SAMPLES_MAX,
+    TELLING_MAX,
+    Series,
+    Source,
+    numeric_paths,
+    value_at,
+)
 from rsltrace_viewer.model.recordings.recording import Recording, Topic
 from rsltrace_viewer.model.recordings.session import RecordingSession
+from rsltrace_viewer.model.timeline.message_values import samples
 
 _RATE_BINS = 240
 
@@ -39,6 +47,16 @@ class RecordingPlots:
                 message = recording.decode(found, found.data[0])
                 return [Source("field", topic, path) for path in numeric_paths(message)]
         return []
+
+    def messages(self, topic: str) -> list[list[object]]:
+        """Return some messages of a topic in each recording, as many in each. Raises TraceError."""
+        found = self._of(topic)
+        kept = [[one for one in topic.data if one is not None] for _, topic in found]
+        numbers = samples(min(map(len, kept), default=0), TELLING_MAX)
+        return [
+            [recording.decode(topic, data[number]) for number in numbers]
+            for (recording, topic), data in zip(found, kept, strict=True)
+        ]
 
     def first(self) -> tuple[str, str]:
         """Return the field that differs first, or the selected topic."""

@@ -17,7 +17,14 @@ from rsltrace.trace.model.texts import format_duration, format_seconds, printabl
 from rsltrace_viewer.model.inspector.message_tree import Line, Openness, Role, message_lines
 from rsltrace_viewer.model.recordings.filter import Condition, Mask, read_filter, steps_of
 from rsltrace_viewer.model.recordings.recording import Pairs, Recording, Topic
-from rsltrace_viewer.model.timeline.message_values import differing_values, message_values
+from rsltrace_viewer.model.timeline.message_values import (
+    SAMPLES_MAX,
+    differing_values,
+    message_values,
+    samples,
+    too_large,
+    varying_values,
+)
 
 # The messages of one or two recordings that a filter or a search means, as far as is known.
 
@@ -61,9 +68,6 @@ class Matches:
         return [int(mask.sum()) for mask in self._masks.get(key, [])]
 
 
-_PREVIEW_BYTES = 1 << 16
-
-
 class RecordingSession:
     """One recording, or two. ``row`` is the selected message of the selected topic."""
 
@@ -89,6 +93,7 @@ class RecordingSession:
         self._kept: tuple[Key | None, tuple[int | None, int | None]] = (None, (None, None))
         self._left_at = (0, 0)
         """Which message the filter should leave selected, and where it did."""
+        self._known_varying: dict[tuple[str, ...], tuple[int, frozenset[str]]] = {}
         self._pairs: tuple[object, Pairs] = (None, Pairs(None, None))
 
     @property
@@ -253,7 +258,7 @@ class RecordingSession:
                 continue
             if not time:
                 time = format_seconds(topic.stamps[place] - recording.start_ns)[:-3]
-            texts.append(_preview(recording, topic, place))
+            texts.append(self._values(recording, topic, place))
         if not self.two:
             return time, None, texts
         sign = pairs.sign(row)
@@ -265,6 +270,32 @@ class RecordingSession:
                 texts = list(told)
         return time, sign, texts
 
+    def _values(self, recording: Recording, topic: Topic, place: int) -> str:
+        data = topic.data[place]
+        if data is None:
+            return "(not kept in memory)"
+        if too_large(topic.type, len(data)):
+            return f"({len(data) / 1e6:.1f} MB)"
+        try:
+            return message_values(recording.decode(topic, data), self._varying(recording, topic))
+        except RsltraceError as error:
+            return printable(str(error))
+
+    def _varying(self, recording: Recording, topic: Topic) -> frozenset[str]:
+        """Return the values that vary on a topic, as far as it is read."""
+        key = str(recording.path), topic.name, topic.type
+        count, found = self._known_varying.get(key, (0, frozenset()))
+        if len(topic.data) >= 2 * max(count, 1):
+            count = len(topic.data)
+            read = (topic.data[number] for number in samples(count, SAMPLES_MAX))
+            found = varying_values(
+                recording.decode(topic, data)
+                for data in read
+                if data is not None and not too_large(topic.type, len(data))
+            )
+            self._known_varying[key] = count, found
+        return found
+
     def _differing(
         self, topics: list[Topic | None], places: tuple[int | None, ...]
     ) -> tuple[str, str] | None:
@@ -272,7 +303,7 @@ class RecordingSession:
         decoded = []
         for recording, topic, place in zip(self.recordings, topics, places, strict=True):
             data = None if topic is None or place is None else topic.data[place]
-            if topic is None or data is None or len(data) > _PREVIEW_BYTES:
+            if topic is None or data is None or too_large(topic.type, len(data)):
                 return None
             try:
                 decoded.append(recording.decode(topic, data))
@@ -391,13 +422,3 @@ class RecordingSession:
                 self.place = place
                 self.row = self.pairs.next_difference(-1, 1) or 0
                 return
-
-
-def _preview(recording: Recording, topic: Topic, place: int) -> str:
-    data = topic.data[place]
-    if data is None or len(data) > _PREVIEW_BYTES:
-        return "(not kept in memory)" if data is None else f"({len(data) / 1e6:.1f} MB)"
-    try:
-        return message_values(recording.decode(topic, data))
-    except RsltraceError as error:
-        return printable(str(error))

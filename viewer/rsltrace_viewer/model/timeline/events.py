@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
-
-from rich.cells import set_cell_size
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import (
@@ -24,66 +21,6 @@ from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace.trace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.view import cells, fit
-
-# Names that are too long for their place, cut so that they can still be told from each other.
-#
-# Names on a robot share much: a namespace at the beginning, a kind of sensor at the end. Cut at
-# the end they may all look the same, so the cut is made where it leaves a name that no other one
-# has.
-
-_Cut = Callable[[str, int], str]
-
-
-class ShortNames:
-    """A set of names, and how each is written in so many cells."""
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._names = sorted(set(names))
-        self._by_width: dict[int, dict[str, str]] = {}
-
-    def fit(self, name: str, width: int) -> str:
-        """Return ``name`` in exactly ``width`` cells. One that is not in the set is cut as text."""
-        if width <= 0 or cells(name) <= width:
-            return fit(name, width)
-        known = self._by_width.get(width)
-        if known is None:
-            known = self._by_width[width] = self._cut(width)
-        return known.get(name) or fit(name, width)
-
-    def _cut(self, width: int) -> dict[str, str]:
-        """Return the cut form of all names that are longer than ``width``."""
-        chosen: dict[str, str] = {}
-        for cut in (fit, _in_the_middle, _at_the_start):
-            forms = {name: cut(name, width) for name in self._names}
-            count = Counter(forms.values())
-            for name, form in forms.items():
-                if cells(name) > width and name not in chosen and count[form] == 1:
-                    chosen[name] = form
-        return chosen
-
-
-def _in_the_middle(name: str, width: int) -> str:
-    if cells(name) <= width:
-        return fit(name, width)
-    tail = _tail(name, width // 2)
-    return set_cell_size(name, width - 1 - cells(tail)) + "…" + tail
-
-
-def _at_the_start(name: str, width: int) -> str:
-    if cells(name) <= width:
-        return fit(name, width)
-    tail = _tail(name, width - 1)
-    return "…" + tail + " " * (width - 1 - cells(tail))
-
-
-def _tail(name: str, width: int) -> str:
-    """Return the longest end of ``name`` that takes at most ``width`` cells."""
-    start = max(len(name) - width, 0)
-    while cells(name[start:]) > width:
-        start += 1
-    return name[start:]
-
 
 _ROWS_KEPT = 2048
 _SUMMARY_MAX = 400
@@ -95,16 +32,15 @@ class EventText:
     """One event in words, each at its full length."""
 
     index: int
-    time: str
-    node: str
-    kind: str
-    entity: str
-    input_hash: str
-    output_hash: str
-    outputs: str
-    raised: bool
-    suspended: bool
-    warns: bool
+    time: str = ""
+    node: str = ""
+    kind: str = ""
+    entity: str = ""
+    input_hash: str = ""
+    output_hash: str = ""
+    outputs: str = ""
+    raised: bool = False
+    warns: bool = False
     """Whether it logged a warning or worse."""
     delta: str = ""
     """How much later it happened in run b, if not at the same time."""
@@ -135,7 +71,7 @@ class EventTexts:
             return self._readable(index)
         except TraceError as error:
             why = printable(f"unreadable: {error}")
-            return EventText(index, "", "", "", "", "", "", why, True, False, False)
+            return EventText(index, outputs=why, raised=True)
 
     def _readable(self, index: int) -> EventText:
         run = self._run
@@ -154,7 +90,6 @@ class EventTexts:
             output_hash=f"{event.output_hash:016x}"[:6] if event.output_hash else "·",
             outputs=outputs_text(run, outputs),
             raised=EventFlag.RAISED in event.flags,
-            suspended=EventFlag.SUSPENDED in event.flags,
             warns=any(log is not None and log.level >= LEVEL_WARN for log in logs),
         )
 
@@ -205,131 +140,3 @@ def outputs_text(
         if length > width:
             break
     return shortened(", ".join(parts), width)
-
-
-# Columns of the timeline: which fit into a width, and an event cut to them.
-
-GAP = 1
-"""Cells between columns."""
-_DELTA = 8
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A column: its name, its width in cells, whether it is aligned to the right."""
-
-    name: str
-    width: int
-    right: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """The columns that fit into ``width`` cells, in order."""
-
-    width: int
-    columns: tuple[Column, ...] = field(default=())
-    micros: bool = False
-    """Whether times are shown to the microsecond (cut, not rounded) for want of room."""
-    relative: bool = False
-    """Whether times count from the start of the run."""
-    names: Mapping[str, ShortNames] = field(default_factory=dict, compare=False)
-    """By column, the names that may stand there: they are cut so that they stay distinct."""
-
-    def header(self) -> str:
-        """Return the line of titles."""
-        return " " * GAP + (" " * GAP).join(
-            fit(self._title(c.name), c.width, right=c.right) for c in self.columns
-        )
-
-    def _title(self, name: str) -> str:
-        return "since start" if name == "time" and self.relative else _TITLES.get(name, name)
-
-    def cells(self, event: EventText, *, sign: str = " ", mark: str = " ") -> list[tuple[str, str]]:
-        """Return (column name, text of its exact width) of a row."""
-        values: Mapping[str, str] = {
-            "sign": sign,
-            "mark": mark,
-            "index": str(event.index),
-            "a": event.numbers[0],
-            "b": event.numbers[1],
-            "time": event.time[:-3] if self.micros else event.time,
-            "delta": event.delta,
-            "node": event.node,
-            "kind": event.kind,
-            "entity": event.entity,
-            "input": event.input_hash,
-            "output": event.output_hash,
-            "outputs": event.outputs,
-        }
-        return [(c.name, self._fit(self._text(c, values, event), c)) for c in self.columns]
-
-    def _text(self, column: Column, values: Mapping[str, str], event: EventText) -> str:
-        text = values[column.name]
-        if column.name != "outputs":
-            return text
-        if event.delta and not any(one.name == "delta" for one in self.columns):
-            text = f"{event.delta}  {text}"
-        return event.short if event.short and cells(text) > column.width else text
-
-    def _fit(self, text: str, column: Column) -> str:
-        if column.name in self.names:
-            return self.names[column.name].fit(text, column.width)
-        return fit(text, column.width, right=column.right)
-
-
-_TITLES = {
-    "sign": "",
-    "mark": "",
-    "index": "event",
-    "time": "time s",
-    "delta": "b − a",
-    "entity": "entity",
-    "input": "in",
-    "output": "out",
-    "outputs": "what it did",
-}
-
-
-def layout(
-    width: int,
-    *,
-    index_width: int,
-    time_width: int,
-    node_width: int,
-    names: Mapping[str, ShortNames],
-    signs: bool = False,
-    two: bool = False,
-    deltas: bool = False,
-    relative: bool = False,
-) -> Columns:
-    """Return the columns for a timeline of ``width`` cells. Narrow ones lose the least needed.
-
-    ``signs``: how rows compare; ``two``: the numbers of both runs."""
-    wanted = [Column("sign", 1)] if signs else []
-    wanted += [Column("mark", 1)]
-    wanted += [
-        Column(name, index_width, right=True) for name in (("a", "b") if two else ("index",))
-    ]
-    spare = width - sum(c.width + GAP for c in wanted) - GAP
-    micros = width < 90
-    time = max(time_width - 3 if micros else time_width, 11 if relative else 6)
-    share = 8 if two and micros else 6
-    node = min(node_width, max(8, width // share))
-    for column, least in (
-        (Column("time", time, right=True), 0),
-        *(((Column("delta", _DELTA, right=True), 0),) if deltas and not micros else ()),
-        (Column("node", node), 0),
-        (Column("kind", 6), 6),
-        (Column("entity", max(10, min(22, width // share))), 0),
-    ):
-        if spare - column.width - GAP < least:
-            break
-        wanted.append(column)
-        spare -= column.width + GAP
-    if spare >= 14 + 44 and not two:  # in which two may differ
-        wanted += [Column("input", 6), Column("output", 6)]
-        spare -= 14
-    if spare > 3:
-        wanted.append(Column("outputs", spare - GAP))
-    return Columns(width, tuple(wanted), micros, relative, names)

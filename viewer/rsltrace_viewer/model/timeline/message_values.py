@@ -1,17 +1,20 @@
-"""A message in a few words, for a row: ``x=0.31 ω=-0.05``. What is zero or long is left out."""
+"""A message in a few words, for a row: ``x=0.31 ω=-0.05``, ``360 ranges 0.4–8.9 m``."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from rsltrace.errors import TraceError
+from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
 from rsltrace_viewer.model.run import Run
@@ -21,23 +24,173 @@ _NOT_SHOWN = PLACEHOLDERS | {"header", "stamp"}
 _VALUES_MAX = 5
 _LEAVES_MAX = 60
 _TEXT_MAX = 30
+SAMPLES_MAX = 4
+"""Messages of a topic that are read to find out which values vary."""
+_BYTES_MAX, _FLAT_BYTES_MAX = 1 << 16, 1 << 24
+_FLAT = frozenset(
+    f"sensor_msgs/msg/{name}" for name in ("CompressedImage", "Image", "LaserScan", "PointCloud2")
+) | {"nav_msgs/msg/OccupancyGrid"}
+"""Types with one long array of numbers, which is decoded at once."""
+_EMPTY = ("0", "false", '""', "[]")
 _TURNS = {"x": "ωx", "y": "ωy", "z": "ω"}
 
 
-def message_values(message: object) -> str:
-    """Return the values of a decoded message that tell most."""
-    leaves = list(_leaves(message, ""))[:_LEAVES_MAX]
-    told = [leaf for leaf in leaves if leaf[1] not in ("0", "false", '""', "[]")] or leaves[:2]
+def message_values(message: object, varying: Collection[str] = ()) -> str:
+    """Return a decoded message in a few words.
+
+    ``varying`` are the paths that ``varying_values`` found on its topic: they come first."""
+    summary = _SUMMARIES.get(str(getattr(message, "__msgtype__", "")))
+    if summary is not None:
+        with suppress(AttributeError):  # a type of this name with other fields
+            return printable(summary(message))
+    return printable(_values(message, varying))
+
+
+def too_large(type_name: str, size: int) -> bool:
+    """Return whether decoding a message of ``size`` bytes takes too long for a row."""
+    return size > (_FLAT_BYTES_MAX if type_name in _FLAT else _BYTES_MAX)
+
+
+def varying_values(messages: Iterable[object]) -> frozenset[str]:
+    """Return the paths of the values in which messages of one topic differ."""
+    first: dict[str, str] = {}
+    found: set[str] = set()
+    for message in messages:
+        values = dict(islice(_leaves(message, ""), _LEAVES_MAX))
+        first = first or values
+        found |= {path for path, value in values.items() if first.get(path) != value}
+    return frozenset(found)
+
+
+def samples(count: int, most: int) -> list[int]:
+    """Return up to ``most`` numbers of ``count`` messages, from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist() if count else []
+
+
+def _values(message: object, varying: Collection[str] = ()) -> str:
+    leaves = list(islice(_leaves(message, ""), _LEAVES_MAX))
+    chosen = [leaf for leaf in leaves if leaf[0] in varying or leaf[1] not in _EMPTY] or leaves[:2]
+    if len(chosen) > _VALUES_MAX:
+        chosen.sort(key=lambda leaf: leaf[0] not in varying)
     # Names of frames and the like rarely change: they come last.
-    told = sorted(told, key=lambda leaf: leaf[1].startswith('"'))[:_VALUES_MAX]
-    short = Counter(path.rpartition(".")[2] for path, _ in told)
+    chosen = sorted(chosen, key=_is_text)[:_VALUES_MAX]
+    short = Counter(path.rpartition(".")[2] for path, _ in chosen)
     parts = []
-    for path, value in told:
+    for path, value in chosen:
         name = path.rpartition(".")[2]
         if short[name] > 1:
             name = ".".join(path.split(".")[-2:])
         parts.append(f"{name}={value}" if len(leaves) > 1 else value)
-    return printable(" ".join(parts))
+    return " ".join(parts)
+
+
+def _is_text(leaf: tuple[str, str]) -> bool:
+    return leaf[1].startswith('"')
+
+
+# What a person wants to know of common messages that are long, or nested.
+
+
+def _transforms(message: Any) -> str:
+    return _first_of([_transform(one) for one in message.transforms[:1]], message.transforms)
+
+
+def _transform(one: Any) -> str:
+    frames = f"{_cut(one.header.frame_id)}→{_cut(one.child_frame_id)}"
+    return f"{frames} {_values(one.transform)}"
+
+
+def _scan(message: Any) -> str:
+    ranges = np.asarray(message.ranges, dtype=np.float64)
+    seen = ranges[np.isfinite(ranges)]
+    if not len(seen):
+        return f"{len(ranges)} ranges, none finite"
+    return f"{len(ranges)} ranges {number(seen.min(), 3)}–{number(seen.max(), 3)} m"
+
+
+def _image(message: Any) -> str:
+    return f"{message.width}x{message.height} {_cut(message.encoding)}"
+
+
+def _compressed_image(message: Any) -> str:
+    return f"{_cut(message.format)} {len(message.data) / 1e3:,.1f} kB"
+
+
+def _cloud(message: Any) -> str:
+    return f"{message.width * message.height:,} points"
+
+
+def _joint_state(message: Any) -> str:
+    values = next((v for v in (message.position, message.velocity, message.effort) if len(v)), ())
+    texts = [
+        f"{_cut(name)}={number(float(value))}"
+        for name, value in zip(message.name, values, strict=False)
+    ]
+    return _some_of(texts or [_cut(name) for name in message.name], "joints")
+
+
+def _trajectory(message: Any) -> str:
+    joints = _some_of([_cut(name) for name in message.joint_names], "joints")
+    return f"{_count(message.points, 'point')} for {joints}"
+
+
+def _path(message: Any) -> str:
+    last = f" to {_values(message.poses[-1].pose.position)}" if len(message.poses) else ""
+    return f"{_count(message.poses, 'pose')}{last}"
+
+
+def _grid(message: Any) -> str:
+    info = message.info
+    return f"{info.width}x{info.height} cells of {number(info.resolution)} m"
+
+
+def _markers(message: Any) -> str:
+    return _count(message.markers, "marker")
+
+
+def _diagnostics(message: Any) -> str:
+    def level(one: Any) -> int:
+        return one.level[0] if isinstance(one.level, bytes) else int(one.level)
+
+    worst = sorted(message.status, key=level)[-1:]
+    return _first_of(
+        [f"{_LEVELS[min(level(one), 3)]} {_cut(one.name)}: {_cut(one.message)}" for one in worst],
+        message.status,
+    )
+
+
+def _first_of(texts: list[str], every: Sequence[object]) -> str:
+    return f"{texts[0]} and {len(every) - 1} more" if len(every) > 1 else "".join(texts) or "none"
+
+
+def _some_of(texts: list[str], what: str) -> str:
+    more = f" and {len(texts) - _VALUES_MAX} more" if len(texts) > _VALUES_MAX else ""
+    return " ".join(texts[:_VALUES_MAX]) + more or f"no {what}"
+
+
+def _count(items: Sequence[object], what: str) -> str:
+    return f"{len(items):,} {what}{'' if len(items) == 1 else 's'}"
+
+
+def _cut(text: str) -> str:
+    return shortened(text, _TEXT_MAX)
+
+
+_LEVELS = ("OK", "WARN", "ERROR", "STALE")
+_SUMMARIES: dict[str, Callable[[Any], str]] = {
+    "diagnostic_msgs/msg/DiagnosticArray": _diagnostics,
+    "geometry_msgs/msg/TransformStamped": _transform,
+    "nav_msgs/msg/OccupancyGrid": _grid,
+    "nav_msgs/msg/Path": _path,
+    "sensor_msgs/msg/CompressedImage": _compressed_image,
+    "sensor_msgs/msg/Image": _image,
+    "sensor_msgs/msg/JointState": _joint_state,
+    "sensor_msgs/msg/LaserScan": _scan,
+    "sensor_msgs/msg/PointCloud2": _cloud,
+    "tf2_msgs/msg/TFMessage": _transforms,
+    "trajectory_msgs/msg/JointTrajectory": _trajectory,
+    "visualization_msgs/msg/MarkerArray": _markers,
+}
 
 
 def differing_values(a: object, b: object) -> tuple[str, str]:
@@ -116,7 +269,6 @@ def number(value: float, digits: int = 4) -> str:
 # decoded for it, and the first of each type takes as long as a screen may.
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
-_BYTES_MAX = 1 << 16
 _OUTPUTS_MAX = 12
 _KEPT = 4096
 
@@ -128,6 +280,8 @@ class RowValues:
         self._run = run
         self._texts: OrderedDict[int, str] = OrderedDict()
         self._events: dict[int, EventText] = {}
+        self._varying: dict[int, frozenset[str]] = {}
+        """By channel, the paths of the values that vary."""
 
     def known(self, event: EventText) -> EventText:
         """Return an event with the values of what it did, if these have been read."""
@@ -176,8 +330,25 @@ class RowValues:
             channel = trace.channel_of(output)
             if found is None or channel is None:
                 return ""
-            if len(found[2]) > _BYTES_MAX:
+            if too_large(channel.type, len(found[2])):
                 return f"({len(found[2]) / 1e6:.1f} MB)"
-            return message_values(trace.decode(channel, found[2]))
+            return message_values(
+                trace.decode(channel, found[2]), self._varying_of(channel, output)
+            )
         except TraceError:
             return ""
+
+    def _varying_of(self, channel: ChannelInfo, output: Output) -> frozenset[str]:
+        trace = self._run.trace
+        known = self._varying.get(channel.id)
+        if known is None:
+            count = 0 if channel.type in _SUMMARIES else trace.message_counts.get(channel.id, 0)
+            payloads = (
+                trace.payload(replace(output, sequence=n)) for n in samples(count, SAMPLES_MAX)
+            )
+            known = self._varying[channel.id] = varying_values(
+                trace.decode(channel, one[2])
+                for one in payloads
+                if one is not None and not too_large(channel.type, len(one[2]))
+            )
+        return known

@@ -18,7 +18,15 @@ from textual.widgets.option_list import Option
 
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.texts import printable
-from rsltrace_viewer.model.plots.series import Plot, PlotData, Series, Source, difference, plot
+from rsltrace_viewer.model.plots.series import (
+    Plot,
+    PlotData,
+    Series,
+    Source,
+    difference,
+    most_telling,
+    plot,
+)
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.follow import walk
 
@@ -136,7 +144,8 @@ class PlotScreen(Screen[None]):
             return False
         self._topic = topic
         names = [source.field for source in fields]
-        place = names.index(field) if field in names else fields.index(_most_telling(fields))
+        field = field if field in names else self._most_telling(topic, fields).field
+        place = names.index(field)
         self._offer(list(fields), place)
         self.query_one("#what", Static).update(Content(f"plots  {printable(topic)}"))
         return True
@@ -148,6 +157,13 @@ class PlotScreen(Screen[None]):
             self.query_one("#plot", PlotView).show(printable(str(error)), [], None)
             return []
 
+    def _most_telling(self, topic: str, fields: list[Source]) -> Source:
+        try:
+            messages = self._data.messages(topic)
+        except RsltraceError:  # the plot will say it
+            messages = []
+        return most_telling(fields, messages)
+
     def _offer(self, choices: list[Source | str], highlighted: int = 0) -> None:
         self._choices = choices
         options = self.query_one(OptionList)
@@ -158,14 +174,12 @@ class PlotScreen(Screen[None]):
         options.focus()
 
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
-        """Plot what is under the cursor; of a topic, its first changing field."""
+        """Plot what is under the cursor; of a topic, a field that differs or varies."""
         choice = self._choices[event.option_index]
         if isinstance(choice, Source):
             self._plot(choice)
-            return
-        fields = [field for field in self._fields(choice) if "stamp" not in field.field]
-        if fields:
-            self._plot(_most_telling(fields))
+        elif fields := self._fields(choice):
+            self._plot(self._most_telling(choice, fields))
         else:
             self._show(f"{printable(choice)} has no numbers", [])
 
@@ -214,12 +228,3 @@ def _words(choice: Source | str) -> str:
     if isinstance(choice, str):
         return f"{printable(choice)}  ›"
     return printable(choice.field or choice.label)
-
-
-def _most_telling(fields: list[Source]) -> Source:
-    """Return a field that is likely to move: a position or a velocity before a sequence number."""
-    for word in ("position.x", "linear.x", "linear_acceleration.x", "latitude", "data", "value"):
-        for source in fields:
-            if source.field.endswith(word):
-                return source
-    return next((f for f in fields if "stamp" not in f.field and "[" not in f.field), fields[0])

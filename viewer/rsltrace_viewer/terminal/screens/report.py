@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 from textual.app import ComposeResult
@@ -16,7 +17,7 @@ from textual.widgets.option_list import Option
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import Style
-from rsltrace.diff.result import BagDiff, Diff
+from rsltrace.diff.result import BagDiff, Diff, Divergence
 
 # A list to choose one of: the effects of an event, the traces of a folder.
 
@@ -90,7 +91,7 @@ class ReportScreen(ModalScreen[None]):
     def compose(self) -> ComposeResult:
         """Make the text."""
         width = min(self.app.size.width, 130) - 6
-        lines = report_lines(self._diff, DiffOptions(), width=max(width, 40))
+        lines = report_lines(_without_view(self._diff), DiffOptions(), width=max(width, 40))
         text = Content("\n").join(
             Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))
             for line in lines
@@ -99,3 +100,18 @@ class ReportScreen(ModalScreen[None]):
             box.border_title = "why the runs diverge"
             box.border_subtitle = "Esc closes, ↓ scrolls"
             yield Static(text)
+
+
+def _without_view(diff: Diff | BagDiff) -> Diff | BagDiff:
+    """Return a diff that does not propose to open the viewer: one is there."""
+    if isinstance(diff, BagDiff):
+        return diff
+
+    def without(one: Divergence) -> Divergence:
+        return replace(one, next_step="") if one.next_step.startswith("rsltrace view ") else one
+
+    return replace(
+        diff,
+        divergences=tuple(without(one) for one in diff.divergences),
+        effect=None if diff.effect is None else without(diff.effect),
+    )

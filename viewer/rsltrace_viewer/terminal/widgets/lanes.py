@@ -15,7 +15,7 @@ from textual.widget import Widget
 
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.lanes import Lane, Lanes, axis_text
-from rsltrace_viewer.model.timeline.events import ShortNames
+from rsltrace_viewer.model.timeline.columns import ShortNames
 from rsltrace_viewer.model.view import cells, fit
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"

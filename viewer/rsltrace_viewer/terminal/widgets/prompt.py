@@ -70,7 +70,7 @@ class Prompt(Vertical):
     Prompt Input:focus { border: none; background-tint: $foreground 0%; }
     Prompt #line { height: 1; layout: horizontal; }
     Prompt #label { width: auto; text-style: bold; color: $text-primary; }
-    Prompt #hint { height: 1; color: $text-muted; }
+    Prompt #hint { height: auto; max-height: 5; color: $text-muted; }
     Prompt #hint.wrong { color: $text-error; }
     """
 
@@ -166,15 +166,19 @@ class Prompt(Vertical):
         hint = self.query_one("#hint", Static)
         hint.add_class("wrong")
         start, end = getattr(error, "start", None), getattr(error, "end", None)
-        pointer = ""
+        text = printable(str(error))
         if start is not None and end is not None and self._question is not None:
             before = self.query_one(Input).value[:start]
             offset = cells(self._question.label) + 1 + cells(before)
-            if offset < self.size.width // 2:
-                pointer = " " * offset + "^" * max(end - start, 1) + " "
+            width = self.size.width - 2
+            pointer = " " * offset + "^" * max(end - start, 1)
+            if len(pointer) + 1 + cells(text) <= width:
+                text = f"{pointer} {text}"
+            elif len(pointer) <= width:
+                text = f"{pointer}\n{text}"
             else:
-                pointer = f"at character {start + 1}: "
-        hint.update(Content(printable(f"{pointer}{error}")))
+                text = f"at character {start + 1}: {text}"
+        hint.update(Content(text))
 
     def _close(self, text: str | None) -> None:
         question, self._question = self._question, None

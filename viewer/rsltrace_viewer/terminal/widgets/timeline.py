@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import ClassVar
 
 from rich.segment import Segment as Piece
@@ -15,24 +14,13 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from rsltrace.diff.row_sign import Sign
-from rsltrace_viewer.model.timeline.events import Columns, EventText
+from rsltrace_viewer.model.timeline.columns import ColumnLayout, EventRow
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
 _DRAWN_MAX = 1000
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """What a row says: the event, how it compares, whether it is marked, and b's other hashes."""
-
-    event: EventText
-    sign: Sign | None = None
-    marked: bool = False
-    related: str = ""
-    """``cause`` or ``effect`` of the selected event."""
 
 
 _SIGN_STYLES = {
@@ -42,16 +30,6 @@ _SIGN_STYLES = {
     Sign.ONLY_B: "only-b",
     Sign.MOVED: "moved",
     Sign.UNKNOWN: "muted",
-}
-_STYLED = {
-    "index": "muted",
-    "a": "muted",
-    "b": "muted",
-    "time": "time",
-    "node": "node",
-    "kind": "muted",
-    "input": "muted",
-    "output": "muted",
 }
 
 
@@ -115,11 +93,11 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         super().__init__(id=id)
         self.cursor = 0
         self.empty = "no events"
-        self._source: Callable[[int], Row] | None = None
+        self._source: Callable[[int], EventRow] | None = None
         self._count = 0
-        self._columns = Columns(0)
+        self._columns = ColumnLayout()
         self._styles: dict[str, Style] = {}
-        self._drawn: dict[int, tuple[Row, bool]] = {}
+        self._drawn: dict[int, tuple[EventRow, bool]] = {}
         """What each row looked like when it was drawn last."""
 
     @property
@@ -138,7 +116,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         """Cells of a row."""
         return self.scrollable_content_region.width
 
-    def show(self, source: Callable[[int], Row], count: int, columns: Columns) -> None:
+    def show(self, source: Callable[[int], EventRow], count: int, columns: ColumnLayout) -> None:
         """Show ``count`` rows from ``source``; the cursor keeps its row if there is one."""
         self._source = source
         self._columns = columns
@@ -185,7 +163,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
             if row < self._count and self._drawn.get(row) != self._look(row):
                 self._refresh_row(row)
 
-    def _look(self, row: int) -> tuple[Row, bool] | None:
+    def _look(self, row: int) -> tuple[EventRow, bool] | None:
         return (self._source(row), row == self.cursor) if self._source is not None else None
 
     def notify_style_update(self) -> None:
@@ -241,15 +219,12 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         self._drawn[row] = shown, row == self.cursor
         return self._row(row, shown, width)
 
-    def _row(self, row: int, shown: Row, width: int) -> Strip:
+    def _row(self, row: int, shown: EventRow, width: int) -> Strip:
         selected = row == self.cursor
-        event = shown.event
-        mark = "!" if event.raised else "*" if shown.marked else "w" if event.warns else " "
-        sign = shown.sign.value if shown.sign is not None else " "
         lead = ">" if selected else {"cause": "←", "effect": "→"}.get(shown.related, " ")
         pieces = [Piece(lead, self._style("lead"))]
-        for name, text in self._columns.cells(event, sign=sign, mark=mark):
-            pieces.append(Piece(text + " ", self._style(self._style_of(name, shown, mark))))
+        for column, text in self._columns.cells(shown):
+            pieces.append(Piece(text + " ", self._style(_style_of(column.style, shown))))
         strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))
         over = "cursor" if selected else "related" if shown.related else ""
         if not over:
@@ -257,14 +232,16 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         style = self._style(over)
         return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
 
-    def _style_of(self, name: str, shown: Row, mark: str) -> str:
-        sign = shown.sign
-        if name in ("sign", "index", "a", "b") and sign is not None:
-            return _SIGN_STYLES[sign]
-        if sign in (Sign.ONLY_A, Sign.ONLY_B, Sign.DIFFERS) and name != "time":
-            return _SIGN_STYLES[sign] if name in ("input", "output", "outputs") else "plain"
-        if name == "mark":
-            return {"!": "error", "w": "warning"}.get(mark, "mark")
-        if name == "outputs":
-            return "error" if shown.event.raised else "warning" if shown.event.warns else "plain"
-        return _STYLED.get(name, "plain")
+
+def _style_of(style: str, row: EventRow) -> str:
+    """Return the style of a cell from that of its column, and how the row compares."""
+    sign, event = row.sign, row.event
+    if style == "sign":
+        return "muted" if sign is None else _SIGN_STYLES[sign]
+    if sign in (Sign.ONLY_A, Sign.ONLY_B, Sign.DIFFERS) and style != "time":
+        return _SIGN_STYLES[sign] if style in ("hash", "outputs") else "plain"
+    if style == "mark":
+        return {"!": "error", "w": "warning"}.get(row.mark, "mark")
+    if style == "outputs":
+        return "error" if event.raised else "warning" if event.warns else "plain"
+    return "muted" if style == "hash" else style
