@@ -529,7 +529,7 @@ def test_json_is_strict_and_versioned() -> None:
 
 
 def documented_keys() -> set[str]:
-    """The keys that the tables of docs/reference/diff-json.md list: the first column, in backticks."""
+    """The keys in the tables of docs/reference/diff-json.md: first column, in backticks."""
     rows = re.findall(r"^\| (`[^|]+`) \|", JSON_DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE)
     return {key for row in rows for key in re.findall(r"`([a-z_]+)`", row)}
 

@@ -1,7 +1,7 @@
 """Sixty nasty nodes: each differs from run to run, unless the guard prevents or reports it.
 
 All nodes are in one job, which is recorded a few times in unlike surroundings with the guard and
-without. ``nasty_nodes.md`` beside it has the table of what came out (``--update-golden`` writes it).
+without. ``nasty_nodes.md`` has the table of what came out (``--update-golden`` writes it).
 """
 
 from __future__ import annotations
