@@ -4,7 +4,7 @@
     python benchmarks/explore.py --only order late_tf   groups or bugs
     python benchmarks/explore.py --ways pct native      some of the columns
     python benchmarks/explore.py --keep out.json        figures that are there are not made again
-    python benchmarks/explore.py --markdown             the table of docs/exploring.md
+    python benchmarks/explore.py --markdown             a table of the bugs
 
 The bugs are those of campaigns/explore/bugs. Each strategy searches with ``--stop-at-first`` and
 several seeds; a figure is the median of the runs it took, ``>1000`` that it was not found in so

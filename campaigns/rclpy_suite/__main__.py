@@ -25,7 +25,7 @@ from document import Counts, document, read
 from excluded import EXCLUDED
 from suite import Outcome, copy_tests, module_names, run_module
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "rclpy-tests.md"
+DOCUMENT = Path(__file__).parents[2] / "docs" / "qualification" / "rclpy-tests.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -110,7 +110,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--baseline", type=Path, help="ids of the tests that pass natively")
     parser.add_argument("--list", type=Path, help="write the ids of the tests that passed")
     parser.add_argument(
-        "--document", metavar="VERSION", default="", help="write docs/rclpy-tests.md"
+        "--document", metavar="VERSION", default="", help="write docs/qualification/rclpy-tests.md"
     )
     parser.add_argument("--timeout", type=float, default=120, help="wall seconds for a process")
     parser.add_argument("-j", "--jobs", type=int, default=1, help="modules at a time")

@@ -13,9 +13,9 @@ Made by `python campaigns/rclpy_suite --rclpy PATH --baseline LIST --document VE
 checkout of rclpy (none of its code is kept here):
 
 - **here**: each test module is the `main:` of a job with `clocks: {{source: topic, advances:
-  true}}` and [`policy: rclpy`](policies.md), in rsltrace's process;
+  true}}` and [`policy: rclpy`](../policies.md), in rsltrace's process;
 - **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
-  rclpy and its compiled parts, unmodified, on [the library of processes](processes.md).
+  rclpy and its compiled parts, unmodified, on [the library of processes](../processes.md).
 
 Wherever a test spins, sleeps, waits or starts a thread, simulated time passes. `make rclpy-tests
 RCLPY=PATH` does it without the document.

@@ -1,4 +1,4 @@
-"""Which of rclpy's tests cannot run in a simulation, and why: see ``docs/rclpy-tests.md``.
+"""Which of rclpy's tests cannot run in a simulation: ``docs/qualification/rclpy-tests.md``.
 
 An excluded test is one that asks for what a simulation does otherwise on purpose. One that fails
 because something is missing or wrong does not belong here.

@@ -109,7 +109,7 @@ def loaded(name: str) -> Any:
 
 def test_the_document_is_that_of_the_table() -> None:
     document, excluded = loaded("document"), loaded("excluded").EXCLUDED
-    text = (ROOT / "docs" / "rclpy-tests.md").read_text()
+    text = (ROOT / "docs" / "qualification" / "rclpy-tests.md").read_text()
     version, both = document.read(text)
     assert text == document.document(version, both, excluded)
     for way, counts in both.items():

@@ -69,6 +69,7 @@ from tests.tiers import cases
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "diff"
 DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "diff.md"
+JSON_DOCUMENT = DOCUMENT.parent / "reference" / "diff-json.md"
 MS = 1_000_000
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
@@ -534,8 +535,8 @@ def test_json_is_strict_and_versioned() -> None:
 
 
 def documented_keys() -> set[str]:
-    """The keys that the tables of docs/diff.md list: the first column, in backticks."""
-    rows = re.findall(r"^\| (`[^|]+`) \|", DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE)
+    """The keys in the tables of docs/reference/diff-json.md: first column, in backticks."""
+    rows = re.findall(r"^\| (`[^|]+`) \|", JSON_DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE)
     return {key for row in rows for key in re.findall(r"`([a-z_]+)`", row)}
 
 

@@ -1,7 +1,7 @@
 """Sixty nasty nodes: each differs from run to run, unless the guard prevents or reports it.
 
 All nodes are in one job, which is recorded a few times in unlike surroundings with the guard and
-without. ``docs/guard.md`` has the table of what came out (``--update-golden`` writes it).
+without. ``nasty_nodes.md`` has the table of what came out (``--update-golden`` writes it).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tests.guard.nasty_nodes import CASES, DETECTED, DETERMINISTIC
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
 
-DOCUMENT = Path(__file__).parents[2] / "docs" / "guard.md"
+DOCUMENT = Path(__file__).parent / "nasty_nodes.md"
 RUNS = 2
 RUNS_MAX = 8
 """Without the guard: until every node has differed, as what chance decides may be equal twice."""

@@ -129,7 +129,7 @@ def test_every_command_does_what_it_shows(document: Path, tmp_path: Path) -> Non
 
 def test_the_documents_that_show_results_are_run() -> None:
     names = {path.name for path in DOCUMENTS}
-    assert names >= {"README.md", "recipes.md", "debugging.md", "what-if.md", "verify.md"}
+    assert names >= {"README.md", "debugging.md", "what-if.md", "verify.md"}
     assert names >= {"index.md", "flaky-node.md", "golden-traces.md", "debug-an-event.md"}
     assert names >= {"audit.md", "guard.md", "launch.md", "bisect.md", "one-node.md"}
 

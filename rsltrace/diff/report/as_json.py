@@ -1,4 +1,4 @@
-"""A diff as JSON, for programs. ``docs/diff.md`` describes it; keys are only ever added.
+"""A diff as JSON, for programs. ``docs/reference/diff-json.md`` describes it; keys are only added.
 
 Facts are objects with their class as ``fact``, or a word where there is nothing more to say; beside
 them stand the sentences for people. Times are integers of nanoseconds; hashes are 16 hex digits,
