@@ -24,10 +24,10 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace import Job, load_job
-from rsltrace.checks.evaluate import condition, opposite, plain, title, topic_of
-from rsltrace.checks.properties import Eventually, Never, Property, Rate
-from rsltrace.conditions.names import Names
-from rsltrace.conditions.view import Sent
+from rsltrace.checks.evaluate import condition, opposite, title, topic_of, with_topic_prefix
+from rsltrace.checks.properties import EventuallyProperty, NeverProperty, RateProperty, RunProperty
+from rsltrace.conditions.names import RunNames
+from rsltrace.conditions.view import SentOutput
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S
 
@@ -37,7 +37,7 @@ TURN_S = 0.02
 """One timeout for all turns: rclpy's executor begins anew where it changes, and serves only
 coroutines that wait then."""
 
-NAMES = Names()
+NAMES = RunNames()
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Seen:
 
     index: int
     stamp_ns: int
-    output: Sent
+    output: SentOutput
     kind: int = int(EventKind.SUBSCRIPTION)
     entity: int = 0
     entity_name: str = ""
@@ -59,7 +59,7 @@ class Seen:
     def received(self) -> None:
         return None
 
-    def sent(self) -> Sequence[Sent]:
+    def sent(self) -> Sequence[SentOutput]:
         return [self.output]
 
     def findings(self) -> Sequence[str]:
@@ -76,19 +76,19 @@ class Start:
         return {}
 
 
-def properties(job: Job) -> dict[str, Property]:
+def properties(job: Job) -> dict[str, RunProperty]:
     """Return what the checks of a job say, by their titles."""
-    found: dict[str, Property] = {}
+    found: dict[str, RunProperty] = {}
     for spec in job.checks:
         if spec.rate is not None:
             over_ns = spec.over_ns or NS_PER_S
-            found[title(spec)] = Rate(spec.rate, spec.at_least, spec.at_most, over_ns)
+            found[title(spec)] = RateProperty(spec.rate, spec.at_least, spec.at_most, over_ns)
             continue
         text = spec.always or spec.never or spec.eventually
         assert text is not None, f"{job.source_name}: a function takes a trace"
         what = (opposite if spec.always else condition)(text, NAMES).arm(Start())
         after = None if spec.after is None else condition(spec.after, NAMES).arm(Start())
-        kind = Eventually if spec.eventually else Never
+        kind = EventuallyProperty if spec.eventually else NeverProperty
         found[title(spec)] = kind(what, after, spec.within_ns)
     return found
 
@@ -96,7 +96,7 @@ def properties(job: Job) -> dict[str, Property]:
 def topics(job: Job) -> set[str]:
     """Return the topics that the checks of a job speak of."""
     texts = [t for s in job.checks for t in (s.always, s.never, s.eventually, s.after) if t]
-    found = {topic for text in texts if (topic := topic_of(plain(text)))}
+    found = {topic for text in texts if (topic := topic_of(with_topic_prefix(text)))}
     return found | {spec.rate for spec in job.checks if spec.rate}
 
 
@@ -173,9 +173,9 @@ def observe(job: Job, seconds: float, ready: Any, go: Any, told: Any) -> None:
             return
         stamp_ns = int((time.monotonic() - begin) * 1e9)
         if topic == "/rosout":
-            output = Sent(int(OutputKind.LOG), topic, 0, message.msg, message.level)
+            output = SentOutput(int(OutputKind.LOG), topic, 0, message.msg, message.level)
         else:
-            output = Sent(int(OutputKind.MESSAGE), topic, 0, message=lambda: message)
+            output = SentOutput(int(OutputKind.MESSAGE), topic, 0, message=lambda: message)
         seen = Seen(count, stamp_ns, output)
         count += 1
         for one in held.values():

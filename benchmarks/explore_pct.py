@@ -27,7 +27,7 @@ from rsltrace import Simulation
 from rsltrace.job import Job
 from rsltrace.run.session import Session
 from rsltrace.search.explore.steps import TrialObserver
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.policy import Pct, pct_bound
 
 TOPICS = ("a", "b", "c")
@@ -143,7 +143,7 @@ def orders(depth: int, choices: int, runs: int) -> Iterator[list[str]]:
     """Yield the order of each seed, from 1."""
     with Simulation(job({"departures": []}, 0, runs)) as sim:
         for seed in range(1, runs + 1):
-            sim._session.loop.policy = Pct(Stream(seed, "pct"), depth, choices)
+            sim._session.loop.policy = Pct(RandomStream(seed, "pct"), depth, choices)
             handled.clear()
             while not handled and sim.step():
                 pass

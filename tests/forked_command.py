@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from rsltrace.guard.pin import PINNED, has_fixed_addresses, pin
+from rsltrace.guard.pin import PINNED_VARIABLES, has_fixed_addresses, pin
 
 FRESH = frozenset(("--no-pin", "--help", "-h"))
 """Words that ask for a process that is not pinned."""
@@ -111,9 +111,9 @@ def _read(descriptor: int, texts: list[str], number: int) -> None:
 
 def _pinned(env: Mapping[str, str]) -> dict[str, str]:
     """Return the environment that ``pin`` starts a command with."""
-    before = {name: env.get(name) for name in PINNED}
+    before = {name: env.get(name) for name in PINNED_VARIABLES}
     told = {**before, "addresses": not has_fixed_addresses()}
-    return {**env, **PINNED, "RSLTRACE_PINNED": json.dumps(told)}
+    return {**env, **PINNED_VARIABLES, "RSLTRACE_PINNED": json.dumps(told)}
 
 
 def serve(requests: socket.socket) -> list[str] | None:

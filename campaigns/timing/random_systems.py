@@ -12,10 +12,10 @@ from rclpy.node import Node
 from std_msgs.msg import Empty
 
 from rsltrace.job import Job
-from rsltrace.native.timing.bounds import Bound, bounds
-from rsltrace.native.timing.model import Wanted, longest_times, system_of
+from rsltrace.native.timing.bounds import ResponseBound, bounds
+from rsltrace.native.timing.model import ProcessorModel, longest_times, system_of
+from rsltrace.native.timing.observed import ChainPath as Chain
 from rsltrace.native.timing.observed import ObservedChains
-from rsltrace.native.timing.observed import Path as Chain
 from rsltrace.run import record
 from rsltrace.trace.reader import Trace
 
@@ -156,7 +156,7 @@ def _execution(
     return {"entities": entities}
 
 
-def held(plan: Plan, folder: Path) -> list[tuple[Chain, Bound]]:
+def held(plan: Plan, folder: Path) -> list[tuple[Chain, ResponseBound]]:
     """Run a system; return its chains, up to each of their callbacks, with their bounds."""
     job = plan.job()
     record(job, folder / "run.mcap", force=True)
@@ -164,5 +164,5 @@ def held(plan: Plan, folder: Path) -> list[tuple[Chain, Bound]]:
         observed = ObservedChains(trace)
         times, notes = longest_times(job, observed)
         assert not notes
-        system, _ = system_of(job, observed, times, Wanted())
+        system, _ = system_of(job, observed, times, ProcessorModel())
         return list(zip(observed.paths, bounds(system), strict=True))

@@ -14,13 +14,19 @@ from rsltrace.checks.latency_checks import (
     check_latency,
     latency_title,
 )
-from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
-from rsltrace.conditions.condition import Armed, Condition, is_true
+from rsltrace.checks.properties import (
+    EventuallyProperty,
+    NeverProperty,
+    RateProperty,
+    RunProperty,
+    Violation,
+)
+from rsltrace.conditions.condition import ActiveCondition, EventCondition, is_true
 from rsltrace.conditions.expressions import Expression, parse_expression
-from rsltrace.conditions.names import Names, names_of
+from rsltrace.conditions.names import RunNames, names_of
 from rsltrace.conditions.occurrences import TopicCondition
 from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.topic_fields import OF_MESSAGE, plain, topic_of
+from rsltrace.conditions.topic_fields import OF_MESSAGE, topic_of, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
@@ -33,12 +39,12 @@ from rsltrace.trace.reader import Trace
 # The texts of checks as conditions: those of the debugger that speak of what others can see.
 
 
-def condition(text: str, names: Names) -> Condition:
+def condition(text: str, names: RunNames) -> EventCondition:
     """Read what happens.
 
     :raises ConditionError: it cannot be understood, or no trace says it.
     """
-    read = parse_condition(plain(text), names)
+    read = parse_condition(with_topic_prefix(text), names)
     if not read.after or read.reads == {"nodes"}:
         raise ConditionError(
             "a check sees messages, log records, exceptions and findings: say /topic, "
@@ -48,20 +54,20 @@ def condition(text: str, names: Names) -> Condition:
     return read
 
 
-def opposite(text: str, names: Names) -> Condition:
+def opposite(text: str, names: RunNames) -> EventCondition:
     """Read what has to be true of all messages, and return the condition that is met by others:
     those of which it is false, or cannot be evaluated.
 
     :raises ConditionError: as above, or it is not about messages.
     """
     read = condition(text, names)
-    if OF_MESSAGE.match(plain(text)) is None:
+    if OF_MESSAGE.match(with_topic_prefix(text)) is None:
         raise ConditionError(
             "always is about messages: say /topic: EXPRESSION; for what must not happen, never",
             text,
         )
 
-    def arm(moment: PausedRun) -> Armed:
+    def arm(moment: PausedRun) -> ActiveCondition:
         armed = read.arm(moment)
         assert isinstance(armed, TopicCondition)
         return _FalseMessageCondition(armed.text, armed.pattern, armed.expression)
@@ -82,7 +88,7 @@ class _FalseMessageCondition(TopicCondition):
 
 def compared(text: str) -> Expression | None:
     """Return the left side of the first comparison in a text about messages, to show its value."""
-    found = OF_MESSAGE.match(plain(text))
+    found = OF_MESSAGE.match(with_topic_prefix(text))
     if found is None:
         return None
     for part in ast.walk(ast.parse(found[2].strip(), mode="eval")):
@@ -92,7 +98,7 @@ def compared(text: str) -> Expression | None:
 
 
 PASSED, VIOLATED, UNDECIDED, SKIPPED = "passed", "violated", "undecided", "skipped"
-_NO_NAMES = Names()
+_NO_NAMES = RunNames()
 _SOME_NODE = "nodes=[{node: 'none:None'}]"
 """A job has to have one; it is never made."""
 
@@ -137,7 +143,7 @@ def check_texts(job: Job) -> None:
         _conditions(job, index, spec, _NO_NAMES)
 
 
-def wrong_checks(job: Job, names: Names) -> Iterator[str]:
+def wrong_checks(job: Job, names: RunNames) -> Iterator[str]:
     """Yield, with its line, what is wrong with each check that speaks of what is not there."""
     for index, spec in enumerate(job.checks):
         try:
@@ -216,7 +222,7 @@ def evaluating(
     yield results
 
 
-def _see(one: Property, event: TraceEvent, where: str) -> None:
+def _see(one: RunProperty, event: TraceEvent, where: str) -> None:
     try:
         one.see(event)
     except ConditionError as error:
@@ -232,14 +238,14 @@ def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:
         return topics | {spec.rate}
     for text in (spec.always, spec.never, spec.eventually, spec.after):
         if text is not None:
-            topic = topic_of(plain(text))
+            topic = topic_of(with_topic_prefix(text))
             if topic is None:
                 return None
             topics = topics | {topic}
     return topics
 
 
-def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | None:
+def _property(trace: Trace, job: Job, index: int, names: RunNames) -> RunProperty | None:
     """Return what a check of a job says, ready to be told of events; None for a function, or a
     latency."""
     spec = job.checks[index]
@@ -247,20 +253,20 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
     if spec.function is not None or spec.latency is not None:
         return None
     if spec.rate is not None:
-        return Rate(
+        return RateProperty(
             spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S, trace.start_ns
         )
     what, after = _conditions(job, index, spec, names)
     assert what is not None
     start = StartOfTrace(trace.start_ns)
     armed = what.arm(start)
-    armed_after: Armed | None = after.arm(start) if after is not None else None
+    armed_after: ActiveCondition | None = after.arm(start) if after is not None else None
     if spec.eventually is not None:
-        return Eventually(armed, armed_after, spec.within_ns, trace.start_ns)
+        return EventuallyProperty(armed, armed_after, spec.within_ns, trace.start_ns)
     text = spec.always or spec.never or ""
-    topic = topic_of(plain(text))
+    topic = topic_of(with_topic_prefix(text))
     says = f"not {text}" if spec.always is not None else text if topic is not None else ""
-    return Never(
+    return NeverProperty(
         armed,
         armed_after,
         spec.within_ns,
@@ -271,7 +277,7 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
     )
 
 
-def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
+def _wrong_names(job: Job, index: int, spec: CheckSpec, names: RunNames) -> None:
     """Raise JobError if a rate, or a latency, is of what is not there."""
     named: list[tuple[tuple[str | int, ...], str]] = []
     if spec.rate is not None:
@@ -292,8 +298,8 @@ def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
 
 
 def _conditions(
-    job: Job, index: int, spec: CheckSpec, names: Names
-) -> tuple[Condition | None, Condition | None]:
+    job: Job, index: int, spec: CheckSpec, names: RunNames
+) -> tuple[EventCondition | None, EventCondition | None]:
     """Return the conditions of a check: what it is about, and after what."""
     what = after = None
     for key in ("always", "never", "eventually"):
@@ -315,7 +321,7 @@ def _located(job: Job, index: int, key: str) -> Iterator[None]:
         raise JobError(f"{key}: {error.message}", where=where) from None
 
 
-def _result(spec: CheckSpec, one: Property) -> CheckResult:
+def _result(spec: CheckSpec, one: RunProperty) -> CheckResult:
     verdict = VIOLATED if one.count else UNDECIDED if one.undecided else PASSED
     return CheckResult(title(spec), verdict, one.count, tuple(one.found), one.note)
 

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rsltrace.conditions.condition import Armed, error_text, shown
+from rsltrace.conditions.condition import ActiveCondition, error_text, shown
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.trace_events import TraceEvent
 from rsltrace.errors import RsltraceError
@@ -31,7 +31,7 @@ class Violation:
 
 
 @dataclass
-class Property(ABC):
+class RunProperty(ABC):
     """A property of a run, told of its events in order. ``count`` is how often it is violated,
     ``undecided`` how often the run ended before that could be said."""
 
@@ -55,11 +55,11 @@ class Property(ABC):
 
 
 @dataclass
-class Never(Property):
+class NeverProperty(RunProperty):
     """Something that must not happen; with ``after``, not from then on (for ``within_ns``)."""
 
-    what: Armed
-    after: Armed | None = None
+    what: ActiveCondition
+    after: ActiveCondition | None = None
     within_ns: int | None = None
     start_ns: int = 0
     says: str = ""
@@ -111,11 +111,11 @@ class Never(Property):
 
 
 @dataclass
-class Eventually(Property):
+class EventuallyProperty(RunProperty):
     """Something that has to happen: once, or each time that ``after`` has."""
 
-    what: Armed
-    after: Armed | None = None
+    what: ActiveCondition
+    after: ActiveCondition | None = None
     within_ns: int | None = None
     start_ns: int = 0
 
@@ -156,7 +156,7 @@ class Eventually(Property):
 
 
 @dataclass
-class Rate(Property):
+class RateProperty(RunProperty):
     """A topic whose messages come at least, or at most, so often in every stretch of time."""
 
     topic: str

@@ -21,7 +21,7 @@ from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.native.timing.analysis import Analysis
+    from rsltrace.native.timing.analysis import TimingAnalysis
     from rsltrace.native.timing.curves import Supply
     from rsltrace.native.timing.observed import ObservedChains
 
@@ -96,14 +96,14 @@ def analyze(
     """
     from rsltrace.job import load_job
     from rsltrace.native.timing import analysis as timing
-    from rsltrace.native.timing.model import Wanted, check_job
-    from rsltrace.run.inputs import without_launch_files
+    from rsltrace.native.timing.model import ProcessorModel, check_job
+    from rsltrace.run.inputs import expand_launch_files
 
     supply = _supply(reservation)
     by_end = dict(_deadline(text) for text in deadlines)
     if plot is not None:
         check_picture(plot)
-    loaded = without_launch_files(load_job(job, overrides=list(overrides))).job
+    loaded = expand_launch_files(load_job(job, overrides=list(overrides))).job
     check_job(loaded)
     with ExitStack() as stack:
         simulated, native = _opened(traces, stack)
@@ -127,7 +127,7 @@ def analyze(
             native,
             times=given,
             deadlines=by_end,
-            wanted=Wanted(supply, one_processor),
+            wanted=ProcessorModel(supply, one_processor),
         )
     if form == "json":
         from rsltrace.cli.output.analysis_text import as_json
@@ -207,7 +207,7 @@ def _simulated(job: Job, stack: ExitStack) -> ObservedChains:
     return ObservedChains(stack.enter_context(Trace.open(path)))
 
 
-def _print(found: Analysis, times: str, native: Sequence[str]) -> None:
+def _print(found: TimingAnalysis, times: str, native: Sequence[str]) -> None:
     from rsltrace.cli.output.analysis_text import text
 
     say("\n".join(map(printable, text(found, times, native))))

@@ -17,7 +17,7 @@ from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
-    from rsltrace.guard.audit.rules import Audit, Found
+    from rsltrace.guard.audit.rules import AuditFinding, AuditReport
 
 _FORMATS = ("text", "json", "github")
 
@@ -60,9 +60,9 @@ def audit(
     Exit status: 0 without findings, 1 with findings, 2 for an error.
     """
     result = _look(words, launch, skip, overrides)
-    from rsltrace.guard.audit.rules import IS_SAFE
+    from rsltrace.guard.audit.rules import SAFE_TREATMENTS
 
-    found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
+    found = [one for one in result.found if not (unguarded and one.treatment in SAFE_TREATMENTS)]
     for trouble in result.troubles:
         tell(f"rsltrace: error: {printable(trouble)}")
     for note in result.notes:
@@ -76,7 +76,9 @@ def audit(
     return EXIT_USAGE if result.troubles else 1 if found else 0
 
 
-def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]) -> Audit:
+def _look(
+    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]
+) -> AuditReport:
     from rsltrace.guard.audit.audit import audit_job, audit_path
 
     only = Path(words[0]) if len(words) == 1 and launch is None else None
@@ -84,21 +86,23 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
         if overrides:
             raise click.UsageError(f"--set needs a job, and {only} is not one")
         return audit_path(only)
-    from rsltrace.run.inputs import without_launch_files
-    from rsltrace.run.plans.executables import source_of
+    from rsltrace.run.inputs import expand_launch_files
+    from rsltrace.run.plans.executables import executable_source
     from rsltrace.run.process import search_path
 
     job, _ = job_of(words, launch, skip, overrides)
-    expanded = without_launch_files(job)
+    expanded = expand_launch_files(job)
     with search_path(job):
         from rsltrace.adapters.workspace.installs import module_folders
 
         return audit_job(
-            expanded.job, lambda target, where: source_of(target, where=where), module_folders
+            expanded.job,
+            lambda target, where: executable_source(target, where=where),
+            module_folders,
         )
 
 
-def _line(one: Found) -> str:
+def _line(one: AuditFinding) -> str:
     text = (
         f"{_shown(one.path)}:{one.line}:{one.column}: {one.kind}: {one.call}; "
         f"guard: {one.treatment.value}, {one.does}; instead: {one.instead}"
@@ -106,7 +110,7 @@ def _line(one: Found) -> str:
     return printable(text)
 
 
-def _summary(result: Audit, found: Sequence[Found]) -> str:
+def _summary(result: AuditReport, found: Sequence[AuditFinding]) -> str:
     files = f"{result.files} file{'s' * (result.files != 1)}"
     silenced = f"; {result.allowed} allowed by a comment" if result.allowed else ""
     if not found:
@@ -117,7 +121,7 @@ def _summary(result: Audit, found: Sequence[Found]) -> str:
     return f"{many} in {files} (guard: {treated}){silenced}"
 
 
-def _as_json(result: Audit, found: Sequence[Found]) -> str:
+def _as_json(result: AuditReport, found: Sequence[AuditFinding]) -> str:
     findings = [
         {**asdict(one), "path": _shown(one.path), "treatment": one.treatment.value} for one in found
     ]
@@ -132,11 +136,11 @@ def _as_json(result: Audit, found: Sequence[Found]) -> str:
     )
 
 
-def _annotation(one: Found) -> str:
+def _annotation(one: AuditFinding) -> str:
     from rsltrace.diff.report.ci import command_data, command_property
-    from rsltrace.guard.audit.rules import IS_SAFE
+    from rsltrace.guard.audit.rules import SAFE_TREATMENTS
 
-    level = "notice" if one.treatment in IS_SAFE else "warning"
+    level = "notice" if one.treatment in SAFE_TREATMENTS else "warning"
     place = f"file={command_property(printable(_shown(one.path)))},line={one.line},col={one.column}"
     title = command_property(printable(f"rsltrace {one.kind}: {one.call}"))
     text = f"guard: {one.treatment.value}, {one.does}; instead: {one.instead}"

@@ -26,9 +26,9 @@ from rsltrace.terminal import say, tell
 if TYPE_CHECKING:
     from rsltrace.child_processes import Processes
     from rsltrace.job import Job
-    from rsltrace.search.bisect.repository import Repository
-    from rsltrace.search.bisect.runs import Check, Runner
-    from rsltrace.search.bisect.search import Found
+    from rsltrace.search.bisect.repository import GitRepository
+    from rsltrace.search.bisect.runs import RevisionCheck, RevisionRunner
+    from rsltrace.search.bisect.search import BisectResult
 
 _BEFORE, _AFTER = "before.mcap", "after.mcap"
 
@@ -107,9 +107,9 @@ def bisect(
     """
     from rsltrace.child_processes import Processes
     from rsltrace.cli.output.search_text import line_of
-    from rsltrace.search.bisect.repository import Repository
-    from rsltrace.search.bisect.runs import Runner
-    from rsltrace.search.bisect.search import Search
+    from rsltrace.search.bisect.repository import GitRepository
+    from rsltrace.search.bisect.runs import RevisionRunner
+    from rsltrace.search.bisect.search import BisectSearch
     from rsltrace.search.bisect.worktree import Worktree
 
     if expression is not None and shell is not None:
@@ -118,7 +118,7 @@ def bisect(
     files = _named(given)
     if output is not None and not force:
         _check_free(output)
-    repository = Repository.of(files[0])
+    repository = GitRepository.of(files[0])
     ends = repository.commit(good), repository.commit(bad)
     _check_ends(repository, *ends)
     processes = Processes()
@@ -130,9 +130,11 @@ def bisect(
     for note in notes:
         tell(f"note: {note}")
     with handling_signals(), Worktree(repository, links) as tree:
-        runner = Runner(repository, tree, tuple(given.arguments(tree.path)), processes, timeout)
+        runner = RevisionRunner(
+            repository, tree, tuple(given.arguments(tree.path)), processes, timeout
+        )
         try:
-            search = Search(
+            search = BisectSearch(
                 runner,
                 *ends,
                 check,
@@ -146,12 +148,12 @@ def bisect(
         return _report(found, runner, output, as_json=as_json)
 
 
-def _check(expression: str | None, shell: str | None, processes: Processes) -> Check | None:
-    from rsltrace.search.bisect.runs import check_of, command
+def _check(expression: str | None, shell: str | None, processes: Processes) -> RevisionCheck | None:
+    from rsltrace.search.bisect.runs import command_check, expression_check
 
     if expression is not None:
-        return check_of(expression)
-    return None if shell is None else command(shell, processes)
+        return expression_check(expression)
+    return None if shell is None else command_check(shell, processes)
 
 
 def _named(given: JobArguments) -> list[Path]:
@@ -171,8 +173,8 @@ def _check_free(folder: Path) -> None:
             raise OutputError(f"{folder / name} exists; use --force to replace it")
 
 
-def _check_ends(repository: Repository, good: Any, bad: Any) -> None:
-    """Check the two ends of the search.
+def _check_ends(repository: GitRepository, good: Any, bad: Any) -> None:
+    """RevisionCheck the two ends of the search.
 
     :raises BisectError: they are the same commit, or in the wrong order.
     """
@@ -190,7 +192,7 @@ def _job_here(given: JobArguments) -> Job | None:
         return None
 
 
-def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> Iterator[Path]:
+def _untracked(repository: GitRepository, job: Job | None, files: list[Path]) -> Iterator[Path]:
     """Yield untracked files of the checkout that the job names, to share with all revisions."""
     candidates = list(files)
     if job is not None:
@@ -202,18 +204,18 @@ def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> It
             yield path
 
 
-def _same_everywhere(repository: Repository, job: Job) -> Iterator[str]:
+def _same_everywhere(repository: GitRepository, job: Job) -> Iterator[str]:
     """Yield notes on code that is the same at every revision because of where it is loaded from."""
-    from rsltrace.replay.code import code_of, file_of
+    from rsltrace.replay.code import job_code_files, module_file
     from rsltrace.search.bisect.runs import python_folders
 
     relative = [path for path in job.search_path if not os.path.isabs(path)]
     folders = [*map(str, python_folders(repository)), *(str(job.resolve(p)) for p in relative)]
-    found = [(one.name, one.file) for one in code_of(job, {}) if one.file is not None]
+    found = [(one.name, one.file) for one in job_code_files(job, {}) if one.file is not None]
     for name, file in found:
         is_ours = file.resolve().is_relative_to(repository.top)
         is_module = all(part.isidentifier() for part in name.split("."))
-        if is_ours and is_module and file_of(name, folders, installed=False) is None:
+        if is_ours and is_module and module_file(name, folders, installed=False) is None:
             yield (
                 f"{name} is loaded from {file} at every revision: add its folder, relative to the "
                 "job, to search_path"
@@ -237,7 +239,9 @@ def _texts(value: Any) -> Iterator[str]:
             yield from _texts(one)
 
 
-def _report(found: Found, runner: Runner, output: Path | None, *, as_json: bool) -> int:
+def _report(
+    found: BisectResult, runner: RevisionRunner, output: Path | None, *, as_json: bool
+) -> int:
     """Print the result, keep the traces if wanted, and return the exit status."""
     from rsltrace.cli.output.search_text import as_text, as_values
 

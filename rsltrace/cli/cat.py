@@ -20,7 +20,7 @@ from rsltrace.errors import TraceError, did_you_mean
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import EventKind, EventRecord, Output, OutputKind
 from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.reader import Trace
@@ -57,7 +57,7 @@ class EventLines:
         self._node_width = min(max(names.longest_node, 1), _COLUMN_MAX)
         self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
 
-    def line(self, event: Event, outputs: list[Output]) -> str:
+    def line(self, event: EventRecord, outputs: list[Output]) -> str:
         """Return the line of an event, then a line for each finding of the guard in it."""
         node = self._words.node(event, outputs) or "-"
         name = self._words.names.name(event.entity) or "-"
@@ -205,7 +205,7 @@ def cat(
             write(form(event, outputs))
 
 
-def _json_form(trace: Trace, payloads: bool) -> Callable[[Event, list[Output]], str]:
+def _json_form(trace: Trace, payloads: bool) -> Callable[[EventRecord, list[Output]], str]:
     make = EventJson(trace, payloads=payloads).object
     return lambda event, outputs: json.dumps(make(event, outputs), allow_nan=False)
 
@@ -279,7 +279,7 @@ def _named(
 
 def _events(
     trace: Trace, choice: _EventFilter, where: TraceCondition | None
-) -> Iterator[tuple[Event, list[Output]]]:
+) -> Iterator[tuple[EventRecord, list[Output]]]:
     """Yield the chosen events with their outputs; memory is that of one segment."""
     segments = trace.segments
     for segment in segments:

@@ -19,8 +19,8 @@ from rsltrace.trace.words.phrases import table
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.run.checking import Checked
-    from rsltrace.simulation.middleware.overview import Link
+    from rsltrace.run.checking import CheckedJob
+    from rsltrace.simulation.middleware.overview import GraphLink
 
 
 @click.command(cls=RosArgsCommand)
@@ -77,7 +77,7 @@ def check(
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
     from rsltrace.conditions.message_fields import loaded_fields
-    from rsltrace.conditions.names import Names
+    from rsltrace.conditions.names import RunNames
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 
@@ -97,7 +97,7 @@ def check(
     try:
         checked = check_job(loaded, everything=everything)
         shown = (*checked.overview.of_kind("topic"), *checked.overview.of_kind("service"))
-        names = Names(
+        names = RunNames(
             nodes=tuple(node.name for node in checked.overview.nodes),
             topics=tuple(dict.fromkeys([*(link.name for link in shown), *checked.interfaces])),
             are_all=True,
@@ -149,14 +149,14 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
     return 1 if checked.violated else 0
 
 
-def _draw(checked: Checked, path: Path) -> None:
+def _draw(checked: CheckedJob, path: Path) -> None:
     from rsltrace.cli.output.graph_svg import graph_svg
 
     picture = graph_svg(checked.overview)
     write_text(path, picture)
 
 
-def _values(job: Job, checked: Checked) -> dict[str, Any]:
+def _values(job: Job, checked: CheckedJob) -> dict[str, Any]:
     return {
         "job": job.resolved(),
         "start_ns": checked.start_ns,
@@ -166,7 +166,7 @@ def _values(job: Job, checked: Checked) -> dict[str, Any]:
     }
 
 
-def _text(job: Job, checked: Checked) -> list[str]:
+def _text(job: Job, checked: CheckedJob) -> list[str]:
     found = checked.overview
     lines = ["job:", *(f"  {line}" for line in job.to_yaml().splitlines()), ""]
     lines += [f"starts at simulated time {format_seconds(checked.start_ns)} s", ""]
@@ -193,7 +193,7 @@ def _text(job: Job, checked: Checked) -> list[str]:
     return lines
 
 
-def _row(link: Link) -> list[str]:
+def _row(link: GraphLink) -> list[str]:
     senders, receivers = (
         ", ".join(dict.fromkeys(end.node for end in ends)) or "nobody"
         for ends in (link.senders, link.receivers)

@@ -71,9 +71,9 @@ def debug(
     """
     from rsltrace.conditions.names import names_of
     from rsltrace.debug.client import DebugSession
-    from rsltrace.debug.prompt.shell import Shell
+    from rsltrace.debug.prompt.shell import DebugPrompt
     from rsltrace.diff.file_kind import is_trace
-    from rsltrace.replay.preparation import prepared
+    from rsltrace.replay.preparation import prepare_replay
 
     if overrides and is_trace(source):
         raise click.UsageError("--set is for a JOB: a trace holds the job that was run")
@@ -82,7 +82,7 @@ def debug(
     with ExitStack() as stack:
         names, told = None, set()
         if is_trace(source):
-            plan = stack.enter_context(prepared(source, job_folder))
+            plan = stack.enter_context(prepare_replay(source, job_folder))
             for line in code_lines(plan, "debugging"):
                 tell(line)
             agree(plan, trust=trust)
@@ -102,7 +102,7 @@ def debug(
         )
         for note in (note for note in session.notes if note not in told):
             tell(f"note: {note}")
-        return Shell(session, commands, names).run()
+        return DebugPrompt(session, commands, names).run()
 
 
 def _on_notice(notice: Mapping[str, Any]) -> None:

@@ -25,8 +25,8 @@ from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.search.explore.search import Budget, Pool, Search
-    from rsltrace.search.explore.small.causes import SmallRun
+    from rsltrace.search.explore.search import Explorer, SearchBudget, TrialPool
+    from rsltrace.search.explore.small.causes import ReducedFailure
     from rsltrace.search.explore.trial import JobSource, TrialResult
 
 STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
@@ -34,16 +34,16 @@ _FORMAT = 1
 _INTERRUPTED = 130
 
 
-def _budget(context: click.Context, option: click.Parameter, text: str) -> Budget:
+def _budget(context: click.Context, option: click.Parameter, text: str) -> SearchBudget:
     """Read ``1000`` (trials) or ``10min`` (of real time)."""
     from rsltrace.job.values.times import parse_time
-    from rsltrace.search.explore.search import Budget
+    from rsltrace.search.explore.search import SearchBudget
     from rsltrace.trace.model.texts import NS_PER_S
 
     if re.fullmatch(r"\d+", text.strip()):
         if int(text) == 0:
             raise click.BadParameter("the budget must be greater than 0")
-        return Budget(trials=int(text))
+        return SearchBudget(trials=int(text))
     try:
         seconds = parse_time(text) / NS_PER_S
     except ValueError:
@@ -52,7 +52,7 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
         ) from None
     if seconds == 0:
         raise click.BadParameter("the budget must be greater than 0")
-    return Budget(seconds=seconds)
+    return SearchBudget(seconds=seconds)
 
 
 def _fork_after(
@@ -160,7 +160,7 @@ def explore(
     skip: bool,
     overrides: tuple[str, ...],
     strategy: str,
-    budget: Budget,
+    budget: SearchBudget,
     stop_at_first: bool,
     resume: bool,
     force: bool,
@@ -187,9 +187,9 @@ def explore(
     """
     from rsltrace.checks.evaluate import check_texts
     from rsltrace.checks.metrics import check_metrics
-    from rsltrace.search.explore.search import Search
+    from rsltrace.search.explore.search import Explorer
     from rsltrace.search.explore.strategies.named import strategy_named
-    from rsltrace.search.explore.table import Table
+    from rsltrace.search.explore.table import ResultsFolder
     from rsltrace.search.explore.trial import JobSource
     from rsltrace.search.explore.vary import check_vary
 
@@ -209,9 +209,9 @@ def explore(
     about = _about(source, job, strategy, seed, depth)
     if fork_after is not None:
         about["fork after"] = fork_after[1]
-    with handling_signals(), Table(folder, about, resume=resume, force=force) as table:
+    with handling_signals(), ResultsFolder(folder, about, resume=resume, force=force) as table:
         chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
-        search = Search(
+        search = Explorer(
             job,
             chosen,
             table,
@@ -243,7 +243,7 @@ def explore(
 
 def _pool(
     source: JobSource, job: Job, jobs: int | None, cluster: str | None
-) -> AbstractContextManager[Pool]:
+) -> AbstractContextManager[TrialPool]:
     """Return the workers of the search: processes on this machine, or a cluster."""
     from rsltrace.search.explore.workers import Workers, default_jobs
 
@@ -279,7 +279,7 @@ def _about(
 
 @contextmanager
 def _telling(
-    search: Search, budget: Budget, *, quiet: bool
+    search: Explorer, budget: SearchBudget, *, quiet: bool
 ) -> Iterator[Callable[[TrialResult], None]]:
     """Show the progress of a search on stderr, and new causes of failures."""
     from rsltrace.cli.output.search_progress import search_line
@@ -304,24 +304,24 @@ class _SearchReport:
     """The report of a search: what is printed, and the page in its folder."""
 
     def __init__(
-        self, search: Search, source: JobSource, folder: Path, strategy: str, form: str
+        self, search: Explorer, source: JobSource, folder: Path, strategy: str, form: str
     ) -> None:
         self._search = search
         self._source = source
         self._folder = folder
         self._strategy = strategy
         self._form = form
-        self._small: dict[str, SmallRun] = {}
+        self._small: dict[str, ReducedFailure] = {}
 
     def make_small(self, job: Job, timeout_s: float | None, *, quiet: bool) -> None:
         """Minimize one run of each cause."""
-        from rsltrace.search.explore.small.causes import make_small
+        from rsltrace.search.explore.small.causes import reduce_failures
 
         def on_begin(cause: str) -> None:
             if not quiet:
                 tell(f"minimizing: {cause}")
 
-        self._small = make_small(
+        self._small = reduce_failures(
             self._source,
             self._search.tally.first,
             self._folder,
@@ -342,7 +342,7 @@ class _SearchReport:
     def report(self, job: Job) -> None:
         """Write the page and the table, and print the result."""
         from rsltrace.cli.output.search_text import search_lines
-        from rsltrace.search.explore.report.exploration import Exploration, Reduced
+        from rsltrace.search.explore.report.exploration import Exploration, ReducedRun
         from rsltrace.search.explore.report.formats import (
             github_text,
             json_text,
@@ -350,18 +350,18 @@ class _SearchReport:
             write_parquet,
         )
         from rsltrace.search.explore.report.page import write_page
-        from rsltrace.search.explore.table import PAGE, PARQUET, rows
+        from rsltrace.search.explore.table import PAGE, PARQUET, result_rows
 
         source, search = self._source, self._search
         explored = Exploration(
             source.path,
-            list(rows(self._folder)),
+            list(result_rows(self._folder)),
             strategy=self._strategy,
             arguments=[word for _, text in source.overrides for word in ("--set", text)],
             coverage=search.strategy.coverage(),
             wall_s=time.monotonic() - search.began_s,
             reduced={
-                cause: Reduced(str(one.folder), one.decides)
+                cause: ReducedRun(str(one.folder), one.decides)
                 for cause, one in self._small.items()
                 if not one.trouble
             },

@@ -92,8 +92,8 @@ def fit(
     quantiles, their ratio with a 95 % confidence interval, and a two-sample test. The same
     comparison of the two native runs shows how much the robot itself varies.
     """
-    from rsltrace.native.fit.comparison import check
-    from rsltrace.native.fit.measured import measured
+    from rsltrace.native.fit.comparison import check_latencies
+    from rsltrace.native.fit.measured import measure_times
     from rsltrace.native.fit.parts import fit as fitted_to
     from rsltrace.native.fit.parts import notes
 
@@ -109,7 +109,7 @@ def fit(
     with ExitStack() as stack:
         first = stack.enter_context(Trace.open(trace))
         wanted = None if second is None else _chains(stack.enter_context(Trace.open(second)))
-        found = fitted_to(measured(first), how)
+        found = fitted_to(measure_times(first), how)
         path = _job_file(first, job_file)
         job = _load(path)
         settings, more = _settings(first, path)
@@ -124,7 +124,7 @@ def fit(
         if wanted is not None:
             assert output is not None
             with _simulated(output, simulated, force=force) as made:
-                checked = check(first, wanted, made)
+                checked = check_latencies(first, wanted, made)
         if as_values:
             say(json.dumps(as_json(found, said, checked), indent=2))
             return

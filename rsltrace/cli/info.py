@@ -13,17 +13,17 @@ import click
 
 from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
-from rsltrace.trace.contents import Counts, count
+from rsltrace.trace.contents import TraceCounts, count_trace
 from rsltrace.trace.format import (
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
     METADATA_GUARD,
     METADATA_NATIVE,
 )
-from rsltrace.trace.model.drop import drops_of
+from rsltrace.trace.model.drop import decode_drops
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.finding import waits_of
+from rsltrace.trace.model.finding import decode_waits
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import (
     NS_PER_S,
@@ -32,7 +32,7 @@ from rsltrace.trace.model.texts import (
     format_seconds,
     printable,
 )
-from rsltrace.trace.native import Spread, busy_threads, callback_figures, is_native
+from rsltrace.trace.native import DurationStatistics, busy_threads, callback_figures, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.kinds import kind_label
@@ -116,7 +116,7 @@ def native_json(trace: Trace) -> dict[str, Any]:
     }
 
 
-def _text(found: Spread | None) -> str:
+def _text(found: DurationStatistics | None) -> str:
     if found is None:
         return "-"
     return " ".join(
@@ -154,14 +154,14 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
             with working(f"checking {opened.name}"):
                 opened.check()
                 check_contents(opened)
-        counts = count(opened)
+        counts = count_trace(opened)
         if as_json:
             say(json.dumps(_as_json(opened, counts), indent=2))
         else:
             say("\n".join(_as_text(opened, counts, show_all=show_all)))
 
 
-def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
+def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
     start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
     time = ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})")
     native = is_native(trace)
@@ -215,10 +215,10 @@ def _state(trace: Trace) -> str:
 
 def _waits(trace: Trace) -> list[str]:
     """Return the calls that were still waiting at the end."""
-    return [f"since {format_seconds(w.since_ns)} s: {w.text}" for w in waits_of(trace.result)]
+    return [f"since {format_seconds(w.since_ns)} s: {w.text}" for w in decode_waits(trace.result)]
 
 
-def _node_lines(trace: Trace, counts: Counts) -> list[str]:
+def _node_lines(trace: Trace, counts: TraceCounts) -> list[str]:
     nodes = _nodes(trace)
     rows = [("  node", "entities", "events", "outputs")]
     for node in nodes:
@@ -248,7 +248,7 @@ def _guard_lines(trace: Trace) -> list[str]:
 def _drop_lines(trace: Trace) -> list[str]:
     """Return the messages that full queues dropped."""
     rows = [("  dropped", "depth", "node", "kind", "name", "queue")]
-    for drop in drops_of(trace.result):
+    for drop in decode_drops(trace.result):
         entity = trace.entities.get(drop.entity)
         if entity is None:
             continue
@@ -258,7 +258,7 @@ def _drop_lines(trace: Trace) -> list[str]:
     return ["", "full queues", *table(rows, right=frozenset((0, 1)))] if rows[1:] else []
 
 
-def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
+def _entity_lines(trace: Trace, counts: TraceCounts, show_all: bool) -> list[str]:
     entities = _entities(trace, counts)
     shown = [e for e in entities if show_all or not _idle_built_in(e, counts)]
     title = f"entities: {len(entities)}"
@@ -286,7 +286,7 @@ def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
     return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]
 
 
-def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
+def _as_json(trace: Trace, counts: TraceCounts) -> dict[str, Any]:
     return {
         "trace": trace.name,
         "size_bytes": trace.size,
@@ -316,7 +316,7 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
             }
             for met in trace.guarded
         ],
-        "drops": [asdict(drop) for drop in drops_of(trace.result)],
+        "drops": [asdict(drop) for drop in decode_drops(trace.result)],
         "nodes": [node.name for node in _nodes(trace)],
         "entities": [
             {
@@ -349,7 +349,7 @@ def _nodes(trace: Trace) -> list[Entity]:
     return [e for e in trace.entities.values() if e.kind is EntityKind.NODE]
 
 
-def _entities(trace: Trace, counts: Counts) -> list[Entity]:
+def _entities(trace: Trace, counts: TraceCounts) -> list[Entity]:
     """Return all entities; the run itself only if it had events."""
     return [
         entity
@@ -358,7 +358,7 @@ def _entities(trace: Trace, counts: Counts) -> list[Entity]:
     ]
 
 
-def _idle_built_in(entity: Entity, counts: Counts) -> bool:
+def _idle_built_in(entity: Entity, counts: TraceCounts) -> bool:
     """Whether ``entity`` is one that rclpy creates in every node, and was not used."""
     if _count(counts.events, entity.id) or _count(counts.outputs, entity.id):
         return False

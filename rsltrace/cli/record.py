@@ -20,9 +20,9 @@ from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.finding import READ_BY, Source
+from rsltrace.trace.model.finding import READ_BY, NondeterminismSource
 from rsltrace.trace.model.texts import printable
-from rsltrace.trace.words.logs import silent_topics, without_server
+from rsltrace.trace.words.logs import missing_servers, silent_topics
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
@@ -132,10 +132,10 @@ def record(
     Exit status: that of the job's stop condition (default 0); 1 if a check of the job fails; 3 if a
     node raised an exception; 130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
-    from rsltrace.run.process import end_with_run
+    from rsltrace.run.process import skip_final_collection
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
-        end_with_run()
+        skip_final_collection()
     _check_options(native, executor, domain, policy, replay, seed, processes=processes)
     changes = all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
@@ -236,7 +236,7 @@ def _recorded(
     samples_states: bool,
 ) -> RunResult:
     """Run a job; notes are shown, and added to ``told``. ``shows``: progress, too."""
-    from rsltrace.run import Observer, run
+    from rsltrace.run import RunCallbacks, run
 
     def note(text: str) -> None:
         told.append(text)
@@ -256,7 +256,7 @@ def _recorded(
             path,
             force=force,
             echo=echo,
-            observer=Observer(on_progress, begins, note, samples_states=samples_states),
+            observer=RunCallbacks(on_progress, begins, note, samples_states=samples_states),
             replay=replay,
         )
 
@@ -320,9 +320,9 @@ def _say_if_it_has_no_end(job: Job) -> None:
 
 
 def _print_job(job: Job) -> None:
-    from rsltrace.run.inputs import without_launch_files
+    from rsltrace.run.inputs import expand_launch_files
 
-    expanded = without_launch_files(job)
+    expanded = expand_launch_files(job)
     for note in expanded.notes:
         _note(note)
     say(expanded.job.to_yaml(), end="")
@@ -349,7 +349,7 @@ def _silent_topics(result: RunResult) -> list[str]:
     try:
         with Trace.open(result.path) as trace:
             entities = trace.entities.values()
-            found = [silent_topics(entities), without_server(entities)]
+            found = [silent_topics(entities), missing_servers(entities)]
     except RsltraceError:
         return []  # the trace is gone
     return [f"{text}; rsltrace check shows the graph" for text in found if text]
@@ -426,7 +426,10 @@ def _warn(result: RunResult) -> None:
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
         times = f", {count} times" if count > 1 else ""
         tell(f"  {source}: {printable(call)}{times}")
-    if any(met.source is Source.ADDRESS for met in found) and not has_fixed_addresses():
+    if (
+        any(met.source is NondeterminismSource.ADDRESS for met in found)
+        and not has_fixed_addresses()
+    ):
         tell("  memory addresses differ in every process on this machine")
     if len(calls) > _SHOWN_MAX:
         tell(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}")

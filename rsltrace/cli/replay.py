@@ -29,7 +29,7 @@ from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.replay.edits import Edit
-    from rsltrace.replay.preparation import Preparation
+    from rsltrace.replay.preparation import ReplayPlan
     from rsltrace.replay.result import ReplayResult
 
 _SHOWN_MAX = 12
@@ -141,7 +141,7 @@ def replay(
     """
     from rsltrace.replay.edits import check_edits, parse_edit
     from rsltrace.replay.one_node.ways import is_job
-    from rsltrace.replay.preparation import count_to, prepared
+    from rsltrace.replay.preparation import event_count_to, prepare_replay
 
     ways = NodeReplayOptions(
         node=node or "",
@@ -158,12 +158,12 @@ def replay(
     changes = [parse_edit(text) for text in edits]
     if bags and is_job(trace):
         return replay_from_job(trace, ways, no_pin=no_pin)
-    with prepared(trace, job_folder, bags=node is None) as plan:
+    with prepare_replay(trace, job_folder, bags=node is None) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
-        count = None if until is None else count_to(plan.trace, until)
+        count = None if until is None else event_count_to(plan.trace, until)
         check_edits(changes, plan.trace)
-        begin = 0 if first is None else count_to(plan.trace, first) - 1
+        begin = 0 if first is None else event_count_to(plan.trace, first) - 1
         if not as_json:
             for line in code_lines(plan, "replaying", node):
                 tell(line)
@@ -185,7 +185,7 @@ def replay(
     return status
 
 
-def agree(plan: Preparation, *, trust: bool) -> None:
+def agree(plan: ReplayPlan, *, trust: bool) -> None:
     """Ask the user to run the code that a trace names, unless it is trusted.
 
     :raises ReplayError: the user does not agree.
@@ -205,7 +205,7 @@ def agree(plan: Preparation, *, trust: bool) -> None:
 
 
 def _replayed(
-    plan: Preparation,
+    plan: ReplayPlan,
     until: int | None,
     first: int,
     edits: Sequence[Edit],
@@ -215,7 +215,7 @@ def _replayed(
     quiet: bool,
 ) -> ReplayResult:
     from rsltrace.replay.replaying import replay_prepared
-    from rsltrace.run import Observer
+    from rsltrace.run import RunCallbacks
 
     with interruptible() as on_interrupt, progress(quiet=quiet, what="replaying") as show:
         return replay_prepared(
@@ -225,7 +225,7 @@ def _replayed(
             output=output,
             force=force,
             echo=not quiet,
-            observer=Observer(progress=_from(first, show), interrupt=on_interrupt),
+            observer=RunCallbacks(progress=_from(first, show), interrupt=on_interrupt),
             edits=edits,
         )
 
@@ -248,7 +248,7 @@ def _from(first: int, show: _Show | None) -> _Show | None:
 # -- output --------------------------------------------------------------------------------------
 
 
-def code_lines(plan: Preparation, doing: str, node: str | None = None) -> Iterator[str]:
+def code_lines(plan: ReplayPlan, doing: str, node: str | None = None) -> Iterator[str]:
     """Yield which code will run, from where, and what has changed since the recording."""
     trace = plan.trace
     job = trace.job.get("name", "") or "a job"
@@ -310,7 +310,7 @@ def _next(result: ReplayResult) -> str:
     return printable(f"{shlex.join(again)}; {shlex.join(view)}")
 
 
-def _values(result: ReplayResult, plan: Preparation) -> dict[str, Any]:
+def _values(result: ReplayResult, plan: ReplayPlan) -> dict[str, Any]:
     difference = None
     if result.diff is not None:
         from rsltrace.diff.report import render

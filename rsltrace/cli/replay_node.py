@@ -19,8 +19,8 @@ from rsltrace.terminal import say, tell
 if TYPE_CHECKING:
     from rsltrace.errors import RunError
     from rsltrace.replay.one_node.result import NodeReplayResult
-    from rsltrace.replay.preparation import Preparation
-    from rsltrace.run import Observer
+    from rsltrace.replay.preparation import ReplayPlan
+    from rsltrace.run import RunCallbacks
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +55,12 @@ class NodeReplayOptions:
             raise click.UsageError("--until-diverged has no effect with --bag")
 
 
-def replay_one(plan: Preparation, ways: NodeReplayOptions) -> int:
+def replay_one(plan: ReplayPlan, ways: NodeReplayOptions) -> int:
     """Replay one node of a trace, and print the result."""
     from rsltrace.replay.one_node.from_bag import replay_from_bag
     from rsltrace.replay.one_node.replaying import replay_node
 
-    def go(echo: bool, observer: Observer) -> NodeReplayResult:
+    def go(echo: bool, observer: RunCallbacks) -> NodeReplayResult:
         if ways.bags:
             return replay_from_bag(
                 plan.job,
@@ -95,7 +95,7 @@ def replay_from_job(path: Path, ways: NodeReplayOptions, *, no_pin: bool) -> int
     if no_pin or not job.guard.pins:
         unpin()
 
-    def go(echo: bool, observer: Observer) -> NodeReplayResult:
+    def go(echo: bool, observer: RunCallbacks) -> NodeReplayResult:
         return replay_from_bag(
             job,
             ways.node,
@@ -110,13 +110,13 @@ def replay_from_job(path: Path, ways: NodeReplayOptions, *, no_pin: bool) -> int
     return _shown(go, ways)
 
 
-def _shown(go: Callable[[bool, Observer], NodeReplayResult], ways: NodeReplayOptions) -> int:
+def _shown(go: Callable[[bool, RunCallbacks], NodeReplayResult], ways: NodeReplayOptions) -> int:
     from rsltrace.replay.one_node import report
-    from rsltrace.run import Observer
+    from rsltrace.run import RunCallbacks
 
     silent = ways.quiet or ways.as_json
     with interruptible() as on_interrupt, progress(quiet=silent, what="replaying") as show:
-        result = go(not silent, Observer(progress=show, interrupt=on_interrupt))
+        result = go(not silent, RunCallbacks(progress=show, interrupt=on_interrupt))
     reopen_standard_streams()
     try:
         if ways.as_json:

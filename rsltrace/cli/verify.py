@@ -23,8 +23,8 @@ from rsltrace.search.perturb import KINDS
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.search.perturb import Recorded, Surroundings
-    from rsltrace.search.verify import Verified
+    from rsltrace.search.perturb import Perturbation, PerturbedRun
+    from rsltrace.search.verify import VerifyResult
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,14 +160,14 @@ def _verify(
     *,
     as_json: bool,
 ) -> int:
-    from rsltrace.search.verify import Verification
+    from rsltrace.search.verify import DeterminismTest
 
-    def on_run(recorded: Recorded) -> None:
+    def on_run(recorded: PerturbedRun) -> None:
         if sys.stderr.isatty():
-            around = recorded.surroundings
+            around = recorded.perturbation
             tell(f"run {around.number}: digest {recorded.digest or '-'}")
 
-    series = Verification(
+    series = DeterminismTest(
         given.arguments(os.path.abspath),
         folder,
         workers=jobs,
@@ -184,7 +184,7 @@ def _verify(
             shutil.move(trace, keep / trace.name)
     from rsltrace.cli.output.verify_text import as_text, as_values
 
-    again = [_again(given, perturbations, one.surroundings) for one in _two(result)]
+    again = [_again(given, perturbations, one.perturbation) for one in _two(result)]
     if as_json:
         say(as_values(result, place, again, kept=keep is not None))
     else:
@@ -194,12 +194,12 @@ def _verify(
     return 0 if result.agrees else 1
 
 
-def _two(result: Verified) -> list[Recorded]:
+def _two(result: VerifyResult) -> list[PerturbedRun]:
     second = result.trouble or result.other
     return [result.first] if second is None or second is result.first else [result.first, second]
 
 
-def _again(given: JobArguments, perturbations: int, around: Surroundings) -> str:
+def _again(given: JobArguments, perturbations: int, around: Perturbation) -> str:
     """Return the command that repeats one run."""
     words = ["rsltrace", "verify", *given.arguments()]
     if perturbations:
@@ -215,16 +215,16 @@ def _one_run(
     only: str | None,
     output: Path | None,
 ) -> int:
-    from rsltrace.search.perturb import record_in, surroundings
+    from rsltrace.search.perturb import perturbation, record_perturbed
 
-    around = surroundings(number, perturbations)
+    around = perturbation(number, perturbations)
     if only is not None:
         if only not in around.values:
             raise click.UsageError(f"run {number} does not perturb the {only}")
         around = around.only(only)
     path = (output or Path(f"run-{number}.mcap")).absolute()
     tell(f"run {number}: {around}")
-    done = record_in(around, given.arguments(os.path.abspath), folder, path=path)
+    done = record_perturbed(around, given.arguments(os.path.abspath), folder, path=path)
     tell(done.errors, end="")
     if not done.digest:
         raise RsltraceError(f"run {number}: {done.failure}")

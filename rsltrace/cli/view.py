@@ -190,9 +190,9 @@ def _opened(
 
     from rsltrace.cli.replay import agree
     from rsltrace.debug.client import DebugSession
-    from rsltrace.replay.preparation import prepared
+    from rsltrace.replay.preparation import prepare_replay
 
-    with prepared(traces[0], job_folder) as plan:
+    with prepare_replay(traces[0], job_folder) as plan:
         agree(plan, trust=trust)
     run = Run.open(traces[0])
     stack.callback(run.close)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.conditions.condition import Armed, error_text, shown
+from rsltrace.conditions.condition import ActiveCondition, error_text, shown
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.job.values.times import TimeInRun
@@ -14,7 +14,7 @@ from rsltrace.trace.model.texts import format_seconds
 _NOT_THERE = "(not there)"
 
 
-class TimeCondition(Armed):
+class TimeCondition(ActiveCondition):
     """Before the first event at a time of the run or after it."""
 
     def __init__(self, time: TimeInRun, moment: PausedRun) -> None:
@@ -29,7 +29,7 @@ class TimeCondition(Armed):
         return f"{format_seconds(view.stamp_ns)} s"
 
 
-class WatchCondition(Armed):
+class WatchCondition(ActiveCondition):
     """After an event in which the value of an expression has changed.
 
     A value is known by its hash: two equal lists are the same, however they were made.
@@ -65,7 +65,7 @@ class WatchCondition(Armed):
         return found, shown(value)
 
 
-class WhenCondition(Armed):
+class WhenCondition(ActiveCondition):
     """After the event with which an expression becomes true."""
 
     def __init__(self, expression: Expression, moment: PausedRun) -> None:

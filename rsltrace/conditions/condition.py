@@ -16,7 +16,7 @@ _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
 _SHOWN_MAX = 120
 
 
-class Armed:
+class ActiveCondition:
     """A condition that counts, in a run that is somewhere.
 
     ``note`` says why it could not be evaluated so far, if that is so: it may be mistyped.
@@ -40,7 +40,7 @@ class Armed:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class EventCondition:
     """Where to stop.
 
     ``before`` and ``after`` say whether it wants to see events that are about to run, and those
@@ -52,7 +52,7 @@ class Condition:
     before: bool
     after: bool
     reads: frozenset[str]
-    arm: Callable[[PausedRun], Armed] = field(repr=False)
+    arm: Callable[[PausedRun], ActiveCondition] = field(repr=False)
 
 
 def is_true(

@@ -90,7 +90,7 @@ class Vocabulary(Protocol):
         """Return what is wrong with a name that nobody knows."""
 
 
-class Refused(Exception):
+class UnsupportedExpression(Exception):
     """A part of an expression is not of the language."""
 
     def __init__(self, node: ast.AST, message: str) -> None:
@@ -132,7 +132,7 @@ def parsed(text: str, whole: str, begin: int) -> ast.expr:
     return tree
 
 
-class Places:
+class TextPositions:
     """Where parts of an expression stand in its text: ``ast`` counts bytes of lines."""
 
     def __init__(self, text: str) -> None:
@@ -197,17 +197,19 @@ class _ExpressionCompiler:
         make = self._parts.get(type(node))
         if make is None:
             what = _WORDS.get(type(node), type(node).__name__)
-            raise Refused(node, f"{what} has no place in an expression, which has {LANGUAGE}")
+            raise UnsupportedExpression(
+                node, f"{what} has no place in an expression, which has {LANGUAGE}"
+            )
         return make(node, own, depth)
 
     def _constant(self, node: ast.Constant, own: Mapping[str, str], depth: int) -> Evaluate:
         value = node.value
         if not isinstance(value, (int, float, str, bytes, type(None))):
-            raise Refused(node, f"{ast.unparse(node)} has no place in an expression")
+            raise UnsupportedExpression(node, f"{ast.unparse(node)} has no place in an expression")
         try:
             within_limits(value)
         except LimitError as error:
-            raise Refused(node, str(error)) from None
+            raise UnsupportedExpression(node, str(error)) from None
         return _Constant(value)
 
     def _name(self, node: ast.Name, own: Mapping[str, str], depth: int) -> Evaluate:
@@ -220,18 +222,18 @@ class _ExpressionCompiler:
         if node.id in CONSTANTS:
             return _Constant(CONSTANTS[node.id])
         if node.id in FUNCTIONS or node.id in OF_MODULES:
-            raise Refused(node, f"{node.id} is a function here: {node.id}(...)")
-        raise Refused(node, self._vocabulary.unknown(node.id))
+            raise UnsupportedExpression(node, f"{node.id} is a function here: {node.id}(...)")
+        raise UnsupportedExpression(node, self._vocabulary.unknown(node.id))
 
     def _attribute(self, node: ast.Attribute, own: Mapping[str, str], depth: int) -> Evaluate:
         module = self._module(node.value, own)
         if module is not None:
             if node.attr in CONSTANTS:
                 return _Constant(CONSTANTS[node.attr])
-            raise Refused(node, _no_function(f"{module}.{node.attr}"))
+            raise UnsupportedExpression(node, _no_function(f"{module}.{node.attr}"))
         name = node.attr
         if name.startswith("__"):
-            raise Refused(node, f"{name!r} is no field of a message")
+            raise UnsupportedExpression(node, f"{name!r} is no field of a message")
         inner = self.part(node.value, own, depth)
         return lambda scope: field(inner(scope), name)
 
@@ -328,13 +330,15 @@ class _ExpressionCompiler:
     def _binary(self, node: ast.BinOp, own: Mapping[str, str], depth: int) -> Evaluate:
         operate = BINARY.get(type(node.op))
         if operate is None:
-            raise Refused(node, f"@ has no place in an expression, which has {LANGUAGE}: dot(a, b)")
+            raise UnsupportedExpression(
+                node, f"@ has no place in an expression, which has {LANGUAGE}: dot(a, b)"
+            )
         left, right = self.part(node.left, own, depth), self.part(node.right, own, depth)
         if isinstance(left, _Constant) and isinstance(right, _Constant):
             try:
                 return _Constant(operate(self._budget, left.value, right.value))
             except LimitError as error:
-                raise Refused(node, str(error)) from None
+                raise UnsupportedExpression(node, str(error)) from None
             except Exception:
                 pass  # it is said where it is evaluated
         usual = USUAL.get(type(node.op))
@@ -371,7 +375,9 @@ class _ExpressionCompiler:
         if isinstance(node.func, ast.Name) and node.func.id not in own:
             found = self._vocabulary.call(node.func.id, node.args)
             if isinstance(found, str) or (found is not None and node.keywords):
-                raise Refused(node, found if isinstance(found, str) else "it takes no keywords")
+                raise UnsupportedExpression(
+                    node, found if isinstance(found, str) else "it takes no keywords"
+                )
             if found is not None:
                 return found
         function, values = self._function(node, own, depth)
@@ -380,12 +386,14 @@ class _ExpressionCompiler:
         for option in node.keywords:
             if option.arg not in _OPTIONS:
                 words = ", ".join(_OPTIONS)
-                raise Refused(option.value, f"functions here take no {option.arg}=, only {words}")
+                raise UnsupportedExpression(
+                    option.value, f"functions here take no {option.arg}=, only {words}"
+                )
             options[option.arg] = self.part(option.value, own, depth)
         try:
             inspect.signature(function).bind(None, *values, **options)
         except TypeError as error:
-            raise Refused(node, f"{ast.unparse(node.func)}: {error}") from None
+            raise UnsupportedExpression(node, f"{ast.unparse(node.func)}: {error}") from None
         if options:
 
             def called_with(scope: ExpressionContext) -> Any:
@@ -423,23 +431,23 @@ class _ExpressionCompiler:
         named = node.func
         for one in (*node.args, *(option.value for option in node.keywords)):
             if isinstance(one, ast.Starred):
-                raise Refused(one, "a function takes plain arguments here")
+                raise UnsupportedExpression(one, "a function takes plain arguments here")
         if isinstance(named, ast.Name):
             if named.id in FUNCTIONS and named.id not in own:
                 return FUNCTIONS[named.id], []
             own_functions = self._vocabulary.functions()
-            raise Refused(node, _no_function(named.id, own_functions))
+            raise UnsupportedExpression(node, _no_function(named.id, own_functions))
         if isinstance(named, ast.Attribute):
             module = self._module(named.value, own)
             if module is not None:
                 outer, _, inner = f"{module}.{named.attr}".partition(".")
                 if inner not in OF_MODULES[outer]:
-                    raise Refused(node, _no_function(f"{outer}.{inner}"))
+                    raise UnsupportedExpression(node, _no_function(f"{outer}.{inner}"))
                 return OF_MODULES[outer][inner], []
             if named.attr in METHODS:
                 return METHODS[named.attr], [self.part(named.value, own, depth)]
-            raise Refused(node, _no_function(named.attr, methods=True))
-        raise Refused(node, _no_function(""))
+            raise UnsupportedExpression(node, _no_function(named.attr, methods=True))
+        raise UnsupportedExpression(node, _no_function(""))
 
     # -- comprehensions ----------------------------------------------------------------------------
 
@@ -450,7 +458,7 @@ class _ExpressionCompiler:
         loops = []
         for at, one in enumerate(node.generators):
             if one.is_async:
-                raise Refused(node, "async has no place in an expression")
+                raise UnsupportedExpression(node, "async has no place in an expression")
             among = self.part(one.iter, keys, depth + at)
             self._count += 1
             names = _targets(one.target)
@@ -596,7 +604,7 @@ def _targets(node: ast.expr) -> list[str]:
         return [node.id]
     if isinstance(node, ast.Tuple) and all(isinstance(one, ast.Name) for one in node.elts):
         return [one.id for one in node.elts if isinstance(one, ast.Name)]
-    raise Refused(node, "a comprehension names one value, or (a, b)")
+    raise UnsupportedExpression(node, "a comprehension names one value, or (a, b)")
 
 
 def _no_function(name: str, own: list[str] | None = None, *, methods: bool = False) -> str:

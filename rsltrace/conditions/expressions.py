@@ -15,8 +15,8 @@ from rsltrace.conditions.evaluation import (
     NO_FIELD,
     Evaluate,
     ExpressionContext,
-    Places,
-    Refused,
+    TextPositions,
+    UnsupportedExpression,
     evaluation,
     field_names,
     message_field,
@@ -25,7 +25,7 @@ from rsltrace.conditions.evaluation import (
 )
 from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
 from rsltrace.conditions.message_fields import wrong_field
-from rsltrace.conditions.names import Names, near_name, nodes_called, short_name
+from rsltrace.conditions.names import RunNames, near_name, nodes_called, short_name
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 
@@ -71,7 +71,7 @@ class EventFields:
 
 def parse_expression(
     text: str,
-    names: Names | None = None,
+    names: RunNames | None = None,
     *,
     whole: str | None = None,
     begin: int = 0,
@@ -89,18 +89,18 @@ def parse_expression(
     begin += len(text) - len(text.lstrip())
     text = text.strip()
     tree = parsed(text, whole, begin)
-    place = Places(text)
+    place = TextPositions(text)
     try:
-        check_names(tree, names or Names(), interface=interface, has_own=has_own)
+        check_names(tree, names or RunNames(), interface=interface, has_own=has_own)
         evaluate = evaluation(tree, _EventVocabulary())
-    except Refused as error:
+    except UnsupportedExpression as error:
         start, end = place.of(error.node)
         raise ConditionError(error.message, whole, begin + start, begin + end) from None
     return Expression(text, evaluate, StepBudget(), begin)
 
 
 def check_names(
-    tree: ast.expr, names: Names, *, interface: str, has_own: bool, others: tuple[str, ...] = ()
+    tree: ast.expr, names: RunNames, *, interface: str, has_own: bool, others: tuple[str, ...] = ()
 ) -> None:
     """See whether what an expression names is there, as far as is known; ``others`` are names that
     it may have besides.
@@ -113,9 +113,9 @@ def check_names(
     for node in ast.walk(tree):
         what = checks.wrong(node, free)
         if what:
-            raise Refused(node, what)
+            raise UnsupportedExpression(node, what)
     if interface and (found := wrong_field(tree, interface, names.fields)) is not None:
-        raise Refused(found.node, found.message)
+        raise UnsupportedExpression(found.node, found.message)
 
 
 def free_names(tree: ast.expr) -> Iterator[str]:
@@ -136,7 +136,7 @@ class _NameChecker:
 
     def __init__(
         self,
-        names: Names,
+        names: RunNames,
         fields: Mapping[str, str] | None,
         anything_goes: bool,
         others: tuple[str, ...],

@@ -18,7 +18,7 @@ def _no_fields(interface: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Names:
+class RunNames:
     """The names of a run's nodes, topics (and services) and entities.
 
     Unless they ``are_all`` (the run may make more), a name that is none of them is no mistake.
@@ -56,11 +56,11 @@ def near_name(word: str, names: Iterable[str]) -> str | None:
 
 def names_of(
     entities: Iterable[Entity], *, are_all: bool = True, fields: Fields = _no_fields
-) -> Names:
+) -> RunNames:
     """Return the names of entities, as those of a trace."""
     entities = tuple(entities)
     with_topic = [one for one in entities if one.kind in WITH_TOPIC]
-    return Names(
+    return RunNames(
         nodes=_each(one.name for one in entities if one.kind is EntityKind.NODE),
         topics=_each(one.name for one in with_topic),
         entities=_each(one.name for one in entities),

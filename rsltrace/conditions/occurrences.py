@@ -7,9 +7,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rsltrace.conditions.condition import Armed, is_true, shown, shown_text
+from rsltrace.conditions.condition import ActiveCondition, is_true, shown, shown_text
 from rsltrace.conditions.expressions import Expression
-from rsltrace.conditions.view import EventView, Sent
+from rsltrace.conditions.view import EventView, SentOutput
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.words.entities import is_named
 
@@ -22,7 +22,7 @@ _SENDS = {
 
 
 @dataclass
-class IndexCondition(Armed):
+class IndexCondition(ActiveCondition):
     """Before the event of a number."""
 
     index: int
@@ -33,7 +33,7 @@ class IndexCondition(Armed):
 
 
 @dataclass
-class NodeCondition(Armed):
+class NodeCondition(ActiveCondition):
     """Before an event of a node."""
 
     pattern: str
@@ -44,7 +44,7 @@ class NodeCondition(Armed):
 
 
 @dataclass
-class EntityCondition(Armed):
+class EntityCondition(ActiveCondition):
     """Before an event of an entity, which goes by its name or (``#27``) its number."""
 
     pattern: str
@@ -58,7 +58,7 @@ class EntityCondition(Armed):
 
 
 @dataclass
-class TopicCondition(Armed):
+class TopicCondition(ActiveCondition):
     """Before an event that receives a message on a topic, and after one that sends one.
 
     With an ``expression``, one of whose fields it is true.
@@ -98,7 +98,7 @@ class TopicCondition(Armed):
         return f"{what}, and {self.expression.text}" if found else ""
 
 
-class _OutputCondition(Armed, ABC):
+class _OutputCondition(ActiveCondition, ABC):
     """After an event with an output for which ``_matches`` says something."""
 
     def after(self, view: EventView) -> str:
@@ -106,7 +106,7 @@ class _OutputCondition(Armed, ABC):
         return next(filter(None, map(self._matches, view.sent())), "")
 
     @abstractmethod
-    def _matches(self, sent: Sent) -> str:
+    def _matches(self, sent: SentOutput) -> str:
         """Return what to say of an output; nothing: go on."""
 
 
@@ -122,7 +122,7 @@ class HashCondition(_OutputCondition):
             return f"output hash {view.output_hash:016x}"
         return super().after(view)
 
-    def _matches(self, sent: Sent) -> str:
+    def _matches(self, sent: SentOutput) -> str:
         text = f"{sent.hash:016x}"
         return f"output {text}" if sent.hash and text.startswith(self.digits) else ""
 
@@ -133,7 +133,7 @@ class ExceptionCondition(_OutputCondition):
 
     type: str = ""
 
-    def _matches(self, sent: Sent) -> str:
+    def _matches(self, sent: SentOutput) -> str:
         if sent.kind != OutputKind.EXCEPTION:
             return ""
         name = sent.text.partition(":")[0].strip()
@@ -156,14 +156,14 @@ class LogCondition(_OutputCondition):
     level: int
     says: Callable[[str], object]
 
-    def _matches(self, sent: Sent) -> str:
+    def _matches(self, sent: SentOutput) -> str:
         if sent.kind != OutputKind.LOG or sent.level < self.level or not self.says(sent.text):
             return ""
         return f"log {shown(sent.text)}"
 
 
 @dataclass
-class FindingCondition(Armed):
+class FindingCondition(ActiveCondition):
     """After an event in which the guard found something."""
 
     source: str = ""
@@ -177,10 +177,10 @@ class FindingCondition(Armed):
 
 
 @dataclass
-class FilteredCondition(Armed):
+class FilteredCondition(ActiveCondition):
     """Another condition, where an expression is true as well."""
 
-    inner: Armed
+    inner: ActiveCondition
     expression: Expression
     text: str
 

@@ -10,8 +10,8 @@ from rsltrace.conditions.bounds import StepBudget
 from rsltrace.conditions.evaluation import (
     Evaluate,
     ExpressionContext,
-    Places,
-    Refused,
+    TextPositions,
+    UnsupportedExpression,
     evaluation,
     parsed,
     value_of,
@@ -40,9 +40,9 @@ class RunExpression:
         tree = parsed(self.text, self._first_line, 0)
         try:
             self._evaluate = evaluation(tree, _RunVocabulary())
-        except Refused as error:
+        except UnsupportedExpression as error:
             raise ConditionError(
-                error.message, self._first_line, *Places(self.text).of(error.node)
+                error.message, self._first_line, *TextPositions(self.text).of(error.node)
             ) from None
 
     def value(self, trace: Trace) -> Any:

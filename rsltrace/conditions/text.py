@@ -25,9 +25,9 @@ from collections.abc import Callable
 from functools import partial
 
 from rsltrace.conditions.changes import TimeCondition, WatchCondition, WhenCondition
-from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.condition import ActiveCondition, EventCondition
 from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.names import Names
+from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.occurrences import (
     EntityCondition,
     ExceptionCondition,
@@ -41,11 +41,11 @@ from rsltrace.conditions.occurrences import (
     says_pattern,
     says_words,
 )
-from rsltrace.conditions.topic_fields import plain, topic_of
+from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
 from rsltrace.conditions.view import PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.job.values.times import parse_time_in_run
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 
 _HEAD = re.compile(r"([A-Za-z_]+)(?:\s*[:=]\s*|\s+|\Z)")
@@ -65,24 +65,24 @@ _WORDS = {
 }
 """Other words for the same."""
 
-_Arm = Callable[[PausedRun], Armed]
+_Arm = Callable[[PausedRun], ActiveCondition]
 
 
-def parse_condition(text: str, names: Names | None = None) -> Condition:
+def parse_condition(text: str, names: RunNames | None = None) -> EventCondition:
     """Read a condition; ``names`` are those of the run, as far as they are known.
 
     :raises ConditionError: naming the place in the text, and what was probably meant.
     """
-    return _ConditionParser(text, names or Names()).read()
+    return _ConditionParser(text, names or RunNames()).read()
 
 
 class _ConditionParser:
-    def __init__(self, text: str, names: Names) -> None:
+    def __init__(self, text: str, names: RunNames) -> None:
         self._text = text
         self._names = names
         self._at = len(text) - len(text.lstrip())
 
-    def read(self) -> Condition:
+    def read(self) -> EventCondition:
         """Read all of it."""
         text = self._text
         if not text.strip():
@@ -97,14 +97,14 @@ class _ConditionParser:
             return read(self)
         if (message := _MESSAGE.match(text, self._at)) is not None:
             return self._message(message)
-        rewritten = plain(text)
+        rewritten = with_topic_prefix(text)
         if rewritten != text.strip() and topic_of(rewritten) is not None and "." in text:
             return _ConditionParser(rewritten, self._names).read()
         return self._bare()
 
     # -- by their first word -----------------------------------------------------------------------
 
-    def _index(self, digits: str = "") -> Condition:
+    def _index(self, digits: str = "") -> EventCondition:
         if not digits:
             digits = self._value("the number of an event")
             if not digits.isdecimal() or not digits.isascii():
@@ -115,7 +115,7 @@ class _ConditionParser:
         index = int(digits)
         return self._end(lambda moment: IndexCondition(index), before=True)
 
-    def _time(self) -> Condition:
+    def _time(self) -> EventCondition:
         value = self._value("a time")
         rest = re.compile(r"\s*(ns|us|ms|s|min|h)\b").match(self._text, self._at + len(value))
         if rest is not None:  # 2.5 s
@@ -127,17 +127,17 @@ class _ConditionParser:
         self._at += len(value)
         return self._end(partial(TimeCondition, time), before=True)
 
-    def _node(self) -> Condition:
+    def _node(self) -> EventCondition:
         name = self._name(self._names.nodes, "node")
         return self._end(lambda moment: NodeCondition(name), before=True)
 
-    def _entity(self) -> Condition:
+    def _entity(self) -> EventCondition:
         value = self._value("a name")
         is_number = value.startswith("#") and value[1:].isdecimal()
         name = self._name(self._names.entities, "entity", check=not is_number)
         return self._end(lambda moment: EntityCondition(name), before=True)
 
-    def _topic(self) -> Condition:
+    def _topic(self) -> EventCondition:
         text = self._text
         if (message := _MESSAGE.match(text, self._at)) is not None:
             return self._message(message)
@@ -148,11 +148,11 @@ class _ConditionParser:
         reads = frozenset({"received", "sent"})
         return self._end(lambda moment: TopicCondition(text, name), reads, before=True, after=True)
 
-    def _message(self, head: re.Match[str]) -> Condition:
+    def _message(self, head: re.Match[str]) -> EventCondition:
         self._name(self._names.topics, "topic or service", head[1])
         return self._of_messages(head[1], head.end())
 
-    def _of_messages(self, name: str, at: int) -> Condition:
+    def _of_messages(self, name: str, at: int) -> EventCondition:
         """Return the condition of a message on a topic, with the expression that begins there."""
         text = self._text
         found = {i for topic, i in self._names.interfaces.items() if is_named(name, topic)}
@@ -164,7 +164,7 @@ class _ConditionParser:
             interface=found.pop() if len(found) == 1 else "",
             has_own=True,
         )
-        return Condition(
+        return EventCondition(
             text.strip(),
             before=True,
             after=True,
@@ -172,7 +172,7 @@ class _ConditionParser:
             arm=lambda moment: TopicCondition(text, name, expression),
         )
 
-    def _output(self) -> Condition:
+    def _output(self) -> EventCondition:
         value = self._value("the first digits of a hash")
         found = _HASH.fullmatch(value)
         if found is None:
@@ -181,13 +181,13 @@ class _ConditionParser:
         digits = found[1].lower()
         return self._end(lambda moment: HashCondition(digits), frozenset({"sent"}), after=True)
 
-    def _exception(self) -> Condition:
+    def _exception(self) -> EventCondition:
         found = _TYPE.match(self._text, self._at)
         name = "" if found is None or found[0] == "if" else found[0]
         self._at += len(name)
         return self._end(lambda moment: ExceptionCondition(name), frozenset({"sent"}), after=True)
 
-    def _log(self) -> Condition:
+    def _log(self) -> EventCondition:
         level = 0
         found = _TYPE.match(self._text, self._at)
         if found is not None and found[0].lower() in LOG_LEVELS:
@@ -197,8 +197,8 @@ class _ConditionParser:
         says = self._log_text()
         return self._end(lambda moment: LogCondition(level, says), frozenset({"sent"}), after=True)
 
-    def _finding(self) -> Condition:
-        sources = [source.value for source in Source]
+    def _finding(self) -> EventCondition:
+        sources = [source.value for source in NondeterminismSource]
         found = _TYPE.match(self._text, self._at)
         name = "" if found is None or found[0] == "if" else found[0].lower()
         if name and name not in sources:
@@ -207,16 +207,16 @@ class _ConditionParser:
         self._at += len(name)
         return self._end(lambda moment: FindingCondition(name), frozenset({"findings"}), after=True)
 
-    def _watch(self) -> Condition:
+    def _watch(self) -> EventCondition:
         return self._of_nodes(WatchCondition)
 
-    def _when(self) -> Condition:
+    def _when(self) -> EventCondition:
         return self._of_nodes(WhenCondition)
 
-    def _of_nodes(self, kind: type[WatchCondition] | type[WhenCondition]) -> Condition:
+    def _of_nodes(self, kind: type[WatchCondition] | type[WhenCondition]) -> EventCondition:
         rest = self._text[self._at :]
         expression = parse_expression(rest, self._names, whole=self._text, begin=self._at)
-        return Condition(
+        return EventCondition(
             self._text.strip(),
             before=False,
             after=True,
@@ -224,7 +224,7 @@ class _ConditionParser:
             arm=partial(kind, expression),
         )
 
-    def _bare(self) -> Condition:
+    def _bare(self) -> EventCondition:
         """Read a name that stands alone (of a node, a topic or an entity), or a time."""
         value = self._value("where to stop")
         if value[0].isdecimal():
@@ -296,7 +296,7 @@ class _ConditionParser:
         *,
         before: bool = False,
         after: bool = False,
-    ) -> Condition:
+    ) -> EventCondition:
         """Return the condition, with ``if …`` if that follows; nothing else may."""
         self._skip_blanks()
         text = self._text
@@ -309,11 +309,11 @@ class _ConditionParser:
             )
             inner = arm
 
-            def arm(moment: PausedRun) -> Armed:
+            def arm(moment: PausedRun) -> ActiveCondition:
                 return FilteredCondition(inner(moment), expression, text)
 
             reads |= {"received", "nodes"}
-        return Condition(text.strip(), before, after, reads, arm)
+        return EventCondition(text.strip(), before, after, reads, arm)
 
     def _wrong(self, message: str, length: int | None = None) -> ConditionError:
         end = None if length is None else self._at + length
@@ -329,7 +329,7 @@ def _closing(text: str, at: int) -> int:
     return ends[0] if ends else -1
 
 
-_READERS: dict[str, Callable[[_ConditionParser], Condition]] = {
+_READERS: dict[str, Callable[[_ConditionParser], EventCondition]] = {
     "index": _ConditionParser._index,
     "time": _ConditionParser._time,
     "node": _ConditionParser._node,

@@ -12,7 +12,7 @@ OF_MESSAGE = re.compile(rf"({_TOPIC})\s*:(?!:)\s*(.*)", re.DOTALL)
 _DOTTED = re.compile(rf"(?:(?<=[\s(\[,<>=!+*%-])|\A)({_TOPIC})(?=\.[A-Za-z_])")
 
 
-def plain(text: str) -> str:
+def with_topic_prefix(text: str) -> str:
     """Return a text with ``/odom.pose.x < 3`` written as ``/odom: msg.pose.x < 3``.
 
     :raises ConditionError: it speaks of several topics.

@@ -12,10 +12,10 @@ import numpy.typing as npt
 from rsltrace.conditions.changes import TimeCondition, WatchCondition, WhenCondition
 from rsltrace.conditions.names import names_of
 from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.topic_fields import plain, topic_of
-from rsltrace.conditions.view import Sent
+from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
+from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import ConditionError, TraceError
-from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventRecord, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.entities import is_named
@@ -43,7 +43,7 @@ class StartOfTrace:
 class TraceEvent:
     """An ``EventView`` of an event that has ended, long ago: nodes are not there any more."""
 
-    def __init__(self, trace: Trace, event: Event, outputs: Sequence[Output]) -> None:
+    def __init__(self, trace: Trace, event: EventRecord, outputs: Sequence[Output]) -> None:
         self._trace = trace
         self.event = event
         self.outputs = outputs
@@ -85,7 +85,7 @@ class TraceEvent:
             return None
         return self._name(outputs[at]), self._message(outputs[at])
 
-    def sent(self) -> Sequence[Sent]:
+    def sent(self) -> Sequence[SentOutput]:
         """Return its outputs, in order."""
         return [self._sent(output) for output in self.outputs]
 
@@ -93,16 +93,16 @@ class TraceEvent:
         """Return what the guard found in it."""
         return [one.source.value for one in self._trace.findings.get(self.index, ())]
 
-    def _sent(self, output: Output) -> Sent:
+    def _sent(self, output: Output) -> SentOutput:
         name, kind = self._name(output), int(output.kind)
         if output.kind in _MESSAGES:
-            return Sent(kind, name, output.hash, message=partial(self._message, output))
+            return SentOutput(kind, name, output.hash, message=partial(self._message, output))
         if output.kind is OutputKind.LOG:
             record = log_record(self._trace, output)
             if record is not None:
-                return Sent(kind, name, output.hash, record.text, record.level)
+                return SentOutput(kind, name, output.hash, record.text, record.level)
         lines = (self._trace.detail(output) or "").strip().splitlines()
-        return Sent(kind, name, output.hash, lines[-1] if lines else "")
+        return SentOutput(kind, name, output.hash, lines[-1] if lines else "")
 
     def _name(self, output: Output) -> str:
         return self._trace.entity(output.entity).name
@@ -139,13 +139,13 @@ class TraceCondition:
                 text,
             )
         self._trace = trace
-        topic = topic_of(plain(text))
+        topic = topic_of(with_topic_prefix(text))
         self.entities: npt.NDArray[np.uint32] | None = None
         if topic is not None:
             ids = sorted(one.id for one in trace.entities.values() if is_named(topic, one.name))
             self.entities = np.array(ids, dtype=np.uint32)
 
-    def holds(self, event: Event, outputs: Sequence[Output]) -> bool:
+    def holds(self, event: EventRecord, outputs: Sequence[Output]) -> bool:
         """Return whether it is true of an event.
 
         :raises ConditionError: it cannot be evaluated.

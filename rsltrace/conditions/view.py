@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 @dataclass(frozen=True, slots=True)
-class Sent:
+class SentOutput:
     """An output of an event.
 
     ``kind`` is an ``OutputKind``, ``name`` the topic or service of a message, ``hash`` covers the
@@ -70,7 +70,7 @@ class EventView(PausedRun, Protocol):
     def received(self) -> tuple[str, object] | None:
         """Return topic (or service) and message of its input, None if it has no message."""
 
-    def sent(self) -> Sequence[Sent]:
+    def sent(self) -> Sequence[SentOutput]:
         """Return its outputs, in order; of an event that is about to run, none."""
 
     def findings(self) -> Sequence[str]:

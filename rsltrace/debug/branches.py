@@ -16,7 +16,7 @@ from pathlib import Path
 from rsltrace.child_processes import Done, Processes, rsltrace_command
 from rsltrace.errors import DebugError, EditError, OutputError
 from rsltrace.replay.edits import parse_edit
-from rsltrace.trace.model.regular_file import in_the_way
+from rsltrace.trace.model.regular_file import not_replaceable
 
 _ERROR = "rsltrace: error: "
 _HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")
@@ -78,7 +78,7 @@ class EditBranches:
         if self.path is None:
             raise DebugError("nothing has been edited in this session, so there is no branch")
         place = Path(output)
-        if kind := in_the_way(place):
+        if kind := not_replaceable(place):
             raise OutputError(f"{place} is {kind}; name a file, or remove it")
         if place.exists() and not force:
             raise OutputError(f"{place} exists; force=True replaces it")

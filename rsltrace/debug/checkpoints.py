@@ -43,7 +43,7 @@ class Breakpoint:
 
 
 @dataclass(frozen=True, slots=True)
-class Stopped:
+class StopReport:
     """Why a session stands where it does.
 
     ``reason`` is ``step``, ``breakpoint``, ``end`` (of the run), ``begin``, ``paused`` or
@@ -67,9 +67,9 @@ def position_of(values: dict[str, Any]) -> RunPosition:
     )
 
 
-def stopped_of(values: dict[str, Any]) -> Stopped:
+def stopped_of(values: dict[str, Any]) -> StopReport:
     found = values.get("breakpoint")
-    return Stopped(
+    return StopReport(
         reason=str(values["reason"]),
         position=position_of(values["position"]),
         breakpoint=None if found is None else Breakpoint(found["number"], found["text"]),

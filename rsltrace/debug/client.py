@@ -22,7 +22,7 @@ from typing import Any
 from rsltrace import errors
 from rsltrace.child_processes import start_connected
 from rsltrace.debug.branches import EditBranches
-from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped, position_of, stopped_of
+from rsltrace.debug.checkpoints import Breakpoint, RunPosition, StopReport, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 
@@ -131,23 +131,23 @@ class DebugSession:
 
     # -- forward -----------------------------------------------------------------------------------
 
-    def step(self, count: int = 1) -> Stopped:
+    def step(self, count: int = 1) -> StopReport:
         """Run ``count`` events."""
         return stopped_of(self._ask("step", count=count))
 
-    def next(self, node: str | None = None) -> Stopped:
+    def next(self, node: str | None = None) -> StopReport:
         """Run to the end of the next event of a node (default: the node of the last event)."""
         return stopped_of(self._ask("next", node=node))
 
-    def finish(self) -> Stopped:
+    def finish(self) -> StopReport:
         """Run to the end of the current time step."""
         return stopped_of(self._ask("finish"))
 
-    def run_to(self, place: int | str) -> Stopped:
+    def run_to(self, place: int | str) -> StopReport:
         """Run to an index, or to the end of a simulated time (``"2.5s"``), or to a breakpoint."""
         return stopped_of(self._ask("run_to", to=place))
 
-    def go_on(self) -> Stopped:
+    def go_on(self) -> StopReport:
         """Run to the next breakpoint, or to the end."""
         return stopped_of(self._ask("go_on"))
 
@@ -159,19 +159,19 @@ class DebugSession:
 
     # -- back --------------------------------------------------------------------------------------
 
-    def reverse_step(self, count: int = 1) -> Stopped:
+    def reverse_step(self, count: int = 1) -> StopReport:
         """Go back ``count`` events."""
         return stopped_of(self._ask("reverse_step", count=count))
 
-    def reverse_next(self, node: str | None = None) -> Stopped:
+    def reverse_next(self, node: str | None = None) -> StopReport:
         """Go back to the end of a node's previous event."""
         return stopped_of(self._ask("reverse_next", node=node))
 
-    def reverse_go_on(self) -> Stopped:
+    def reverse_go_on(self) -> StopReport:
         """Go back to the previous place where a breakpoint stops, or to the beginning."""
         return stopped_of(self._ask("reverse_go_on"))
 
-    def go_to(self, place: int | str) -> Stopped:
+    def go_to(self, place: int | str) -> StopReport:
         """Go to an index, or to the end of a simulated time, ahead or back. No breakpoint stops."""
         return stopped_of(self._ask("go_to", to=place))
 

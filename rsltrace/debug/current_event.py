@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
-from rsltrace.conditions.view import Sent
+from rsltrace.conditions.view import SentOutput
 from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.words.logs import parse_log
@@ -189,26 +189,26 @@ class CurrentEventView:
             return None
         return self.entity_name, message
 
-    def sent(self) -> Sequence[Sent]:
+    def sent(self) -> Sequence[SentOutput]:
         if self.is_next:
             return ()
         return [self._sent(*output) for output in self._ledger.outputs_of_last()]
 
     def _sent(
         self, kind: int, entity_id: int, content_hash: int, kept: Payload | str | None
-    ) -> Sent:
+    ) -> SentOutput:
         entity = self._ledger.entities.get(entity_id)
         name = entity.name if entity is not None else ""
         if isinstance(kept, str):
             lines = kept.strip().splitlines() or [""]
-            return Sent(kind, name, content_hash, lines[-1])
+            return SentOutput(kind, name, content_hash, lines[-1])
         if kept is None:
-            return Sent(kind, name, content_hash)
+            return SentOutput(kind, name, content_hash)
         if kind == OutputKind.LOG:
             record = parse_log(kept[1])
-            return Sent(kind, name, content_hash, record.text, record.level)
+            return SentOutput(kind, name, content_hash, record.text, record.level)
         type_name = self._ledger.channels[kept[0]][1]
-        return Sent(kind, name, content_hash, message=partial(_decoded, type_name, kept[1]))
+        return SentOutput(kind, name, content_hash, message=partial(_decoded, type_name, kept[1]))
 
     def findings(self) -> Sequence[str]:
         return () if self.is_next else [one.source.value for one in self._ledger.findings]

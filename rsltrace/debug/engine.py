@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from greenlet import getcurrent, greenlet
 
 from rsltrace.conditions.message_fields import loaded_fields
-from rsltrace.conditions.names import Names, names_of
+from rsltrace.conditions.names import RunNames, names_of
 from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
 from rsltrace.debug.current_event import NO_CALL, CallbackCall, CurrentEventView, call_of
@@ -481,7 +481,7 @@ class Engine(EventObserver):
             rest, chain_hash, self.ledger.entities if trace is None else trace.entities
         )
 
-    def names(self) -> Names:
+    def names(self) -> RunNames:
         trace = self.ledger.history.trace
         entities = self.ledger.entities if trace is None else trace.entities
         return names_of(entities.values(), are_all=trace is not None, fields=loaded_fields)

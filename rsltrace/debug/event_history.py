@@ -21,7 +21,7 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.reader import RUN, Trace
-from rsltrace.trace.words.events import counted, output_text
+from rsltrace.trace.words.events import group_equal, output_text
 from rsltrace.trace.writer import TraceWriter
 
 _ROW_BYTES = 8 + EVENT_REST.size
@@ -267,7 +267,7 @@ class EventLedger(TraceWriter):
         if not self.rest:
             return None
         event = event_values(self.rest, self.chain_hash, self.entities)
-        event["did"] = list(islice(counted(map(self._output_text, self.outputs)), DID_MAX))
+        event["did"] = list(islice(group_equal(map(self._output_text, self.outputs)), DID_MAX))
         return event
 
     def _output_text(self, packed: bytes) -> str:

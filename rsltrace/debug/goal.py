@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rsltrace.conditions.condition import Armed, Condition
-from rsltrace.conditions.names import Names
+from rsltrace.conditions.condition import ActiveCondition, EventCondition
+from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import EventView
 from rsltrace.debug.current_event import CurrentEventView
@@ -21,7 +21,7 @@ class WatchedCondition:
 
     number: int
     text: str
-    armed: Armed
+    armed: ActiveCondition
 
 
 @dataclass
@@ -58,7 +58,7 @@ class RunGoal:
         return [f"{one.text}: {one.armed.note}" for one in found.values() if one.armed.note]
 
 
-class AfterNodeEvent(Armed):
+class AfterNodeEvent(ActiveCondition):
     """True after each event of one node."""
 
     def __init__(self, node: str) -> None:
@@ -68,7 +68,7 @@ class AfterNodeEvent(Armed):
         return self._node if view.node == self._node else ""
 
 
-def parse_goal(request: Message, view: CurrentEventView, names: Callable[[], Names]) -> RunGoal:
+def parse_goal(request: Message, view: CurrentEventView, names: Callable[[], RunNames]) -> RunGoal:
     """Return the goal of a request; its conditions count from where the run stands now.
 
     :raises ConditionError: a condition is wrong.
@@ -83,7 +83,7 @@ def parse_goal(request: Message, view: CurrentEventView, names: Callable[[], Nam
         interval_s=float(request.get("interval_s", 0.0)),
     )
     for one in request.get("breakpoints", ()):
-        condition: Condition = parse_condition(one["text"], names())
+        condition: EventCondition = parse_condition(one["text"], names())
         watched = WatchedCondition(int(one["number"]), condition.text, condition.arm(view))
         if condition.before:
             goal.before.append(watched)

@@ -14,8 +14,8 @@ from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.conditions.evaluation import (
-    Places,
-    Refused,
+    TextPositions,
+    UnsupportedExpression,
     field_names,
     parsed,
 )
@@ -26,7 +26,7 @@ from rsltrace.conditions.expressions import (
     no_such_field,
     node_named,
 )
-from rsltrace.conditions.names import Names, nodes_called, short_name
+from rsltrace.conditions.names import RunNames, nodes_called, short_name
 from rsltrace.conditions.view import EventView
 from rsltrace.debug.current_event import source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
@@ -56,7 +56,9 @@ _REFUSED: Mapping[type[ast.AST], str] = {
 }
 
 
-def python_value(text: str, names: Names, view: EventView, *, message: object, node: object) -> Any:
+def python_value(
+    text: str, names: RunNames, view: EventView, *, message: object, node: object
+) -> Any:
     """Return the value of a Python expression.
 
     Names are looked up in ``message`` (its fields), ``node`` (its attributes), the run's nodes by
@@ -70,11 +72,11 @@ def python_value(text: str, names: Names, view: EventView, *, message: object, n
     try:
         for part in ast.walk(tree):
             if type(part) in _REFUSED:
-                raise Refused(part, _REFUSED[type(part)])
+                raise UnsupportedExpression(part, _REFUSED[type(part)])
         others = ("self", "math", "np", *_BUILTINS)
         check_names(tree, names, interface="", has_own=True, others=others)
-    except Refused as error:
-        raise ConditionError(error.message, text, *Places(text).of(error.node)) from None
+    except UnsupportedExpression as error:
+        raise ConditionError(error.message, text, *TextPositions(text).of(error.node)) from None
     try:
         code = compile(ast.Expression(tree), "<expression>", "eval")
         scope: dict[str, Any] = {"__builtins__": {}}
@@ -155,7 +157,7 @@ class StoppedRun(Protocol):
     session: Session
     ledger: EventLedger
 
-    def names(self) -> Names:
+    def names(self) -> RunNames:
         """Return the names in the run."""
 
 

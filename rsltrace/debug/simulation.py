@@ -57,10 +57,10 @@ def _opened(
         from rsltrace.job import load_job
 
         return load_job(Path(source), overrides=spec["overrides"]), RunHistory(), (), []
-    from rsltrace.replay.preparation import prepared
+    from rsltrace.replay.preparation import prepare_replay
 
     folder = spec["job_folder"]
-    plan = stack.enter_context(prepared(source, None if folder is None else Path(folder)))
+    plan = stack.enter_context(prepare_replay(source, None if folder is None else Path(folder)))
     if plan.distrust and not spec["trust"]:
         raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
     changed = [f"{one.name} {one.change}" for one in plan.code if one.change]
@@ -79,7 +79,7 @@ def _serve(
     from rsltrace.debug.engine import Engine
     from rsltrace.debug.event_history import EventLedger
     from rsltrace.replay.editing import EditObserver
-    from rsltrace.run.process import Observer
+    from rsltrace.run.process import RunCallbacks
     from rsltrace.run.session import Session
 
     idle = _middleware_threads()
@@ -95,7 +95,7 @@ def _serve(
             echo=spec["echo"],
             replay=recorded,
             writer=ledger,
-            observer=Observer(note=notes.append),
+            observer=RunCallbacks(note=notes.append),
         )
     )
     if edits:  # those that a branch was made with
@@ -122,10 +122,10 @@ def _serve(
 
 def _middleware_threads() -> frozenset[int]:
     """Return the threads that DDS starts when it is loaded; a simulation does not use them."""
-    from rsltrace.adapters.rclpy.boundary.installation import check_free
+    from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation
     from rsltrace.forking import other_threads
 
-    check_free()
+    check_no_simulation()
     with suppress(ImportError):  # the session says what is missing
         import_module("rclpy")
     return other_threads()

@@ -12,7 +12,7 @@ from pathlib import Path
 from mcap.opcode import Opcode
 
 from rsltrace.trace.format import METADATA_FORMAT, begins_a_trace
-from rsltrace.trace.mcap.records import MAGIC, Damaged, Fields, parse_header
+from rsltrace.trace.mcap.records import MAGIC, DamageError, RecordFields, parse_header
 from rsltrace.trace.model.regular_file import not_regular
 
 _HEAD_BYTES = 4096
@@ -27,8 +27,8 @@ def is_trace(path: str | os.PathLike[str]) -> bool:
     if not head.startswith(MAGIC):
         return False
     # The format has it that this metadata is the first record after the header.
-    with suppress(Damaged):
-        fields = Fields(head[len(MAGIC) :])
+    with suppress(DamageError):
+        fields = RecordFields(head[len(MAGIC) :])
         fields.take(1)
         header = parse_header(fields.take(fields.u64()))
         if not any(head[len(MAGIC) + fields.position :]):  # zeros are what a crash leaves
@@ -36,7 +36,7 @@ def is_trace(path: str | os.PathLike[str]) -> bool:
         try:
             opcode, _ = fields.take(1)[0], fields.u64()
             return opcode == Opcode.METADATA and fields.text() == METADATA_FORMAT
-        except Damaged:
+        except DamageError:
             return begins_a_trace(header)
     return False
 

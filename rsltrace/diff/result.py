@@ -16,7 +16,7 @@ from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CallDifference,
     CauseStep,
-    EventView,
+    EventSummary,
     Setting,
 )
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
@@ -34,10 +34,10 @@ class Divergence(Judgement):
     """
 
     chain: tuple[CauseStep, ...] = ()
-    before_a: tuple[EventView, ...] = ()
-    before_b: tuple[EventView, ...] = ()
-    same_node_a: tuple[EventView, ...] = ()
-    same_node_b: tuple[EventView, ...] = ()
+    before_a: tuple[EventSummary, ...] = ()
+    before_b: tuple[EventSummary, ...] = ()
+    same_node_a: tuple[EventSummary, ...] = ()
+    same_node_b: tuple[EventSummary, ...] = ()
     reaches: tuple[AffectedTopic, ...] = ()
     next_step: str = ""
     calls: tuple[CallDifference, ...] = ()
@@ -208,11 +208,11 @@ class Diff:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it."""
-        from rsltrace.trace.model.html import Sheet
+        from rsltrace.trace.model.html import HtmlSheet
         from rsltrace.trace.model.texts import format_seconds
         from rsltrace.trace.words.phrases import as_sentence
 
-        sheet = Sheet(as_sentence(self.sentence))
+        sheet = HtmlSheet(as_sentence(self.sentence))
         sheet.line(f"{self.verdict.value}; the first {self.agreeing} events agree")
         sheet.table(
             ("", "trace", "events", "ends at", "digest", "stopped by"),

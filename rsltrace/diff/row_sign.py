@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import Enum
 
 
-class Sign(Enum):
+class RowSign(Enum):
     """The value is what is printed, so no colour is needed."""
 
     MATCH = "="

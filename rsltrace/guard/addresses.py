@@ -22,7 +22,7 @@ from weakref import ReferenceType, WeakSet
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 
 # Hashes made of object addresses: reported when code asks for one.
 #
@@ -39,7 +39,7 @@ def _report_hash(obj: object, value: int, frame: FrameType) -> int:
             note_address_hash(frame)  # matters when a set of such objects is iterated
         elif guard.is_user(frame):
             kind = type(obj).__qualname__
-            guard.report_user_call(Source.ADDRESS, f"hash() of {kind}", value, frame)
+            guard.report_user_call(NondeterminismSource.ADDRESS, f"hash() of {kind}", value, frame)
     return value
 
 
@@ -116,18 +116,20 @@ _by_address: WeakSet[type] = WeakSet()
 """Types whose hashes include those of objects that are hashed by address."""
 
 
-def text_with_address(text: str) -> None:
+def report_address_in_text(text: str) -> None:
     """Report a text for others to read that contains an object's address."""
     guard = engaged()
     if guard is not None:
         match = _ADDRESS.search(text)
         if match is not None:
             report_from_middleware(
-                guard, Source.ADDRESS, "an address in a log record", match.group()
+                guard, NondeterminismSource.ADDRESS, "an address in a log record", match.group()
             )
 
 
-def report_from_middleware(guard: Guard, source: Source, call: str, value: str) -> None:
+def report_from_middleware(
+    guard: Guard, source: NondeterminismSource, call: str, value: str
+) -> None:
     """Report something that user code did through rsltrace's middleware."""
     frame: FrameType | None = sys._getframe(1)
     while frame is not None:

@@ -32,7 +32,7 @@ from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.redirect import redirect, redirect_function
 from rsltrace.guard.rules import AUDIT_EVENTS, C_FUNCTIONS, RULES, Rule, answers, sql_call
-from rsltrace.trace.model.finding import READ_BY, Mode, Source
+from rsltrace.trace.model.finding import READ_BY, GuardMode, NondeterminismSource
 
 # -- functions that are replaced ------------------------------------------------------------------
 
@@ -56,7 +56,7 @@ def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
     source, restore, answer = rule.reports, rule.restore, rule.answer
     assert source is not None
     name = name.lstrip("_")
-    is_thread, is_file = source is Source.THREAD, source is Source.FILE
+    is_thread, is_file = source is NondeterminismSource.THREAD, source is NondeterminismSource.FILE
 
     def call(*arguments: Any, **options: Any) -> Any:
         guard = engaged()
@@ -76,7 +76,7 @@ def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
         text = f"{name}({shown})"
-        if restore is not None and guard.mode(source, frame) is Mode.RECORD:
+        if restore is not None and guard.mode(source, frame) is GuardMode.RECORD:
             return restore(guard.record(source, text, lambda: real(*arguments, **options), frame))
         value = real(*arguments, **options)
         guard.report_user_call(source, text, value, frame, _value_text)
@@ -140,9 +140,14 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
             return str(super().__getitem__(name))
         frame = caller()
         call = f"os.environ[{name!r}]"
-        if guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD and guard.is_user_call(frame):
+        if guard.mode(
+            NondeterminismSource.ENVIRONMENT, frame
+        ) is GuardMode.RECORD and guard.is_user_call(frame):
             kept = guard.record(
-                Source.ENVIRONMENT, call, lambda: self._data.get(self.encodekey(name)), frame
+                NondeterminismSource.ENVIRONMENT,
+                call,
+                lambda: self._data.get(self.encodekey(name)),
+                frame,
             )
             if kept is None:
                 raise KeyError(name)
@@ -150,10 +155,15 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         try:
             value = str(super().__getitem__(name))
         except KeyError:
-            guard.report_user_call(Source.ENVIRONMENT, call + _reader(frame), "not set", frame)
+            guard.report_user_call(
+                NondeterminismSource.ENVIRONMENT, call + _reader(frame), "not set", frame
+            )
             raise
         guard.report_user_call(
-            Source.ENVIRONMENT, call + _reader(frame), _variable_text(name, value), frame
+            NondeterminismSource.ENVIRONMENT,
+            call + _reader(frame),
+            _variable_text(name, value),
+            frame,
         )
         return value
 
@@ -162,7 +172,9 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         if guard is not None:
             frame = caller()
             call = "os.environ" + _reader(frame)
-            guard.report_user_call(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
+            guard.report_user_call(
+                NondeterminismSource.ENVIRONMENT, call, f"{len(self)} variables", frame
+            )
         names: Iterator[str] = super().__iter__()
         return names
 
@@ -238,12 +250,12 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         wanted = handle(arguments, frame)
     if wanted is not None:
         source, call, value = wanted
-        if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
+        if event == "subprocess.Popen" and guard.mode(source, frame) is GuardMode.RECORD:
             return  # starting it is recorded, or else is a finding of its own
         guard.report_user_call(source, call, value, frame)
 
 
-_Report = tuple[Source, str, object] | None
+_Report = tuple[NondeterminismSource, str, object] | None
 
 
 def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
@@ -252,13 +264,13 @@ def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
         return None
     name = os.fsdecode(path)
     if name in ("/dev/urandom", "/dev/random"):
-        return Source.RANDOM, f"open({name!r})", ""
+        return NondeterminismSource.RANDOM, f"open({name!r})", ""
     if is_installed_path(name):
         return None
     writing = any(c in mode for c in "wax+") if isinstance(mode, str) else flags & _WRITING
     if writing:
-        return Source.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
-    return Source.FILE, f"open({name!r})", _content(name)
+        return NondeterminismSource.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
+    return NondeterminismSource.FILE, f"open({name!r})", _content(name)
 
 
 def _content(name: str) -> str:
@@ -281,7 +293,9 @@ def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     return None if source is None else (source, f"C library: {name}()", "")
 
 
-def _event_report(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Report]:
+def _event_report(
+    source: NondeterminismSource, name: str
+) -> Callable[[tuple[Any, ...], FrameType], _Report]:
     def wanted(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
         shown = next((a for a in arguments if isinstance(a, (str, bytes, list, tuple))), "")
         return source, f"{name}()", str(shown)[:200]
@@ -292,8 +306,16 @@ def _event_report(source: Source, name: str) -> Callable[[tuple[Any, ...], Frame
 _HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Report]] = {
     "open": _open_report,
     "ctypes.dlsym": _foreign_function,
-    "ctypes.addressof": lambda arguments, frame: (Source.ADDRESS, "ctypes.addressof()", ""),
-    "builtins.id": lambda arguments, frame: (Source.ADDRESS, "id()", hex(arguments[0])),
+    "ctypes.addressof": lambda arguments, frame: (
+        NondeterminismSource.ADDRESS,
+        "ctypes.addressof()",
+        "",
+    ),
+    "builtins.id": lambda arguments, frame: (
+        NondeterminismSource.ADDRESS,
+        "id()",
+        hex(arguments[0]),
+    ),
     **{event: _event_report(source, event) for event, source in AUDIT_EVENTS.items()},
 }
 

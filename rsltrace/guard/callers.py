@@ -58,7 +58,7 @@ def _kind_of(file: str) -> int:
     return STANDARD if file.startswith(("<frozen", *_PYTHON)) else USER
 
 
-KINDS = _FileKinds()
+FILE_OWNERS = _FileKinds()
 """The owner of each source file; hot paths look here directly."""
 
 
@@ -73,25 +73,25 @@ def _is_dispatcher(file: str) -> bool:
     return f"{os.sep}rclpy{os.sep}" in file
 
 
-def is_own(module: str) -> bool:
+def is_rsltrace_module(module: str) -> bool:
     """Return whether a module is rsltrace's; it may lie in a folder of user code."""
     return module.partition(".")[0] in ("rsltrace", "rsltrace_viewer")
 
 
 def is_user_file(file: str) -> bool:
     """Return whether a source file is the user's."""
-    return KINDS[file] in (USER, _PACKAGE)
+    return FILE_OWNERS[file] in (USER, _PACKAGE)
 
 
-def is_telling(file: str) -> bool:
+def is_user_or_library_file(file: str) -> bool:
     """Return whether a source file is the user's or a library's, not Python's, rclpy's or
     rsltrace's."""
-    return KINDS[file] in (USER, _PACKAGE, _LIBRARY)
+    return FILE_OWNERS[file] in (USER, _PACKAGE, _LIBRARY)
 
 
 def is_python_frame(frame: FrameType) -> bool:
     """Return whether a frame is of Python's own modules, or of the guard."""
-    return KINDS[code_of(frame).co_filename] == STANDARD
+    return FILE_OWNERS[code_of(frame).co_filename] == STANDARD
 
 
 def is_never_user_code(frame: FrameType | None) -> bool:
@@ -99,7 +99,7 @@ def is_never_user_code(frame: FrameType | None) -> bool:
     rsltrace or an import calls, directly or through Python's own modules."""
     while frame is not None:
         file = code_of(frame).co_filename
-        kind = KINDS[file]
+        kind = FILE_OWNERS[file]
         if kind != STANDARD:
             return kind == _IMPORT or (kind == OURS and file != _THREADS)
         frame = frame.f_back
@@ -117,7 +117,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     installed = library = standard = None
     while frame is not None:
         file = code_of(frame).co_filename
-        kind = KINDS[file]
+        kind = FILE_OWNERS[file]
         if kind == USER:
             return installed or frame
         if kind == OURS:
@@ -141,7 +141,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
 def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
     """Return whether an installed package is being imported, rather than user code run."""
     while frame is not None:
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         if kind in (USER, OURS):
             return False
         if packages and is_in(frame, packages):
@@ -178,7 +178,7 @@ def user_stack(frame: FrameType | None, packages: frozenset[str]) -> str:
     """Return the lines of user code from ``frame`` outwards, without paths of this machine."""
     lines: list[str] = []
     while frame is not None and len(lines) < _LINES_MAX:
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         if kind in (USER, _PACKAGE) or (packages and is_in(frame, packages)):
             code = code_of(frame)
             folder = module_of(frame).rpartition(".")[0].replace(".", "/")

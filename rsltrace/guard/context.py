@@ -8,7 +8,7 @@ from random import Random
 from typing import Any, Protocol
 
 from rsltrace.guard.redirect import copy_of
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 
 # Simulated time passes as fast as real time while code waits for something outside of the run.
 
@@ -121,7 +121,7 @@ class SimulationContext(Protocol):
         """Return the number of the running process: 0 for nodes that the job constructs, then the
         mains from 1, in the order of the job."""
 
-    def policy(self) -> Policy | None:
+    def policy(self) -> GuardPolicy | None:
         """Return the policy of that node, or None for the job's."""
 
     def place(self) -> tuple[int, int]:

@@ -13,7 +13,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from rsltrace.guard.redirect import copy_of
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 
 _fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 _Identity = tuple[int, int]
@@ -24,7 +24,7 @@ class RecordedDescriptor:
     """An open file descriptor whose answers are recorded; of a folder only ``fstat``."""
 
     number: int
-    source: Source
+    source: NondeterminismSource
     identity: _Identity
     is_folder: bool = False
 
@@ -40,7 +40,9 @@ class DescriptorTable:
         self._numbers: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
         self._last = 0
 
-    def add(self, fd: int, source: Source, *, is_folder: bool = False) -> RecordedDescriptor:
+    def add(
+        self, fd: int, source: NondeterminismSource, *, is_folder: bool = False
+    ) -> RecordedDescriptor:
         """Register a descriptor whose answers are to be recorded."""
         found = self.find(fd)
         if found is None:

@@ -51,7 +51,7 @@ _BY_NAME = {
 """What a slot holds if the type looks the method up by name."""
 
 
-def exchange(stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]) -> None:
+def replace_member(stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]) -> None:
     """Replace a member, if the type has it, by ``make(member)`` until ``stack`` ends."""
     real = kind.__dict__.get(name)
     if real is not None:
@@ -76,7 +76,7 @@ def replace_special_method(
     slot, by_name = _slot(kind, name).value, _BY_NAME.get(name)
     if by_name is None or slot == by_name:
         return
-    exchange(stack, kind, name, make)
+    replace_member(stack, kind, name, make)
     for one in _subclasses_of(kind):
         if _slot(one, name).value == slot:
             _set_slot(stack, one, name, by_name)

@@ -16,7 +16,7 @@ from weakref import WeakKeyDictionary
 from rsltrace.errors import GuardError
 from rsltrace.guard import engagement
 from rsltrace.guard.callers import (
-    KINDS,
+    FILE_OWNERS,
     OURS,
     STANDARD,
     USER,
@@ -43,7 +43,13 @@ from rsltrace.guard.recorded_answers import (
     finding_value,
 )
 from rsltrace.guard.redirect import copy_of
-from rsltrace.trace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
+from rsltrace.trace.model.finding import (
+    DEFAULT_MODES,
+    Finding,
+    GuardMode,
+    GuardPolicy,
+    NondeterminismSource,
+)
 
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
 _guards: WeakKeyDictionary[Guard, None] = WeakKeyDictionary()  # no set: a run puts those in order
@@ -52,9 +58,9 @@ FINDINGS_PER_EVENT = 100
 """An event that reads the address of a million objects is one problem, not a million."""
 
 # Local names: the lookup of an Enum member takes longer than the rest of the call.
-_ALLOW, _ERROR, _RANDOM = Mode.ALLOW, Mode.ERROR, Source.RANDOM
-_EACH = (Mode.ERROR, Mode.RECORD)
-_ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
+_ALLOW, _ERROR, _RANDOM = GuardMode.ALLOW, GuardMode.ERROR, NondeterminismSource.RANDOM
+_EACH = (GuardMode.ERROR, GuardMode.RECORD)
+_ALWAYS = (GuardMode.WARN, GuardMode.ERROR, GuardMode.ALLOW)
 
 _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
@@ -68,9 +74,9 @@ def _disengage_in_child() -> None:
 os.register_at_fork(after_in_child=_disengage_in_child)
 
 
-def reporting_mode(mode: Mode) -> Mode:
+def reporting_mode(mode: GuardMode) -> GuardMode:
     """Return the mode of a call that can neither be answered nor recorded: at least a warning."""
-    return mode if mode in _ALWAYS else Mode.WARN
+    return mode if mode in _ALWAYS else GuardMode.WARN
 
 
 class Guard:
@@ -117,7 +123,7 @@ class Guard:
         self,
         context: SimulationContext,
         *,
-        policy: Policy,
+        policy: GuardPolicy,
         seed: int = 0,
         packages: frozenset[str] = frozenset(),
         on_finding: Callable[[Finding], None] = lambda finding: None,
@@ -132,8 +138,10 @@ class Guard:
         self.kinds: dict[str, int] = {}
         """The owners of modules that read clocks and draw, by ``__file__`` (see ``file_kind``)."""
         self.on_finding = on_finding
-        self._found: dict[tuple[Source, Mode, str, str], int] = {}
-        self._answered: dict[Source, dict[str, dict[str, int]]] = {source: {} for source in Source}
+        self._found: dict[tuple[NondeterminismSource, GuardMode, str, str], int] = {}
+        self._answered: dict[NondeterminismSource, dict[str, dict[str, int]]] = {
+            source: {} for source in NondeterminismSource
+        }
         self._draws: dict[str, dict[str, RandomFunction]] = {}
         self.streams = RandomStreams(seed)
         self.answers = RecordedAnswers()
@@ -143,8 +151,12 @@ class Guard:
         self.shown = TextNumbers()
         self._policy = policy
         self.modes = policy.modes if one_policy and not any(policy.allowed.values()) else None
-        self.answers_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
-        self.answers_random = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
+        self.answers_clocks = (
+            self.modes is not None and self.modes[NondeterminismSource.CLOCK] is GuardMode.VIRTUAL
+        )
+        self.answers_random = (
+            self.modes is not None and self.modes[NondeterminismSource.RANDOM] is GuardMode.VIRTUAL
+        )
         self.thread = engagement.thread_id()
         self.process = _process_id()
         _guards[self] = None
@@ -161,24 +173,24 @@ class Guard:
         self.process = process
 
     @property
-    def counts(self) -> dict[tuple[Source, Mode, str, str], int]:
+    def counts(self) -> dict[tuple[NondeterminismSource, GuardMode, str, str], int]:
         """How often each call was made: by source, mode, node and call."""
-        counts: dict[tuple[Source, Mode, str, str], int] = dict(self._found)
+        counts: dict[tuple[NondeterminismSource, GuardMode, str, str], int] = dict(self._found)
         for call, clocks in self._clocks.items():
             for node, clock in clocks.items():
                 if clock.looks:
-                    counts[Source.CLOCK, Mode.VIRTUAL, node, call] = clock.looks
+                    counts[NondeterminismSource.CLOCK, GuardMode.VIRTUAL, node, call] = clock.looks
         for call, draws in self._draws.items():
             for node, draw in draws.items():
                 if draw.count:
-                    counts[_RANDOM, Mode.VIRTUAL, node, call] = draw.count
+                    counts[_RANDOM, GuardMode.VIRTUAL, node, call] = draw.count
         for source, calls in self._answered.items():
             for call, nodes in calls.items():
                 for node, count in nodes.items():
-                    counts[source, Mode.VIRTUAL, node, call] = count
+                    counts[source, GuardMode.VIRTUAL, node, call] = count
         return counts
 
-    def mode(self, source: Source, frame: FrameType) -> Mode:
+    def mode(self, source: NondeterminismSource, frame: FrameType) -> GuardMode:
         """Return what the job says about ``source`` in the code of ``frame``."""
         if self.modes is not None:
             return self.modes[source]
@@ -188,12 +200,12 @@ class Guard:
             user = user_frame(frame, self.packages) or frame
             names = {module_of(frame), module_of(user)}
             if any(fnmatchcase(name, glob) for name in names for glob in allowed):
-                return Mode.ALLOW
+                return GuardMode.ALLOW
         return policy.modes.get(source) or DEFAULT_MODES[source]
 
-    def is_virtual(self, source: Source) -> bool:
+    def is_virtual(self, source: NondeterminismSource) -> bool:
         """Return whether the run answers calls of a source, unless a node says otherwise."""
-        return self._policy.modes.get(source, DEFAULT_MODES[source]) is Mode.VIRTUAL
+        return self._policy.modes.get(source, DEFAULT_MODES[source]) is GuardMode.VIRTUAL
 
     def stream(self, frame: FrameType) -> str:
         """Return the name of the random stream for the running code: the node's or its module's.
@@ -202,7 +214,7 @@ class Guard:
         already.
         """
         node = self.context.node()
-        is_users = KINDS[code_of(frame).co_filename] == USER
+        is_users = FILE_OWNERS[code_of(frame).co_filename] == USER
         if node and (is_users or not in_import(frame, self.packages)):
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
@@ -222,7 +234,7 @@ class Guard:
     ) -> Callable[..., Any]:
         """Count a draw and return the function that draws from the stream of the running code."""
         node = self.context.node()
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         if node and (kind <= OURS or user_frame(frame, self.packages) is not None):
             try:
                 draw = self._draws[call][node]
@@ -236,22 +248,22 @@ class Guard:
 
     def is_user(self, frame: FrameType) -> bool:
         """Return whether a frame is user code itself."""
-        is_users = KINDS[code_of(frame).co_filename] == USER
+        is_users = FILE_OWNERS[code_of(frame).co_filename] == USER
         return is_users or user_frame(frame, self.packages) is frame
 
     def is_user_call(self, frame: FrameType) -> bool:
         """Return whether user code led to a frame."""
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         return kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None)
 
     def user_frame_of(self, frame: FrameType) -> FrameType | None:
         """Return the frame of user code that led to a frame, if any."""
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         if kind <= OURS:
             return frame if kind == USER else None
         return user_frame(frame, self.packages)
 
-    def count_call(self, source: Source, call: str, frame: FrameType) -> None:
+    def count_call(self, source: NondeterminismSource, call: str, frame: FrameType) -> None:
         """Count a call of user code that the run answers."""
         if self.user_frame_of(frame) is not None:
             running = self._running
@@ -263,7 +275,7 @@ class Guard:
                 self._answered[source].setdefault(call, {})[node] = 1
 
     def note_answer(
-        self, source: Source, call: str, describe: Callable[[], str], frame: FrameType
+        self, source: NondeterminismSource, call: str, describe: Callable[[], str], frame: FrameType
     ) -> None:
         """Keep in the trace what user code received from outside, in an order that the run makes.
 
@@ -274,7 +286,9 @@ class Guard:
         if user is None or not self._has_room(event):
             return
         node, stack = self.context.node(), user_stack(user, self.packages)
-        self.on_finding(Finding(event, entity, node, source, Mode.VIRTUAL, call, describe(), stack))
+        self.on_finding(
+            Finding(event, entity, node, source, GuardMode.VIRTUAL, call, describe(), stack)
+        )
 
     def _has_room(self, event: int) -> bool:
         """Count one more finding of an event; return whether the trace takes it."""
@@ -285,8 +299,8 @@ class Guard:
 
     def report(
         self,
-        source: Source,
-        mode: Mode,
+        source: NondeterminismSource,
+        mode: GuardMode,
         call: str,
         value: object,
         frame: FrameType,
@@ -319,7 +333,12 @@ class Guard:
                 )
 
     def record(
-        self, source: Source, call: str, real: Callable[[], Any], frame: FrameType, number: int = 0
+        self,
+        source: NondeterminismSource,
+        call: str,
+        real: Callable[[], Any],
+        frame: FrameType,
+        number: int = 0,
     ) -> Any:
         """Return the answer to a call from outside, and keep it in the trace for a re-run.
 
@@ -335,13 +354,17 @@ class Guard:
             with engage(None):
                 text = encoded_answer(real)
         self.report(
-            source, Mode.RECORD, call, finding_value(number, 0, text) if number else text, frame
+            source,
+            GuardMode.RECORD,
+            call,
+            finding_value(number, 0, text) if number else text,
+            frame,
         )
         return decoded(text)
 
     def report_user_call(
         self,
-        source: Source,
+        source: NondeterminismSource,
         call: str,
         value: object,
         frame: FrameType,
@@ -360,7 +383,7 @@ class Guard:
         """Return who owns the code of a frame, and remember it for its module with globals
         ``names``."""
         file = code_of(frame).co_filename
-        kind = KINDS[file]
+        kind = FILE_OWNERS[file]
         if kind > STANDARD and self.packages and is_in(frame, self.packages):
             kind = USER
         # Code compiled from a text has no file, and a program may be imported as a module, too.
@@ -420,17 +443,17 @@ class Guard:
 
 
 ADVICE = {
-    Source.CLOCK: "use the node's clock: self.get_clock().now()",
-    Source.RANDOM: "use a generator with a seed of its own",
-    Source.DIRECTORY: "sort what is listed",
-    Source.FILE: "read the file before the run, or write 'file: record'",
-    Source.ENVIRONMENT: "make it a parameter of the node",
-    Source.PID: "name it by a parameter of the node, or write 'pid: virtual'",
-    Source.THREAD: "use timers, tasks or callback groups",
-    Source.PROCESS: "do it before the run, or write 'process: record'",
-    Source.SOCKET: "record what comes from outside into a bag, or write 'socket: record'",
-    Source.ADDRESS: "use a name or a number of your own instead of an object's address",
-    Source.ORDER: "sort it, or use a dict or a list",
+    NondeterminismSource.CLOCK: "use the node's clock: self.get_clock().now()",
+    NondeterminismSource.RANDOM: "use a generator with a seed of its own",
+    NondeterminismSource.DIRECTORY: "sort what is listed",
+    NondeterminismSource.FILE: "read the file before the run, or write 'file: record'",
+    NondeterminismSource.ENVIRONMENT: "make it a parameter of the node",
+    NondeterminismSource.PID: "name it by a parameter of the node, or write 'pid: virtual'",
+    NondeterminismSource.THREAD: "use timers, tasks or callback groups",
+    NondeterminismSource.PROCESS: "do it before the run, or write 'process: record'",
+    NondeterminismSource.SOCKET: "record that data into a bag, or write 'socket: record'",
+    NondeterminismSource.ADDRESS: "use a name or a number of your own, not an object's address",
+    NondeterminismSource.ORDER: "sort it, or use a dict or a list",
 }
 """What to do instead, by source."""
 

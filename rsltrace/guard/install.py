@@ -21,7 +21,7 @@ from rsltrace.guard.call_reports import reported_calls
 from rsltrace.guard.callers import is_never_user_code, module_of
 from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.process_ids import meant_id, real_path, virtual_id
+from rsltrace.guard.process_ids import real_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
 from rsltrace.guard.recorded.polls import recorded_polls
@@ -32,7 +32,7 @@ from rsltrace.guard.virtual.clocks import virtual_clocks
 from rsltrace.guard.virtual.processors import virtual_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.virtual.set_order import ordered_sets
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 # Directory listings are sorted by name: a file system returns them in any order.
 
@@ -102,17 +102,20 @@ def _listing(
         if guard is None:
             return value
         frame = caller()
-        mode = guard.mode(Source.DIRECTORY, frame)
-        if mode is Mode.VIRTUAL:
+        mode = guard.mode(NondeterminismSource.DIRECTORY, frame)
+        if mode is GuardMode.VIRTUAL:
             arranged, names = arrange(value)
-            guard.count_call(Source.DIRECTORY, call, frame)
+            guard.count_call(NondeterminismSource.DIRECTORY, call, frame)
             guard.note_answer(
-                Source.DIRECTORY, _call(name, arguments), partial(_names_text, names), frame
+                NondeterminismSource.DIRECTORY,
+                _call(name, arguments),
+                partial(_names_text, names),
+                frame,
             )
             return arranged
-        if mode is not Mode.ALLOW:
+        if mode is not GuardMode.ALLOW:
             shown = repr(value[:10]) if isinstance(value, list) else ""
-            guard.report_user_call(Source.DIRECTORY, call, shown, frame)
+            guard.report_user_call(NondeterminismSource.DIRECTORY, call, shown, frame)
         return value
 
     return listed
@@ -233,18 +236,18 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         frame = caller()
         if is_never_user_code(frame):
             return real()
-        mode = guard.mode(Source.PID, frame)
+        mode = guard.mode(NondeterminismSource.PID, frame)
         shown = module_of(frame) == _LOGGING  # which puts it into every record
-        if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
+        if mode is GuardMode.VIRTUAL and (shown or guard.is_user(frame)):
             if not shown:
-                guard.count_call(Source.PID, _CALL, frame)
+                guard.count_call(NondeterminismSource.PID, _CALL, frame)
             return virtual_id(guard)
         if shown:
             return real()
-        if mode is Mode.RECORD and guard.is_user_call(frame):
-            return int(guard.record(Source.PID, _CALL, real, frame))
+        if mode is GuardMode.RECORD and guard.is_user_call(frame):
+            return int(guard.record(NondeterminismSource.PID, _CALL, real, frame))
         value = real()
-        guard.report_user_call(Source.PID, _CALL, value, frame)
+        guard.report_user_call(NondeterminismSource.PID, _CALL, value, frame)
         return value
 
     return getpid
@@ -265,8 +268,8 @@ def own_process_ids() -> Iterator[None]:
         redirect(stack, os.getpid, _getpid)
         for name in _ID_FUNCTIONS:
             if hasattr(os, name):
-                redirect(stack, getattr(os, name), partial(_translating, meant_id))
-        redirect(stack, resource.prlimit, partial(_translating, meant_id))
+                redirect(stack, getattr(os, name), partial(_translating, real_id))
+        redirect(stack, resource.prlimit, partial(_translating, real_id))
         for name in _PATH_FUNCTIONS:
             redirect(stack, getattr(os, name), partial(_translating, real_path))
         yield
@@ -286,7 +289,7 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     def __repr__(self: Any, /) -> str:  # noqa: N807
         text = real(self)
         guard = engaged()
-        if guard is None or guard.mode(Source.ADDRESS, caller()) is Mode.ALLOW:
+        if guard is None or guard.mode(NondeterminismSource.ADDRESS, caller()) is GuardMode.ALLOW:
             return text
         with engage(None):
             address = f"0x{id(self):x}"

@@ -22,7 +22,7 @@ _MARK = "RSLTRACE_PINNED"
 
 HASH_SEED = "PYTHONHASHSEED"
 PLACE = {"TZ": "UTC", "LC_ALL": "C.UTF-8"}
-THREADS = (
+THREAD_VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "MKL_NUM_THREADS",
@@ -32,7 +32,7 @@ THREADS = (
     "NUMBA_NUM_THREADS",
     "RAYON_NUM_THREADS",  # libraries written in Rust
 )
-PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
+PINNED_VARIABLES = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREAD_VARIABLES, "1")}
 
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BY_WHEELS = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
@@ -70,7 +70,7 @@ def pin() -> None:
 
 def pinned_variables() -> dict[str, str]:
     """Return the environment variables of a pinned process and of the processes of a run."""
-    return {**PINNED, **_libraries()}
+    return {**PINNED_VARIABLES, **_libraries()}
 
 
 def _libraries() -> dict[str, str]:
@@ -130,7 +130,7 @@ def _personality(value: int) -> int:
         return -1
 
 
-def thread_pools() -> ModuleType:
+def import_threadpoolctl() -> ModuleType:
     """Return threadpoolctl, without the OpenMP variable that its import sets.
 
     Processes of the first run would otherwise have one variable more than those of the next.
@@ -160,10 +160,10 @@ def kept_variables(names: Iterable[str]) -> Iterator[None]:
 def pinned_place() -> Iterator[None]:
     """Pin time zone, locale and numerical threads from within the process."""
     before = {name: os.environ.get(name) for name in PLACE}
-    if before == PLACE and all(os.environ.get(name) == "1" for name in THREADS):
+    if before == PLACE and all(os.environ.get(name) == "1" for name in THREAD_VARIABLES):
         yield
         return
-    with thread_pools().threadpool_limits(limits=1):
+    with import_threadpoolctl().threadpool_limits(limits=1):
         try:
             with kept_variables(PLACE):
                 os.environ.update(PLACE)

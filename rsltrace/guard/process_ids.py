@@ -25,7 +25,7 @@ def virtual_id(guard: Guard) -> int:
     return FIRST + guard.context.process()
 
 
-def meant_id(pid: Any) -> Any:
+def real_id(pid: Any) -> Any:
     """Return the real process id if ``pid`` is the one that the running code sees as its own."""
     if isinstance(pid, int) and pid >= FIRST:
         guard = engaged()
@@ -42,5 +42,5 @@ def real_path(path: Any) -> Any:
     if isinstance(text, str) and text.startswith(_PROC):
         match = _OF_PROCESS.match(text)
         if match is not None:
-            return f"{_PROC}{meant_id(int(match[1]))}{text[match.end() :]}"
+            return f"{_PROC}{real_id(int(match[1]))}{text[match.end() :]}"
     return path

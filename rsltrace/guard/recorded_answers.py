@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import GuardError
-from rsltrace.trace.model.finding import Finding, Mode
+from rsltrace.trace.model.finding import Finding, GuardMode
 
 # Clocks and random functions, as far as counts and further answers need them.
 
@@ -118,7 +118,7 @@ class RecordedAnswers:
         """Use the recorded answers of an earlier run, for each node in order."""
         self._kept, self._trace = {}, trace
         for finding in findings:
-            if finding.mode is Mode.RECORD:
+            if finding.mode is GuardMode.RECORD:
                 number, kept = _parsed(finding.value)
                 self._kept.setdefault((finding.node, finding.call, number), deque()).append(kept)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
-from rsltrace.trace.model.finding import MODES, Mode, Policy, Source
+from rsltrace.trace.model.finding import MODES, GuardMode, GuardPolicy, NondeterminismSource
 
 PROCESSORS = 4
 """How many processors user code sees, on every machine."""
@@ -39,11 +39,11 @@ class Treatment(str, Enum):
 
 
 _OF_MODE = {
-    Mode.VIRTUAL: Treatment.VIRTUAL,
-    Mode.RECORD: Treatment.RECORDED,
-    Mode.WARN: Treatment.DETECTED,
-    Mode.ERROR: Treatment.REFUSED,
-    Mode.ALLOW: Treatment.NOTHING,
+    GuardMode.VIRTUAL: Treatment.VIRTUAL,
+    GuardMode.RECORD: Treatment.RECORDED,
+    GuardMode.WARN: Treatment.DETECTED,
+    GuardMode.ERROR: Treatment.REFUSED,
+    GuardMode.ALLOW: Treatment.NOTHING,
 }
 
 ArgumentTest = Callable[[ast.Call], bool]
@@ -61,14 +61,14 @@ class Rule:
     treatment: Treatment
     does: str
     instead: str
-    source: Source | None = None
+    source: NondeterminismSource | None = None
     is_class: bool = False
     """Naming it is harmless; calling it or deriving from it is not."""
     is_shared: bool = False
     """It draws from a generator that the whole module shares, and may have seeded."""
     when: ArgumentTest | None = None
     """The audit reports only calls with such arguments."""
-    reports: Source | None = None
+    reports: NondeterminismSource | None = None
     """The guard replaces the function for the run and reports its calls under this key of
     ``guard:``. Functions without it are replaced by modules of ``guard/virtual`` and
     ``guard/recorded``, reported by audit events, or not seen at all."""
@@ -78,36 +78,45 @@ class Rule:
     answer: Callable[..., Any] | None = None
     """For ``reports``: what the run answers itself, called with the arguments of the call."""
 
-    def treated(self, policy: Policy | None, whose: str = "the job") -> tuple[Treatment, str]:
+    def treated(self, policy: GuardPolicy | None, whose: str = "the job") -> tuple[Treatment, str]:
         """Return what a guard with this policy (None: no guard at all) does about the call."""
         if policy is None:
             return Treatment.NOTHING, "the job has no guard"
         if self.source is None or self.treatment not in (Treatment.VIRTUAL, Treatment.DETECTED):
             return self.treatment, self.does
         mode = policy.modes[self.source]
-        if self.treatment is Treatment.DETECTED and mode is Mode.VIRTUAL:
-            mode = Mode.WARN
+        if self.treatment is Treatment.DETECTED and mode is GuardMode.VIRTUAL:
+            mode = GuardMode.WARN
         elif self.treatment is Treatment.VIRTUAL and answers(self.source, mode):
-            mode = Mode.VIRTUAL
+            mode = GuardMode.VIRTUAL
         treatment = _OF_MODE[mode]
         if treatment is self.treatment:
             return treatment, self.does
         return treatment, f"{whose} says {self.source.value}: {mode.value}"
 
 
-def answers(source: Source, mode: Mode) -> bool:
+def answers(source: NondeterminismSource, mode: GuardMode) -> bool:
     """Return whether the run answers a call itself where it can.
 
     Sources without a mode ``virtual`` leave only ``allow`` to ask the machine.
     """
-    return mode is Mode.VIRTUAL or (mode is not Mode.ALLOW and Mode.VIRTUAL not in MODES[source])
+    return mode is GuardMode.VIRTUAL or (
+        mode is not GuardMode.ALLOW and GuardMode.VIRTUAL not in MODES[source]
+    )
 
 
 _V, _P, _D, _N = Treatment.VIRTUAL, Treatment.PINNED, Treatment.DETECTED, Treatment.NOTHING
 
-_CLOCK = Rule("clock", _V, "shows simulated time", "self.get_clock().now()", Source.CLOCK)
+_CLOCK = Rule(
+    "clock", _V, "shows simulated time", "self.get_clock().now()", NondeterminismSource.CLOCK
+)
 _CPU_TIME = Rule(
-    "clock", _D, "reported as a finding", "an external profiler", Source.CLOCK, reports=Source.CLOCK
+    "clock",
+    _D,
+    "reported as a finding",
+    "an external profiler",
+    NondeterminismSource.CLOCK,
+    reports=NondeterminismSource.CLOCK,
 )
 _SLEEP = Rule("sleep", _V, "waits in simulated time", "a timer: self.create_timer(seconds, …)")
 _RANDOM = Rule(
@@ -115,7 +124,7 @@ _RANDOM = Rule(
     _V,
     "draws from the node's seeded stream",
     "a generator with its own seed: random.Random(seed), from a parameter",
-    Source.RANDOM,
+    NondeterminismSource.RANDOM,
     is_shared=True,
 )
 _NUMPY = replace(_RANDOM, instead="np.random.default_rng(seed), the seed from a parameter")
@@ -124,7 +133,7 @@ _UNSEEDED = Rule(
     _V,
     "is seeded from the node's stream",
     "give it a seed, from a parameter",
-    Source.RANDOM,
+    NondeterminismSource.RANDOM,
 )
 _TORCH = replace(
     _UNSEEDED,
@@ -136,7 +145,9 @@ _ENTROPY = replace(
     does="comes from the node's seeded stream",
     instead="a counter, or bytes of a seeded generator",
 )
-_OPENSSL = replace(_ENTROPY, treatment=_D, does="reported as a finding", reports=Source.RANDOM)
+_OPENSSL = replace(
+    _ENTROPY, treatment=_D, does="reported as a finding", reports=NondeterminismSource.RANDOM
+)
 _THREAD = Rule(
     "thread",
     _V,
@@ -148,22 +159,22 @@ _SIGNAL = Rule(
     _D,
     "reported as a finding",
     "a timer: self.create_timer(…)",
-    Source.THREAD,
-    reports=Source.THREAD,
+    NondeterminismSource.THREAD,
+    reports=NondeterminismSource.THREAD,
 )
 _PROCESS = Rule(
     "process",
     _D,
     "reported as a finding; it runs in real time",
     "do it before the run, or run it outside and record what it sends into a bag",
-    Source.PROCESS,
+    NondeterminismSource.PROCESS,
 )
 _SOCKET = Rule(
     "socket",
     _D,
     "reported as a finding; answers come in real time",
     "record what comes from outside into a bag, or write 'socket: record' below 'guard:'",
-    Source.SOCKET,
+    NondeterminismSource.SOCKET,
 )
 _DEVICE = Rule(
     "socket",
@@ -192,34 +203,42 @@ _ASYNC_IO = Rule(
     "its loop waits in simulated time",
     "async callbacks of the node: await client.call_async(…)",
 )
-_LISTING = Rule("directory", _V, "is sorted", "sorted(…)", Source.DIRECTORY)
+_LISTING = Rule("directory", _V, "is sorted", "sorted(…)", NondeterminismSource.DIRECTORY)
 ENVIRONMENT = Rule(
-    "environment", _D, "reported as a finding", "a parameter of the node", Source.ENVIRONMENT
+    "environment",
+    _D,
+    "reported as a finding",
+    "a parameter of the node",
+    NondeterminismSource.ENVIRONMENT,
 )
-_MACHINE = replace(ENVIRONMENT, reports=Source.ENVIRONMENT, restore=lambda answer: answer)
-_INTERPRETER = replace(ENVIRONMENT, instead="leave it to a profiler", reports=Source.ENVIRONMENT)
+_MACHINE = replace(
+    ENVIRONMENT, reports=NondeterminismSource.ENVIRONMENT, restore=lambda answer: answer
+)
+_INTERPRETER = replace(
+    ENVIRONMENT, instead="leave it to a profiler", reports=NondeterminismSource.ENVIRONMENT
+)
 _PID = Rule(
     "pid",
     _V,
     "is the node's own number, the same in every run",
     "a parameter of the node",
-    Source.PID,
+    NondeterminismSource.PID,
 )
 _PROCESSORS = Rule(
     "environment",
     _V,
     f"is {PROCESSORS}, on every machine",
     "a parameter of the node, or a constant",
-    Source.ENVIRONMENT,
+    NondeterminismSource.ENVIRONMENT,
 )
 _FILE_TIME = Rule(
     "file",
     _D,
     "reported as a finding",
     "the content of the file instead of its age",
-    Source.FILE,
+    NondeterminismSource.FILE,
 )
-_DISK = replace(_FILE_TIME, instead="a parameter of the node", reports=Source.FILE)
+_DISK = replace(_FILE_TIME, instead="a parameter of the node", reports=NondeterminismSource.FILE)
 LOCALE = Rule(
     "locale", _P, "record runs in C.UTF-8", "plain formatting: f'{x:.3f}', key=str.casefold"
 )
@@ -244,10 +263,14 @@ ORDER = Rule(
     _V,
     "its order is the same in every run; objects with equal contents are a finding",
     "sorted(…), or a dict or a list instead of the set",
-    Source.ORDER,
+    NondeterminismSource.ORDER,
 )
 ADDRESS = Rule(
-    "address", _D, "reported as a finding", "a name or a number of your own", Source.ADDRESS
+    "address",
+    _D,
+    "reported as a finding",
+    "a name or a number of your own",
+    NondeterminismSource.ADDRESS,
 )
 HASH = replace(
     ADDRESS,
@@ -261,7 +284,11 @@ REPLACED_FUNCTION = Rule(
     "replace rclpy.executors.await_or_execute, or wrap the callbacks",
 )
 _SQL_CLOCK = Rule(
-    "clock", _D, "reported as a finding", "pass the node's time as a parameter", Source.CLOCK
+    "clock",
+    _D,
+    "reported as a finding",
+    "pass the node's time as a parameter",
+    NondeterminismSource.CLOCK,
 )
 _SQL_RANDOM = replace(
     _UNSEEDED, treatment=_D, does="reported as a finding", instead="pass a number"
@@ -389,7 +416,12 @@ RULES: dict[str, Rule] = {
         "multinomial poisson",
     ),
     **_classes(_THREAD, "threading", "Thread Timer"),
-    **_calls(_THREAD, "_thread", "start_new_thread start_joinable_thread", reports=Source.THREAD),
+    **_calls(
+        _THREAD,
+        "_thread",
+        "start_new_thread start_joinable_thread",
+        reports=NondeterminismSource.THREAD,
+    ),
     **_classes(_THREAD, "concurrent.futures", "ThreadPoolExecutor"),
     **_classes(_THREAD, "concurrent.futures.thread", "ThreadPoolExecutor"),
     **_classes(_THREAD, "multiprocessing.pool", "ThreadPool"),
@@ -444,7 +476,13 @@ RULES: dict[str, Rule] = {
     **_calls(_INTERPRETER, "gc", "get_count", restore=lambda answer: answer),
     **_calls(_INTERPRETER, "sys", "getallocatedblocks"),
     **_calls(_PROCESSORS, "os", "process_cpu_count sched_getaffinity"),
-    **_calls(_PROCESSORS, "os", "cpu_count", reports=Source.ENVIRONMENT, answer=lambda: PROCESSORS),
+    **_calls(
+        _PROCESSORS,
+        "os",
+        "cpu_count",
+        reports=NondeterminismSource.ENVIRONMENT,
+        answer=lambda: PROCESSORS,
+    ),
     **_calls(_PROCESSORS, "multiprocessing", "cpu_count"),
     **_calls(_PID, "os", "getpid"),
     **_calls(ENVIRONMENT, "os.path", "expanduser expandvars"),
@@ -481,13 +519,13 @@ SHARED_GENERATORS = {"random.": "random.seed", "numpy.random.": "numpy.random.se
 METHODS = {"iterdir": _LISTING, "rglob": _LISTING}
 """Rules for methods by their names alone, whatever object they are called on."""
 
-AUDIT_EVENTS: dict[str, Source] = {
+AUDIT_EVENTS: dict[str, NondeterminismSource] = {
     **dict.fromkeys(
         (
             *("subprocess.Popen", "os.system", "os.exec", "os.fork", "os.forkpty"),
             *("os.posix_spawn", "os.spawn", "os.kill"),
         ),
-        Source.PROCESS,
+        NondeterminismSource.PROCESS,
     ),
     **dict.fromkeys(
         (
@@ -495,22 +533,24 @@ AUDIT_EVENTS: dict[str, Source] = {
             *("socket.getaddrinfo", "socket.gethostbyname", "socket.gethostbyaddr"),
             "socket.gethostname",
         ),
-        Source.SOCKET,
+        NondeterminismSource.SOCKET,
     ),
 }
 """Audit events of Python that the guard reports, named as Python names them."""
 
-C_FUNCTIONS: dict[str, Source] = {
+C_FUNCTIONS: dict[str, NondeterminismSource] = {
     **dict.fromkeys(
-        ("time", "clock", "clock_gettime", "gettimeofday", "times", "getrusage"), Source.CLOCK
+        ("time", "clock", "clock_gettime", "gettimeofday", "times", "getrusage"),
+        NondeterminismSource.CLOCK,
     ),
     **dict.fromkeys(
         ("rand", "random", "getrandom", "getentropy", "arc4random", "drand48", "lrand48"),
-        Source.RANDOM,
+        NondeterminismSource.RANDOM,
     ),
-    "getpid": Source.PID,
+    "getpid": NondeterminismSource.PID,
     **dict.fromkeys(
-        ("getppid", "gettid", "getenv", "gethostname", "sched_getcpu"), Source.ENVIRONMENT
+        ("getppid", "gettid", "getenv", "gethostname", "sched_getcpu"),
+        NondeterminismSource.ENVIRONMENT,
     ),
 }
 """Functions of the C library that the guard reports when nodes load them by ctypes or cffi."""

@@ -19,8 +19,8 @@ from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
-from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
+from rsltrace.trace.model.texts import waiting_ns
 
 NOT_YET: Any = object()
 """The result of an attempt that found no answer."""
@@ -40,7 +40,7 @@ _monotonic = copy_of(time.monotonic)  # type: ignore[arg-type]
 
 def wait_recorded(
     guard: Guard,
-    source: Source,
+    source: NondeterminismSource,
     call: str,
     look: Attempt,
     frame: FrameType,
@@ -88,7 +88,7 @@ def wait_recorded(
     finally:
         # the run ends: None: the run ends before the answer comes, and a re-run waits as long for
         # it.
-        guard.report(source, Mode.RECORD, call, finding_value(number, steps, text), frame)
+        guard.report(source, GuardMode.RECORD, call, finding_value(number, steps, text), frame)
     return decoded(text)
 
 
@@ -127,7 +127,7 @@ def wait_unrecorded(
 
 
 def _deadline_ns(context: SimulationContext, timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
+    return None if timeout_s is None else context.now_ns() + max(waiting_ns(timeout_s), 0)
 
 
 def initial_wait_s(frame: FrameType, timeout_s: float | None) -> float:

@@ -194,9 +194,9 @@ class Job(JobFields):
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of it."""
-        from rsltrace.trace.model.html import Sheet
+        from rsltrace.trace.model.html import HtmlSheet
 
-        sheet = Sheet(f"job {self.source_name}")
+        sheet = HtmlSheet(f"job {self.source_name}")
         sheet.table(
             ("", "runs", "named", "parameters"),
             ((n.kind, n.target, n.name or "", ", ".join(n.parameters)) for n in self.nodes),

@@ -27,7 +27,7 @@ from rsltrace.native.span_recorder import (
     TaskCreation,
 )
 from rsltrace.native.support import patched
-from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
+from rsltrace.simulation.middleware.events.failure import exception_text, user_traceback
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
@@ -299,4 +299,4 @@ class ObservedTask:
 
 def failure_of(error: BaseException) -> CallbackError:
     """Return what a trace keeps of an exception."""
-    return CallbackError(type(error).__qualname__, text_of(error), user_traceback(error))
+    return CallbackError(type(error).__qualname__, exception_text(error), user_traceback(error))

@@ -9,7 +9,7 @@ from functools import wraps
 from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.wire.codec import codec_for
@@ -32,11 +32,11 @@ class NodeObserver:
         self._entities = entities
         self._gid_of = gid_of
         self._local = threading.local()
-        self.main: Entry | None = None
+        self.main: JobEntry | None = None
         """Whose nodes all others of this process are."""
 
     @contextmanager
-    def constructing(self, entry: Entry) -> Iterator[None]:
+    def constructing(self, entry: JobEntry) -> Iterator[None]:
         """Give the nodes that this thread makes the arguments of an entry."""
         self._local.entry = entry
         try:
@@ -98,7 +98,7 @@ class NodeObserver:
 
         @wraps(original)
         def construct(node: Any, node_name: str, *args: Any, **kwargs: Any) -> None:
-            entry: Entry | None = getattr(self._local, "entry", None) or self.main
+            entry: JobEntry | None = getattr(self._local, "entry", None) or self.main
             if entry is not None and kwargs.get("use_global_arguments", True):
                 kwargs = with_arguments(entry, node_name, kwargs)
             original(node, node_name, *args, **kwargs)
@@ -298,7 +298,7 @@ def _is_parameter_service(entity: ObservedEntity) -> bool:
     return entity.kind is EntityKind.SERVICE and name in NODE_SERVICES
 
 
-def with_arguments(entry: Entry, node_name: str, given: dict[str, Any]) -> dict[str, Any]:
+def with_arguments(entry: JobEntry, node_name: str, given: dict[str, Any]) -> dict[str, Any]:
     """Return the keyword arguments of a node to which those of its entry are added.
 
     Its parameters are looked up here: rclpy has no list of arguments in which those of the job win

@@ -13,7 +13,7 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from rsltrace.simulation.middleware.entity import callback_name
-from rsltrace.simulation.middleware.interface import MessageType, source_of
+from rsltrace.simulation.middleware.interface import MessageType, callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 
 
@@ -87,7 +87,7 @@ class ObservedEntities:
         with self._lock:
             if self._news is not None:
                 self._news.append(entity)
-        if source := source_of(runs):
+        if source := callback_source(runs):
             detail["source"] = source
         self._tell(Entity(number, owner, kind, name, type_name, 0, detail))
         return entity

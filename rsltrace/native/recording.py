@@ -17,7 +17,7 @@ from rsltrace.native import support
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
-from rsltrace.run.process import Observer
+from rsltrace.run.process import RunCallbacks
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
 from rsltrace.run.stop_rules import (
     StopInputs,
@@ -28,9 +28,9 @@ from rsltrace.run.stop_rules import (
 )
 from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.loop.stop import Progress, Stop
-from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.simulation.middleware.events.failure import exception_text
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_NATIVE
-from rsltrace.trace.mcap.sink import unfinished
+from rsltrace.trace.mcap.sink import unfinished_path
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
@@ -80,7 +80,7 @@ class NativeRun:
     """
 
     job: Job
-    observer: Observer
+    observer: RunCallbacks
     executor: str
     domain_id: int | None
     policy: str | None = None
@@ -113,7 +113,7 @@ class NativeRun:
             self.note(
                 f"a native run is not steered; without effect in the job: {', '.join(without)}"
             )
-        for place in (output, unfinished(output)):
+        for place in (output, unfinished_path(output)):
             check_output(self.job, place, None)
 
     def create(
@@ -277,7 +277,8 @@ def rclpy_running(*, echo: bool) -> Iterator[None]:
         rclpy.init(args=quiet, signal_handler_options=SignalHandlerOptions.NO)
     except Exception as error:
         raise SetupError(
-            f"ROS's middleware cannot be started: {text_of(error)}; see RMW_IMPLEMENTATION, and "
+            f"ROS's middleware cannot be started: {exception_text(error)}; "
+            "see RMW_IMPLEMENTATION, and "
             "whether the loopback network is up (ip link)"
         ) from error
     try:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.errors import JobError
 from rsltrace.native.callback_observer import failure_of
 from rsltrace.native.node_observer import NodeObserver
@@ -24,7 +24,7 @@ class RunningEntry(threading.Thread):
 
     def __init__(
         self,
-        entry: Entry,
+        entry: JobEntry,
         recorder: SpanRecorder,
         nodes: NodeObserver,
         make_executor: Callable[[], Any],

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.rclpy.boundary.installation import boundary, check_free
+from rsltrace.adapters.rclpy.boundary.installation import boundary, check_no_simulation
 from rsltrace.errors import JobError, NodeError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support
@@ -29,11 +29,11 @@ from rsltrace.native.recording import (
 from rsltrace.native.running_entry import RunningEntry, destroy
 from rsltrace.native.span_recorder import SpanRecorder
 from rsltrace.native.support import domain
-from rsltrace.run.inputs import without_launch_files
+from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.plans.entries import node_entries
-from rsltrace.run.process import Observer, kept_process, search_path
+from rsltrace.run.process import RunCallbacks, preserved_process, search_path
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
+from rsltrace.simulation.middleware.events.failure import exception_text, user_traceback
 
 _CONSTRUCTED_WITHIN_S = 5.0
 """How long others wait for a constructor, which may itself wait for one of them."""
@@ -49,7 +49,7 @@ def run_natively(
     processes: bool = False,
     domain_id: int | None = None,
     policy: str | None = None,
-    observer: Observer | None = None,
+    observer: RunCallbacks | None = None,
 ) -> NativeResult:
     """Run a job natively and record it. What goes wrong in the run is in the result's ``error``.
 
@@ -61,16 +61,16 @@ def run_natively(
 
     :raises JobError, SetupError, OutputError: the run could not start or be written.
     """
-    check_free()
-    expanded = without_launch_files(job)
+    check_no_simulation()
+    expanded = expand_launch_files(job)
     support.check(expanded.job)
     kind: type[SingleProcessRun | MultiProcessRun] = SingleProcessRun
     if processes or support.needs_processes(expanded.job):
         kind = MultiProcessRun
     rules = support.priority_rules(expanded.job, policy)
-    run = kind(expanded.job, observer or Observer(), executor, domain_id, policy, rules)
+    run = kind(expanded.job, observer or RunCallbacks(), executor, domain_id, policy, rules)
     run.notes += expanded.notes
-    with kept_process(), ExitStack() as stack:
+    with preserved_process(), ExitStack() as stack:
         stack.enter_context(search_path(run.job, native=True))
         run.open(stack, output, force=force, echo=echo)
         run.go_on()
@@ -158,7 +158,7 @@ class SingleProcessRun(NativeRun):
         reason = f"{reason} raised {type(error).__qualname__}"
         self.fail(
             NodeError(
-                f"{reason}: {text_of(error)}",
+                f"{reason}: {exception_text(error)}",
                 node=node,
                 entity=one.entry.name,
                 stamp_ns=self.clocks.stamp(time.monotonic_ns()),

@@ -103,7 +103,7 @@ def replay_trace(
     """
     from rsltrace.errors import ReplayError
     from rsltrace.replay.edits import parse_edit
-    from rsltrace.replay.preparation import count_to, prepared
+    from rsltrace.replay.preparation import event_count_to, prepare_replay
     from rsltrace.replay.replaying import replay_prepared
 
     place = None if output is None else Path(output)
@@ -129,12 +129,12 @@ def replay_trace(
     if bag is not None:
         raise ReplayError("a bag is for one node: say which (node=…)")
     folder = None if job_folder is None else Path(job_folder)
-    with prepared(trace, folder, job) as plan:
+    with prepare_replay(trace, folder, job) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
         return replay_prepared(
             plan,
-            until=None if until is None else count_to(plan.trace, until),
+            until=None if until is None else event_count_to(plan.trace, until),
             output=place,
             force=force,
             echo=echo,

@@ -15,7 +15,7 @@ from rsltrace.adapters.workspace.installs import module_folders
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.values.target import target_text
-from rsltrace.run.plans.executables import source_of
+from rsltrace.run.plans.executables import executable_source
 from rsltrace.trace.model.module_search import find_module
 
 _OF_FILES = "file:"
@@ -42,14 +42,14 @@ class JobCodeFile:
         return "has changed" if self.recorded and self.recorded != self.present else ""
 
 
-def code_of(job: Job, sources: dict[str, str]) -> tuple[JobCodeFile, ...]:
+def job_code_files(job: Job, sources: dict[str, str]) -> tuple[JobCodeFile, ...]:
     """Return the code files of a job; ``sources`` are their hashes in a trace."""
     places = [job.resolve(folder) for folder in job.search_path]
     if any(spec.executable is not None for spec in job.nodes):
         places += module_folders(places, ask=False)  # nothing is run to find out
     folders = [str(folder) for folder in places]
     named = dict.fromkeys(name for name in sources if not name.startswith(_OF_FILES))
-    found = {name: file_of(name, folders) for name in named}
+    found = {name: module_file(name, folders) for name in named}
     for name, file in _named_by(job, folders):
         found.setdefault(name, file)
     for _, path in job.model_files():
@@ -75,7 +75,7 @@ def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | No
     for target in targets:
         if target is not None:
             module = target_text(target).partition(":")[0]
-            yield module, file_of(module, folders)
+            yield module, module_file(module, folders)
     for spec in job.nodes:
         if spec.executable is not None:
             yield from _executable(spec.executable, folders)
@@ -83,15 +83,17 @@ def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | No
             yield f"{_OF_FILES}{spec.script}", job.resolve(spec.script)
         elif spec.module is not None:
             inside = f"{spec.module}.__main__"
-            file = file_of(inside, folders)
-            yield (spec.module, file_of(spec.module, folders)) if file is None else (inside, file)
+            file = module_file(inside, folders)
+            yield (
+                (spec.module, module_file(spec.module, folders)) if file is None else (inside, file)
+            )
     for launch in job.launch:
         yield launch.file, job.resolve(launch.file)
 
 
 def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
     try:
-        found = source_of(name, where="")
+        found = executable_source(name, where="")
     except JobError:
         if not any(Path(folder, "package.xml").is_file() for folder in folders):
             yield name, None  # else it is one of an unbuilt package
@@ -100,10 +102,10 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
         yield name, found
     else:
         module = found.partition(":")[0]
-        yield module, file_of(module, folders)
+        yield module, module_file(module, folders)
 
 
-def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
+def module_file(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
     """Return the file a module would be loaded from: of ``folders``, then (``installed``) of
     Python's path."""
     if installed:

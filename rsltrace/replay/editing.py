@@ -80,9 +80,11 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 def arrived_for_action(handle: Any, kind: int) -> Any:
     """Return the part of an action (goal, response, feedback) whose arrival a coroutine is about to
     take, or None."""
-    from rsltrace.adapters.rclpy.actions.parts import Part
+    from rsltrace.adapters.rclpy.actions.parts import ActionEndpoint
 
-    parts = (one for one in _begun_with(handle, kind) if isinstance(one, Part) and one.queue)
+    parts = (
+        one for one in _begun_with(handle, kind) if isinstance(one, ActionEndpoint) and one.queue
+    )
     return next(parts, None) if kind == EventKind.ACTION else None
 
 
@@ -95,12 +97,12 @@ def _begun_with(run: Any, kind: int) -> list[Any]:
 
 def _change_arrival(part: Any, edit: Edit) -> int:
     """Change the first arrival in a queue; return its hash."""
-    from rsltrace.adapters.rclpy.actions.parts import GoalClient, GoalService
+    from rsltrace.adapters.rclpy.actions.parts import ActionService, ActionServiceClient
     from rsltrace.adapters.rclpy.wire.codec import codec_for
 
-    if isinstance(part, GoalService):
+    if isinstance(part, ActionService):
         codec = codec_for(part.srv_type.Request)
-    elif isinstance(part, GoalClient):
+    elif isinstance(part, ActionServiceClient):
         codec = codec_for(part.srv_type.Response)
     else:
         codec = codec_for(part.msg_type)

@@ -13,13 +13,13 @@ from rsltrace.adapters.launch import ros_launch
 from rsltrace.errors import JobError, ReplayError
 from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.job.reading.resolved import job_from_resolved
-from rsltrace.replay.code import JobCodeFile, code_of, file_of
+from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
-from rsltrace.run.inputs import without_launch_files
+from rsltrace.run.inputs import expand_launch_files
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import EventKind
-from rsltrace.trace.model.finding import Mode
+from rsltrace.trace.model.finding import GuardMode
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 
@@ -130,7 +130,7 @@ def _match_folder(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bo
     """Return whether a folder has the files, and whether the job file is unchanged."""
     if not job_name(trace):
         folders = _search(trace, folder)
-        return all(file_of(name, folders, installed=False) for name in wanted), False
+        return all(module_file(name, folders, installed=False) for name in wanted), False
     file = folder / job_name(trace)
     return file.is_file(), file.is_file() and _text(file) == trace.job_text
 
@@ -192,7 +192,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
         return f"its job differs from {folder / name} in {', '.join(differing)}"
     if edits_of(trace):
         return "it holds edits, which the nodes would run with"
-    if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
+    if any(found.mode is GuardMode.RECORD for one in trace.findings.values() for found in one):
         return "it holds recorded answers (of files, sockets, …) that the nodes would get"
     return ""
 
@@ -210,7 +210,7 @@ def _own_job(file: Path, *, bags: bool) -> Job | None:
         # ROS's own launch runs what a launch file tells it to.
         if not launch.file.endswith(_LAUNCH) or ros_launch.can_read(job.resolve(launch.file)):
             return None
-    return without_launch_files(job, programs=False).job
+    return expand_launch_files(job, programs=False).job
 
 
 def _differing(own: Job, job: Job) -> list[str]:
@@ -244,7 +244,7 @@ class EnvironmentChange:
 
 
 @dataclass(frozen=True, slots=True)
-class Preparation:
+class ReplayPlan:
     """A replay that is ready to start. ``distrust`` says why it needs ``trust``, or is "".
 
     ``code`` is what would run, ``changes`` are differences of the environment. ``trace`` is open.
@@ -262,13 +262,13 @@ class Preparation:
 
 
 @contextmanager
-def prepared(
+def prepare_replay(
     path: str | Path,
     job_folder: Path | None = None,
     job: Job | None = None,
     *,
     bags: bool = True,
-) -> Iterator[Preparation]:
+) -> Iterator[ReplayPlan]:
     """Open a trace and find out what replaying it needs. Runs and imports nothing.
 
     Without ``bags``, those of the job need not exist. A given ``job`` replaces the trace's own, and
@@ -289,11 +289,11 @@ def prepared(
             distrust = why_not_trusted(trace, job, folder, named=named, bags=bags)
         else:
             folder, distrust = job.base_dir, ""
-        yield Preparation(
+        yield ReplayPlan(
             trace,
             job,
             folder,
-            code_of(job, trace.metadata(METADATA_SOURCES)),
+            job_code_files(job, trace.metadata(METADATA_SOURCES)),
             tuple(_changes(trace)),
             distrust,
             tuple(_notes(trace)),
@@ -316,7 +316,7 @@ def _notes(trace: Trace) -> Iterator[str]:
         )
 
 
-def count_to(trace: Trace, position: Position) -> int:
+def event_count_to(trace: Trace, position: Position) -> int:
     """Return the number of events up to and including a position.
 
     :raises ReplayError: it is not a position, or before the first event.

@@ -16,14 +16,14 @@ from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
-from rsltrace.replay.preparation import Preparation
+from rsltrace.replay.preparation import ReplayPlan
 from rsltrace.replay.result import ReplayResult
 from rsltrace.replay.verification import EventVerification
-from rsltrace.run import Observer, RunResult
-from rsltrace.run.process import kept_process
+from rsltrace.run import RunCallbacks, RunResult
+from rsltrace.run.process import preserved_process
 from rsltrace.run.session import Session
 from rsltrace.trace.chain import digest_text
-from rsltrace.trace.format import METADATA_EDITS, METADATA_FED
+from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
 from rsltrace.trace.reader import Trace
 
 THE_REPLAY = "the replay"
@@ -32,14 +32,14 @@ _CONTEXT = 5
 
 
 def replay_prepared(
-    plan: Preparation,
+    plan: ReplayPlan,
     *,
     until: int | None = None,
     first: int = 0,
     output: Path | None = None,
     force: bool = False,
     echo: bool = False,
-    observer: Observer | None = None,
+    observer: RunCallbacks | None = None,
     edits: Sequence[Edit] = (),
 ) -> ReplayResult:
     """Run a job as its trace says, ``until`` so many events are verified (None: to the end).
@@ -52,7 +52,7 @@ def replay_prepared(
     :raises EditError: an edit cannot be made.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     """
-    node = plan.trace.metadata(METADATA_FED).get("node")
+    node = plan.trace.metadata(METADATA_RECORDED_INPUTS).get("node")
     if node is not None:
         raise ReplayError(
             f"{plan.trace.name} is a replay of {node} alone, without the nodes that it subscribes "
@@ -89,19 +89,19 @@ def place_for(output: Path | None) -> Iterator[Path]:
 
 
 def _run(
-    plan: Preparation,
+    plan: ReplayPlan,
     verification: EventVerification,
     editing: EditObserver,
     path: Path,
     *,
     force: bool,
-    observer: Observer | None,
+    observer: RunCallbacks | None,
 ) -> RunResult:
     recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
     edits = editing.unmade
     metadata = {METADATA_EDITS: edits_metadata(edits, plan.trace)} if edits else {}
     with (
-        kept_process(),
+        preserved_process(),
         Session(
             plan.job, path, force=force, observer=observer, replay=recorded, metadata=metadata
         ) as session,
@@ -152,7 +152,7 @@ def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
 
 
 def _branch(
-    plan: Preparation,
+    plan: ReplayPlan,
     verification: EventVerification,
     editing: EditObserver,
     run: RunResult,
@@ -184,7 +184,7 @@ def _branch(
 
 
 def _result(
-    plan: Preparation,
+    plan: ReplayPlan,
     verification: EventVerification,
     run: RunResult,
     difference: Diff | None,

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from rsltrace.job import Job
-from rsltrace.run.process import Observer, kept_process
+from rsltrace.run.process import RunCallbacks, preserved_process
 from rsltrace.run.provenance import environment
 from rsltrace.run.session import RunResult, Session
 from rsltrace.run.simulation import Simulation
 
-__all__ = ["Observer", "RunResult", "Simulation", "environment", "record", "run"]
+__all__ = ["RunCallbacks", "RunResult", "Simulation", "environment", "record", "run"]
 
 
 def record(
@@ -43,14 +43,14 @@ def run(
     *,
     force: bool = False,
     echo: bool = False,
-    observer: Observer | None = None,
+    observer: RunCallbacks | None = None,
     replay: str | Path | None = None,
 ) -> RunResult:
     """Do ``record``, but return a failed run's error in the result instead of raising it."""
     path = None if output is None else Path(output)
     earlier = None if replay is None else Path(replay)
     with (
-        kept_process(),
+        preserved_process(),
         Session(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session,
     ):
         session.begin()

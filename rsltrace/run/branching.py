@@ -40,7 +40,7 @@ def run_up_to(session: Session, time_ns: int) -> bool:
     return not session.ended
 
 
-def why_never(job: Job) -> str:
+def why_no_branches(job: Job) -> str:
     """Return why no other run can go on from one of a job, "" if others can."""
     for _, _, rule in given_rules(job):
         if rule.prevents_forks:
@@ -50,7 +50,7 @@ def why_never(job: Job) -> str:
     return ""
 
 
-def why_not(session: Session, job: Job) -> str:
+def why_no_branch(session: Session, job: Job) -> str:
     """Return why a job's run cannot branch off where a session stands, or ""."""
     first = next(_obstacles(session, job), "")
     at = format_seconds(session.loop.now_ns - session.start_ns)

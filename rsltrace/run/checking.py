@@ -11,13 +11,13 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.run.plans.bags import PLAYER
 from rsltrace.run.plans.entries import impossible_starts
-from rsltrace.run.plans.executables import source_of
-from rsltrace.run.process import Observer, kept_process
+from rsltrace.run.plans.executables import executable_source
+from rsltrace.run.process import RunCallbacks, preserved_process
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
 
 if TYPE_CHECKING:
-    from rsltrace.simulation.middleware.overview import Overview
+    from rsltrace.simulation.middleware.overview import GraphOverview
 
 
 _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_events"))
@@ -25,12 +25,12 @@ _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_eve
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class CheckedJob:
     """A job that could run: its start time (ns), graph and notes."""
 
     job: Job
     start_ns: int
-    overview: Overview
+    overview: GraphOverview
     notes: tuple[str, ...]
     unused: tuple[str, ...]
     """What in the job had nothing to do: it names what is not there."""
@@ -42,7 +42,7 @@ class Checked:
         return (*self.overview.problems, *self.unused)
 
 
-def check_job(job: Job, *, everything: bool = False) -> Checked:
+def check_job(job: Job, *, everything: bool = False) -> CheckedJob:
     """Construct a job's nodes and return their graph (``everything``: with each node's default
     topics).
 
@@ -52,8 +52,8 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     from rsltrace.simulation.middleware.overview import graph_overview
 
     notes: list[str] = []
-    observer = Observer(note=notes.append)
-    with kept_process(), Session(job, None, observer=observer) as session:
+    observer = RunCallbacks(note=notes.append)
+    with preserved_process(), Session(job, None, observer=observer) as session:
         session.whole_graph = True
         session.begin()
         if session.error is not None:
@@ -79,7 +79,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
         session.stop = Stop("checked")
         session.finish()
         notes += _divisions_by_nothing(session.job)
-        return Checked(session.job, session.start_ns, found, tuple(notes), unused, interfaces)
+        return CheckedJob(session.job, session.start_ns, found, tuple(notes), unused, interfaces)
 
 
 def _divisions_by_nothing(job: Job) -> Iterator[str]:
@@ -92,7 +92,7 @@ def _divisions_by_nothing(job: Job) -> Iterator[str]:
         from rsltrace.adapters.workspace.installs import module_folders
 
         found = audit_job(
-            job, lambda target, where: source_of(target, where=where), module_folders
+            job, lambda target, where: executable_source(target, where=where), module_folders
         ).found
     except JobError:  # made in Python: there is no source to look at
         return
@@ -102,7 +102,7 @@ def _divisions_by_nothing(job: Job) -> Iterator[str]:
             yield f"{path}:{one.line}:{one.column}: {one.call}, which {one.does}"
 
 
-def _played_and_published(found: Overview) -> Iterator[str]:
+def _played_and_published(found: GraphOverview) -> Iterator[str]:
     """Yield the topics that both a bag and a node publish."""
     for link in found.of_kind("topic"):
         nodes = list(dict.fromkeys(end.node for end in link.senders))

@@ -24,8 +24,8 @@ from rsltrace.forking import (
     why_not,
 )
 from rsltrace.job import FaultSpec, Job
-from rsltrace.run.branching import why_never
-from rsltrace.run.branching import why_not as why_no_branch
+from rsltrace.run.branching import why_no_branch as why_no_branch
+from rsltrace.run.branching import why_no_branches
 from rsltrace.run.inputs import check_output
 from rsltrace.run.session import RunResult, Session
 from rsltrace.trace.writer import TraceWriter
@@ -148,7 +148,7 @@ class ForkedRun:
         """
         old = self.session.job
         job = old.replace(faults=[*old.faults, *faults]) if faults else old
-        why = why_never(old) or why_no_branch(self.session, job)
+        why = why_no_branches(old) or why_no_branch(self.session, job)
         if why:
             raise RunError(f"this simulation cannot fork: {why}")
         return job

@@ -5,28 +5,28 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from rsltrace.adapters.launch.model import Expanded
+from rsltrace.adapters.launch.model import JobExpansion
 from rsltrace.errors import OutputError
 from rsltrace.job import Job
-from rsltrace.run.plans.executables import compiled_file, why_not
+from rsltrace.run.plans.executables import compiled_file, why_not_runnable
 from rsltrace.run.process import search_path
 
 
-def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
+def expand_launch_files(job: Job, *, programs: bool = True) -> JobExpansion:
     """Return a job whose launch files are replaced by nodes; executables are also looked for in its
     ``search_path``. Unless ``programs`` is False, this runs Python launch files.
 
     :raises JobError: a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
-        return Expanded(job)
+        return JobExpansion(job)
     from rsltrace.adapters.launch.expand import expand
 
     def is_process(package: str, executable: str) -> bool:
         return compiled_file(f"{package}/{executable}") is not None
 
     with search_path(job):
-        return expand(job, why_not=why_not, is_process=is_process, programs=programs)
+        return expand(job, why_not=why_not_runnable, is_process=is_process, programs=programs)
 
 
 def check_output(job: Job, output: Path, replay: Path | None) -> None:

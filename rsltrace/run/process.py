@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING
 
 from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
 from rsltrace.adapters.workspace.imports import unbuilt_packages
-from rsltrace.guard.callers import is_own
+from rsltrace.guard.callers import is_rsltrace_module
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.trace.mcap.descriptor import Descriptor
+from rsltrace.trace.mcap.descriptor import PrivateDescriptor
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
@@ -39,7 +39,7 @@ _HEAP_BLOCK_BYTES = 8 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Observer:
+class RunCallbacks:
     """Callbacks of the caller of a run. ``progress`` gets (simulated ns, end ns or None, events)
     about every thousand events; ``interrupt`` gets a function that ends the run properly; ``note``
     gets notes from before the run (an incomplete bag, ignored parts of a launch file).
@@ -52,7 +52,7 @@ class Observer:
 
 
 def housekeeping(
-    dispatcher: Callable[[], Dispatcher], observer: Observer, end_ns: int | None
+    dispatcher: Callable[[], Dispatcher], observer: RunCallbacks, end_ns: int | None
 ) -> Callable[[], int]:
     """Return the function called between time steps: it reports progress and collects garbage.
 
@@ -91,7 +91,7 @@ def gc_disabled() -> Iterator[None]:
 _lives_on = True
 
 
-def end_with_run() -> None:
+def skip_final_collection() -> None:
     """For a command: leave existing objects out of garbage collection until the process ends.
     Python would look at them several times then, a sixth of a short command's time."""
     global _lives_on
@@ -129,7 +129,7 @@ _INSTALLED = frozenset(("site-packages", "dist-packages"))
 
 
 @contextmanager
-def kept_process() -> Iterator[None]:
+def preserved_process() -> Iterator[None]:
     """Restore what user code may change of the process: directory, arguments, environment.
 
     The caller's paths are relative to its directory. Not for a ``Simulation``, whose driver may
@@ -164,7 +164,7 @@ def _kept_streams() -> Iterator[None]:
     copies = {}
     for number in range(3):
         with suppress(OSError):
-            copies[number] = Descriptor.copy_of(number)
+            copies[number] = PrivateDescriptor.copy_of(number)
     try:
         yield
     finally:
@@ -254,7 +254,7 @@ def user_modules(folders: list[str]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for name, module in sorted(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if isinstance(file, str) and not is_own(name) and _is_below(file, below):
+        if isinstance(file, str) and not is_rsltrace_module(name) and _is_below(file, below):
             found[name] = Path(file)
     return found
 

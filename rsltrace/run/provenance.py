@@ -17,8 +17,8 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 
 from rsltrace._version import __version__
-from rsltrace.guard.callers import is_own, is_user_file
-from rsltrace.guard.pin import HASH_SEED, thread_pools
+from rsltrace.guard.callers import is_rsltrace_module, is_user_file
+from rsltrace.guard.pin import HASH_SEED, import_threadpoolctl
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
 from rsltrace.run.process import is_below, is_pytest_module, run_as_main, user_modules
@@ -69,14 +69,14 @@ def _kernels() -> str:
     keys = ("internal_api", "version", "architecture")
     found = {
         " ".join(str(pool[key]) for key in keys if pool.get(key))
-        for pool in thread_pools().threadpool_info()
+        for pool in import_threadpoolctl().threadpool_info()
     }
     return ", ".join(sorted(found))
 
 
 def _is_of_user(module: ModuleType) -> bool:
     file = getattr(module, "__file__", None)
-    return isinstance(file, str) and not is_own(module.__name__) and is_user_file(file)
+    return isinstance(file, str) and not is_rsltrace_module(module.__name__) and is_user_file(file)
 
 
 def _imports_numbers(code: CodeType) -> bool:

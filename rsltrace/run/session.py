@@ -14,23 +14,23 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from rsltrace.adapters.processes.door import ProcessDoor
+from rsltrace.adapters.processes.door import ProcessAdapter
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job
-from rsltrace.run.inputs import check_output, without_launch_files
+from rsltrace.run.inputs import check_output, expand_launch_files
 from rsltrace.run.plans.bags import (
     BagInput,
     bag_notes,
     check_bag_types,
     open_bag_of,
-    start_ns_of,
+    run_start_ns,
     start_players,
 )
 from rsltrace.run.plans.entries import add_job_location, hook_entries, missed_starts, node_entries
 from rsltrace.run.plans.executables import MainProgram
 from rsltrace.run.plans.faults import BagFaults, arm_node_faults, arm_topic_faults, missed_faults
 from rsltrace.run.plans.guard import RunGuard, install_guard, node_packages
-from rsltrace.run.plans.network import clock_notes, clocks_of, network_plan
+from rsltrace.run.plans.network import clock_notes, clock_rules, network_plan
 from rsltrace.run.plans.processes import make_process_adapter
 from rsltrace.run.plans.recorded_order import follow_recording, remember_choices, write_choices
 from rsltrace.run.plans.scheduling import (
@@ -43,7 +43,7 @@ from rsltrace.run.plans.scheduling import (
     unmet_departures,
 )
 from rsltrace.run.process import (
-    Observer,
+    RunCallbacks,
     frozen_gc,
     gc_disabled,
     housekeeping,
@@ -81,15 +81,15 @@ from rsltrace.simulation.loop.timer_queue import timer_queue
 from rsltrace.simulation.middleware.events.event import NameRegistry
 from rsltrace.simulation.middleware.interface import AllTopicFaults
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_STATES
-from rsltrace.trace.mcap.sink import unfinished
-from rsltrace.trace.model.drop import kept_drops
-from rsltrace.trace.model.finding import EndlessWait, GuardCount, kept_waits
+from rsltrace.trace.mcap.sink import unfinished_path
+from rsltrace.trace.model.drop import encode_drops
+from rsltrace.trace.model.finding import EndlessWait, GuardCount, encode_waits
 from rsltrace.trace.model.texts import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.entry import Entry
+    from rsltrace.adapters.rclpy.entry import JobEntry
     from rsltrace.adapters.rclpy.faults import NodeFaults
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.run.state_samples import StateSamples
@@ -160,7 +160,7 @@ class Session:
         *,
         force: bool = False,
         echo: bool = False,
-        observer: Observer | None = None,
+        observer: RunCallbacks | None = None,
         replay: Path | None = None,
         writer: TraceWriter | None = None,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
@@ -177,17 +177,17 @@ class Session:
         self._has_begun = False
         self._force = force
         self._echo = echo
-        self._observer = observer or Observer()
+        self._observer = observer or RunCallbacks()
         self._stack = ExitStack()
         self._writer: TraceWriter | None = None
         self._bags: list[BagInput]
         self._notes: tuple[str, ...]
         self._guarded: RunGuard
-        self._entries: list[Entry]
+        self._entries: list[JobEntry]
         self._plan: NetworkPlan | None
         self._recorded: RecordedOrderObserver | NativeOrderObserver | None
         self._late: LateLibraryScan
-        self._processes: ProcessDoor
+        self._processes: ProcessAdapter
         self._numerics_known = True
         self._samples: StateSamples | None = None
         self._faults: NodeFaults | None = None
@@ -231,11 +231,11 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
-        from rsltrace.adapters.rclpy.boundary.installation import check_free
+        from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation
         from rsltrace.adapters.rclpy.world import World  # keeps functions that the guard redirects
 
-        check_free()
-        expanded = without_launch_files(self.job)
+        check_no_simulation()
+        expanded = expand_launch_files(self.job)
         self.job = expanded.job
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
@@ -264,7 +264,7 @@ class Session:
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
-        self.start_ns = start_ns_of(job, self._bags)
+        self.start_ns = run_start_ns(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
         self._notes = (*notes, *bag_notes(job, self._bags), *clock_notes(job, self.start_ns))
         if self._observer.note is not None:
@@ -298,7 +298,7 @@ class Session:
             world.domain.entities.census = census = NameRegistry()
             world.domain.dispatcher.add_observer(census)
         self._order_events(stack)
-        world.use_clocks(clocks_of(job), self.start_ns)
+        world.use_clocks(clock_rules(job), self.start_ns)
 
     def _loop_class(self) -> type[EventLoop]:
         return OrderedLoop if is_ordered(self.job) else EventLoop
@@ -336,7 +336,7 @@ class Session:
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
         """Create the file, and write what is known before the run."""
         job = self.job
-        for place in (path, unfinished(path)):
+        for place in (path, unfinished_path(path)):
             check_output(job, place, self._replay)
         self._writer = writer = stack.enter_context(
             TraceWriter(path, force=self._force, events_per_segment=job.record.segment_events)
@@ -455,7 +455,7 @@ class Session:
         :raises JobError: its policy cannot be made.
         """
         old = self.job
-        self.job = job = without_launch_files(job).job
+        self.job = job = expand_launch_files(job).job
         if isinstance(self.loop, OrderedLoop) and job.policy != old.policy:
             with self._guarded.engaged():
                 self.loop.policy = continued_policy(
@@ -536,7 +536,7 @@ class Session:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error, outcome.waits),
-                    **kept_drops(queue_drops(outcome.drops)),
+                    **encode_drops(queue_drops(outcome.drops)),
                     **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,
@@ -578,7 +578,7 @@ class Session:
 def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
     """Return the texts of a deadlock and of calls that still waited at the end, for the trace."""
     found = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
-    return found | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
+    return found | encode_waits(replace(one, text=_without_folders(one.text)) for one in waits)
 
 
 def _without_folders(text: str) -> str:

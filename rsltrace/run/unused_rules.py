@@ -19,8 +19,8 @@ from rsltrace.run.plans.entries import entry_keys
 from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.entity import Receiver
-from rsltrace.simulation.middleware.events.event import Asker, NameRegistry
-from rsltrace.trace.model.drop import Drop
+from rsltrace.simulation.middleware.events.event import NameRegistry, NameRequester
+from rsltrace.trace.model.drop import QueueDrops
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
 
@@ -31,10 +31,10 @@ Counts = Mapping[tuple[Receiver, int], int]
 the full one (else 0)."""
 
 
-def queue_drops(counts: Counts) -> list[Drop]:
+def queue_drops(counts: Counts) -> list[QueueDrops]:
     """Return the drops of full queues, ordered by entity."""
     found = [
-        Drop(receiver.entity_id, held or receiver.keep or 0, count, in_outage=held > 0)
+        QueueDrops(receiver.entity_id, held or receiver.keep or 0, count, in_outage=held > 0)
         for (receiver, held), count in counts.items()
     ]
     return sorted(found, key=lambda one: (one.entity, one.in_outage))
@@ -73,9 +73,9 @@ def unused_remappings(job: Job, census: NameRegistry) -> Iterator[str]:
 
     A remapping given to several nodes (``<set_remap>``, a YAML anchor) is used if one node uses it.
     """
-    everybody: list[Asker] = []
-    given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
-    asked_by: dict[str, list[Asker]] = {}
+    everybody: list[NameRequester] = []
+    given: dict[tuple[str, str], tuple[str, list[NameRequester]]] = {}
+    asked_by: dict[str, list[NameRequester]] = {}
     for asker in census.asked:
         asked_by.setdefault(asker.entry_key, []).append(asker)
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
@@ -100,7 +100,7 @@ def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
             yield index, word.partition(":=")[0]
 
 
-def _is_used(old: str, askers: Iterable[Asker], census: NameRegistry) -> bool:
+def _is_used(old: str, askers: Iterable[NameRequester], census: NameRegistry) -> bool:
     bare = old.rpartition(":")[2]
     if bare.startswith("__") or bare in _USUAL:
         return True
@@ -112,13 +112,13 @@ def _is_used(old: str, askers: Iterable[Asker], census: NameRegistry) -> bool:
     )
 
 
-def _forms(name: str, asker: Asker) -> list[str]:
+def _forms(name: str, asker: NameRequester) -> list[str]:
     """Return the names by which a rule may refer to the full name ``name``."""
     folder = asker.namespace.rstrip("/") + "/"
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
 
-def _remapping_note(old: str, askers: list[Asker], census: NameRegistry) -> str:
+def _remapping_note(old: str, askers: list[NameRequester], census: NameRegistry) -> str:
     names = [
         form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]

@@ -22,7 +22,7 @@ from typing import Any
 
 from rsltrace.adapters.workspace.cache import same_place
 from rsltrace.child_processes import Done, Processes, how_ended
-from rsltrace.guard.pin import THREADS
+from rsltrace.guard.pin import THREAD_VARIABLES
 from rsltrace.trace.format import METADATA_STATES
 from rsltrace.trace.reader import Trace
 
@@ -89,7 +89,7 @@ while os.getppid() == parent:
 
 
 @dataclass(frozen=True, slots=True)
-class Surroundings:
+class Perturbation:
     """The perturbed environment of one process; ``values`` has a text for each perturbed kind."""
 
     number: int
@@ -97,9 +97,9 @@ class Surroundings:
     alone: str = ""
     """The only perturbed kind, for a run with just one."""
 
-    def only(self, kind: str) -> Surroundings:
+    def only(self, kind: str) -> Perturbation:
         """Return the same with only one kind perturbed."""
-        return Surroundings(self.number, {kind: self.values[kind]}, kind)
+        return Perturbation(self.number, {kind: self.values[kind]}, kind)
 
     def __str__(self) -> str:
         if not self.values:
@@ -108,7 +108,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class PerturbedRun:
     """The result of one run.
 
     ``digest`` is empty if the process did not finish a trace. ``failure`` says what went wrong, if
@@ -116,7 +116,7 @@ class Recorded:
     trace has, as JSON.
     """
 
-    surroundings: Surroundings
+    perturbation: Perturbation
     path: Path
     digest: str
     events: int
@@ -136,14 +136,14 @@ class Recorded:
         return *self.outcome, self.states
 
 
-def surroundings(number: int, seed: int = 0) -> Surroundings:
+def perturbation(number: int, seed: int = 0) -> Perturbation:
     """Return the perturbation of run ``number``; run 0 has none.
 
     Hash seed and address space are fixed where they are not perturbed, so that a difference has a
     cause.
     """
     if number == 0:
-        return Surroundings(0, {})
+        return Perturbation(0, {})
     chance = random.Random(f"{seed} {number}")
     values = {
         HASH_SEED: str(chance.randrange(2**32)),
@@ -159,7 +159,7 @@ def surroundings(number: int, seed: int = 0) -> Surroundings:
     kernels = core_types()
     if len(kernels) > 1 and not os.environ.get(CORE_TYPE):  # unless the user has chosen one
         values[KERNEL] = chance.choice(kernels)
-    return Surroundings(number, values)
+    return Perturbation(number, values)
 
 
 def core_types() -> tuple[str, ...]:
@@ -182,15 +182,15 @@ def can_fix_addresses() -> bool:
     return done.returncode == 0
 
 
-def record_in(
-    around: Surroundings,
+def record_perturbed(
+    around: Perturbation,
     arguments: Sequence[str],
     folder: Path,
     *,
     path: Path | None = None,
     processes: Processes | None = None,
     timeout_s: float | None = None,
-) -> Recorded:
+) -> PerturbedRun:
     """Record in a perturbed process; ``arguments`` are those of ``record``, paths absolute.
 
     The trace goes to ``path``, or to a new file in ``folder``.
@@ -198,11 +198,11 @@ def record_in(
     path = path or folder / f"{_name(around)}.mcap"
     words = record_words([*arguments, "--sample-states"], path)
     done = run_in(around, words, folder, processes=processes, timeout_s=timeout_s)
-    return recorded(around, path, done)
+    return perturbed_run(around, path, done)
 
 
 def run_in(
-    around: Surroundings,
+    around: Perturbation,
     words: Sequence[str],
     folder: Path,
     *,
@@ -243,16 +243,16 @@ def _working_folder(place: Path, name: str | None) -> Path:
     return cwd
 
 
-def _name(around: Surroundings) -> str:
+def _name(around: Perturbation) -> str:
     return "-".join(("run", str(around.number), *around.alone.split()))
 
 
 def record_words(arguments: Sequence[str], path: Path) -> list[str]:
-    """Return the words of a command whose output ``recorded`` reads."""
+    """Return the words of a command whose output ``perturbed_run`` reads."""
     return ["record", *arguments, "-o", str(path), "--force", "--quiet", "--json"]
 
 
-def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
+def perturbed_run(around: Perturbation, path: Path, done: Done) -> PerturbedRun:
     """Return the result of a run, from what its process has printed."""
     result = _result_in(done.output)
     try:
@@ -268,7 +268,7 @@ def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
     elif not digest and not failure:
         failure = f"it ended with exit status {done.exit_code} and no trace"
     states = _states_in(path) if digest and path.is_file() else ""
-    return Recorded(around, path, digest, events, done.exit_code, failure, done.errors, states)
+    return PerturbedRun(around, path, digest, events, done.exit_code, failure, done.errors, states)
 
 
 def _states_in(path: Path) -> str:
@@ -302,7 +302,7 @@ def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
     if HEAP in values:
         env["PADDING"] = "p" * (int(values[HEAP]) % 4000)
     if THREAD_COUNT in values:
-        env.update(dict.fromkeys(THREADS, values[THREAD_COUNT]))
+        env.update(dict.fromkeys(THREAD_VARIABLES, values[THREAD_COUNT]))
     if KERNEL in values:
         env[CORE_TYPE] = values[KERNEL]
     return env

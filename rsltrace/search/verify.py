@@ -12,14 +12,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rsltrace.child_processes import Processes
-from rsltrace.search.perturb import KINDS, Recorded, Surroundings, record_in, surroundings
+from rsltrace.search.perturb import (
+    KINDS,
+    Perturbation,
+    PerturbedRun,
+    perturbation,
+    record_perturbed,
+)
 
 _TIMEOUT_MIN_S = 120.0
 _TIMEOUT_FACTOR = 30
 _NARROWING_S = 120.0
 """Each perturbation is tried alone only if that takes no longer than this."""
 
-OnRun = Callable[[Recorded], None]
+OnRun = Callable[[PerturbedRun], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,11 +41,11 @@ class HiddenDifference:
     attribute: str
     event: int
     run: int
-    traces: tuple[Recorded, Recorded] | None
+    traces: tuple[PerturbedRun, PerturbedRun] | None
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
+class VerifyResult:
     """The runs and their result.
 
     ``other`` is the first run (by number) that differs from ``first``. ``provoked_by`` are its
@@ -48,12 +54,12 @@ class Verified:
     ``trouble`` is a run that did not finish.
     """
 
-    first: Recorded
+    first: PerturbedRun
     runs: int
     kinds: tuple[str, ...]
     digests: tuple[str, ...]
-    other: Recorded | None = None
-    trouble: Recorded | None = None
+    other: PerturbedRun | None = None
+    trouble: PerturbedRun | None = None
     narrowed: bool = False
     provoked_by: tuple[str, ...] = ()
     by_itself: bool = False
@@ -65,7 +71,7 @@ class Verified:
         return self.other is None and self.trouble is None
 
 
-class Verification:
+class DeterminismTest:
     """Runs one job many times. ``arguments`` are those of ``rsltrace record``, paths absolute.
 
     Traces go to ``folder``; those equal to the first one are deleted unless ``keep``.
@@ -89,22 +95,22 @@ class Verification:
         self._keep = keep
         self._processes = Processes()
 
-    def verify(self, runs: int, on_run: OnRun = lambda recorded: None) -> Verified:
+    def verify(self, runs: int, on_run: OnRun = lambda recorded: None) -> VerifyResult:
         """Record ``runs`` times, until two runs differ or one does not finish."""
         begin = time.monotonic()
         with self._ending():
-            first = self._record(surroundings(0))
+            first = self._record(perturbation(0))
             on_run(first)
             took_s = time.monotonic() - begin
             if first.failure:
-                return Verified(first, 1, (), (first.digest,), trouble=first)
+                return VerifyResult(first, 1, (), (first.digest,), trouble=first)
             if self._timeout_s is None:
                 self._timeout_s = max(_TIMEOUT_MIN_S, _TIMEOUT_FACTOR * took_s)
             done = [first, *self._others(first, runs, on_run)]
             differing = [one for one in done if one.outcome != first.outcome]
             ended = [one for one in differing if one.digest]
-            kinds = {kind for one in done for kind in one.surroundings.values}
-            tried = Verified(
+            kinds = {kind for one in done for kind in one.perturbation.values}
+            tried = VerifyResult(
                 first,
                 len(done),
                 tuple(kind for kind in KINDS if kind in kinds),
@@ -117,19 +123,19 @@ class Verification:
                 return replace(tried, trouble=differing[0])
             return self._narrowed(replace(tried, other=ended[0]), took_s)
 
-    def _hidden(self, tried: Verified, other: Recorded, took_s: float) -> Verified:
+    def _hidden(self, tried: VerifyResult, other: PerturbedRun, took_s: float) -> VerifyResult:
         """Find what provokes it that states differ, and where: the two runs are made again with
         the states after all events in their traces."""
         first = tried.first
         narrowed = self._narrowed(replace(tried, other=other), took_s)
         event, node, attribute = _first_sample(first.states, other.states)
-        around = other.surroundings
+        around = other.perturbation
         if narrowed.by_itself:
-            around = Surroundings(0, {}, "again")
+            around = Perturbation(0, {}, "again")
         elif narrowed.provoked_by:
             around = around.only(narrowed.provoked_by[0])
         one, two = (
-            record_in(
+            record_perturbed(
                 perturbed,
                 (*self._arguments, "--set", "guard.state=record"),
                 self._folder,
@@ -137,10 +143,10 @@ class Verification:
                 processes=self._processes,
                 timeout_s=self._timeout_s,
             )
-            for name, perturbed in (("a", first.surroundings), ("b", around))
+            for name, perturbed in (("a", first.perturbation), ("b", around))
         )
         differ = one.digest and two.digest and one.digest != two.digest
-        number = other.surroundings.number
+        number = other.perturbation.number
         hidden = HiddenDifference(node, attribute, event, number, (one, two) if differ else None)
         return replace(narrowed, other=None, hidden=hidden)
 
@@ -151,8 +157,8 @@ class Verification:
         finally:
             self._processes.kill()
 
-    def _record(self, around: Surroundings) -> Recorded:
-        return record_in(
+    def _record(self, around: Perturbation) -> PerturbedRun:
+        return record_perturbed(
             around,
             self._arguments,
             self._folder,
@@ -160,11 +166,11 @@ class Verification:
             timeout_s=self._timeout_s,
         )
 
-    def _others(self, first: Recorded, runs: int, on_run: OnRun) -> list[Recorded]:
+    def _others(self, first: PerturbedRun, runs: int, on_run: OnRun) -> list[PerturbedRun]:
         """Return the other runs by number; no new ones begin after a difference."""
         differs = threading.Event()
 
-        def next_one(around: Surroundings) -> Recorded | None:
+        def next_one(around: Perturbation) -> PerturbedRun | None:
             if differs.is_set():
                 return None
             recorded = self._record(around)
@@ -175,7 +181,7 @@ class Verification:
         done = []
         with self._pool() as pool:
             waiting = [
-                pool.submit(next_one, surroundings(number, self._seed)) for number in range(1, runs)
+                pool.submit(next_one, perturbation(number, self._seed)) for number in range(1, runs)
             ]
             for future in as_completed(waiting):
                 recorded = future.result()
@@ -185,7 +191,7 @@ class Verification:
                 on_run(recorded)
                 if recorded.outcome == first.outcome:
                     self._forget(recorded)
-        return sorted(done, key=lambda one: one.surroundings.number)
+        return sorted(done, key=lambda one: one.perturbation.number)
 
     @contextmanager
     def _pool(self) -> Iterator[ThreadPoolExecutor]:
@@ -198,24 +204,24 @@ class Verification:
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
 
-    def _forget(self, recorded: Recorded) -> None:
+    def _forget(self, recorded: PerturbedRun) -> None:
         if not self._keep:
             recorded.path.unlink(missing_ok=True)
 
-    def _narrowed(self, found: Verified, took_s: float) -> Verified:
+    def _narrowed(self, found: VerifyResult, took_s: float) -> VerifyResult:
         """Try a second unperturbed run, then each perturbation alone."""
         first, other = found.first, found.other
         assert other is not None
-        again = self._record(Surroundings(0, {}, "again"))
+        again = self._record(Perturbation(0, {}, "again"))
         if again.kept != first.kept:
             self._forget(again)
             return replace(found, narrowed=True, by_itself=True)
         self._forget(again)
-        kinds = list(other.surroundings.values)
+        kinds = list(other.perturbation.values)
         if took_s * len(kinds) > _NARROWING_S * self._workers:
             return found
         with self._pool() as pool:
-            runs = list(pool.map(self._record, map(other.surroundings.only, kinds)))
+            runs = list(pool.map(self._record, map(other.perturbation.only, kinds)))
         provoked = tuple(
             kind for kind, run in zip(kinds, runs, strict=True) if run.kept != first.kept
         )

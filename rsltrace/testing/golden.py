@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
 
 from rsltrace.errors import OutputError, RsltraceError, TraceError
-from rsltrace.trace.model.regular_file import in_the_way, replacement_of
+from rsltrace.trace.model.regular_file import not_replaceable, replacement_of
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
@@ -124,7 +124,7 @@ def _write(run: Path, golden: Path) -> bool:
                 return False
     except RsltraceError:
         pass  # missing, damaged or of an older format: what the update is for
-    if kind := in_the_way(golden):
+    if kind := not_replaceable(golden):
         raise OutputError(f"the golden trace {golden} cannot be written: it is {kind}")
     try:
         golden.parent.mkdir(parents=True, exist_ok=True)

@@ -16,7 +16,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.format import CDR_HEADER
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import CodeLine
-from rsltrace.trace.model.finding import Finding, Mode, Source
+from rsltrace.trace.model.finding import Finding, GuardMode, NondeterminismSource
 
 # Strings of 16-bit characters (``wstring``), which rosbags does not read. In CDR, as ROS 2 writes
 # it, each is a sequence of 32-bit numbers, one per UTF-16 unit. So a schema is read with a message
@@ -136,7 +136,7 @@ def unpack_finding(data: bytes) -> Finding:
         _check_header(data)
         event, entity = _DETAIL_HEAD.unpack_from(data, 4)
         node, source, mode, *texts = _read_strings(data, 4 + _DETAIL_HEAD.size, 6)
-        return Finding(event, entity, node, Source(source), Mode(mode), *texts)
+        return Finding(event, entity, node, NondeterminismSource(source), GuardMode(mode), *texts)
     except (struct.error, ValueError) as error:
         raise TraceError(f"a finding of the trace cannot be read: {error}") from error
 

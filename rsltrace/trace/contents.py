@@ -27,7 +27,7 @@ _ENTITY = int(OutputKind.ENTITY)
 
 
 @dataclass(slots=True)
-class Series:
+class Occurrences:
     """Occurrences of something: their number, the first and the last (simulated ns)."""
 
     count: int = 0
@@ -48,14 +48,14 @@ class Series:
 
 
 @dataclass(slots=True)
-class Counts:
+class TraceCounts:
     """The counts of a whole trace, by entity and by kind.
 
     The creation of an entity is an output (counted by kind), but not one of that entity.
     """
 
-    events: dict[int, Series] = field(default_factory=dict)
-    outputs: dict[int, Series] = field(default_factory=dict)
+    events: dict[int, Occurrences] = field(default_factory=dict)
+    outputs: dict[int, Occurrences] = field(default_factory=dict)
     event_kinds: Counter[int] = field(default_factory=Counter)
     output_kinds: Counter[int] = field(default_factory=Counter)
 
@@ -65,25 +65,25 @@ class Counts:
         return series.rate_hz if series else None
 
 
-def count(trace: Trace) -> Counts:
+def count_trace(trace: Trace) -> TraceCounts:
     """Count all events and outputs of ``trace``, a segment at a time.
 
     Raises TraceError where the trace is damaged.
     """
-    counts = Counts()
+    counts = TraceCounts()
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         stamps = events["stamp"]
-        add_series(counts.events, events["entity"], stamps)
+        add_occurrences(counts.events, events["entity"], stamps)
         own = outputs[outputs["kind"] != _ENTITY]
         owners = (own["event"] - events["index"][0]).astype(np.intp)
-        add_series(counts.outputs, own["entity"], stamps[owners])
+        add_occurrences(counts.outputs, own["entity"], stamps[owners])
         _add_kinds(counts.event_kinds, events["kind"])
         _add_kinds(counts.output_kinds, outputs["kind"])
     return counts
 
 
-def add_series(
-    series: dict[int, Series], entities: npt.NDArray[np.uint32], stamps: npt.NDArray[np.uint64]
+def add_occurrences(
+    series: dict[int, Occurrences], entities: npt.NDArray[np.uint32], stamps: npt.NDArray[np.uint64]
 ) -> None:
     """Add rows to the series of their entities."""
     ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
@@ -93,7 +93,7 @@ def add_series(
     np.maximum.at(last, places, stamps)
     rows = zip(ids.tolist(), counts.tolist(), first.tolist(), last.tolist(), strict=True)
     for entity, number, first_ns, last_ns in rows:
-        series.setdefault(entity, Series()).add(number, first_ns, last_ns)
+        series.setdefault(entity, Occurrences()).add(number, first_ns, last_ns)
 
 
 def _add_kinds(counter: Counter[int], kinds: npt.NDArray[np.unsignedinteger]) -> None:

@@ -31,7 +31,7 @@ from rsltrace.trace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.model.texts import PLACEHOLDERS
 
 if TYPE_CHECKING:
-    from rsltrace.trace.leaves import Leaf
+    from rsltrace.trace.leaves import ValueField
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
 _CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
@@ -114,7 +114,7 @@ class Decoder:
             if name not in PLACEHOLDERS
         }
 
-    def leaves(self) -> list[Leaf]:
+    def leaves(self) -> list[ValueField]:
         """Return the fields of the message that hold values."""
         from rsltrace.trace.leaves import leaves_of
 

@@ -6,7 +6,7 @@ import json
 from collections.abc import Iterable
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.finding import GuardCount, Mode, Source
+from rsltrace.trace.model.finding import GuardCount, GuardMode, NondeterminismSource
 
 
 def counts_text(counts: Iterable[GuardCount]) -> str:
@@ -19,7 +19,9 @@ def parse_counts(text: str) -> tuple[GuardCount, ...]:
     """Return the counts of ``counts_text``. Raises TraceError for anything else."""
     try:
         return tuple(
-            GuardCount(Source(source), Mode(mode), str(node), str(call), int(count))
+            GuardCount(
+                NondeterminismSource(source), GuardMode(mode), str(node), str(call), int(count)
+            )
             for source, mode, node, call, count in json.loads(text)
         )
     except (ValueError, TypeError, RecursionError) as error:

@@ -34,10 +34,10 @@ from rsltrace.trace.mcap.records import (
     MESSAGE_HEAD,
     RECORD_HEAD,
     ChunkIndexEntry,
-    Damaged,
-    Fields,
+    DamageError,
     McapHeader,
     McapSchema,
+    RecordFields,
     RecordSpan,
     TruncatedFile,
     records_in,
@@ -64,7 +64,7 @@ def read_body(source: ByteSource, span: RecordSpan, opcode: int, what: str) -> b
     """Return the body of the record at ``span``. Raises TraceError if it is not such a record."""
     try:
         return mcap_summary.read_body(source, span, opcode)
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, span.offset, what, error) from error
 
 
@@ -72,7 +72,7 @@ def read_chunk(source: ByteSource, span: RecordSpan, size_max: int = CHUNK_BYTES
     """Return the records of the chunk at ``span``, their CRC checked. Raises TraceError."""
     try:
         return mcap_chunk.read_chunk(source, span, size_max)
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, span.offset, "the chunk", error) from error
 
 
@@ -82,13 +82,13 @@ def read_attachment(source: ByteSource, span: RecordSpan) -> bytes:
     content, crc = body[:-_CRC_BYTES], body[-_CRC_BYTES:]
     try:
         if crc32(content) != int.from_bytes(crc, "little"):
-            raise Damaged("its checksum does not match")
-        fields = Fields(content)
+            raise DamageError("its checksum does not match")
+        fields = RecordFields(content)
         fields.take(16)  # times
         fields.text()
         fields.text()
         return fields.take(fields.u64())
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, span.offset, "the attachment", error) from error
 
 
@@ -106,14 +106,14 @@ def read_metadata(source: ByteSource, span: RecordSpan, *, checked: bool = False
 
     ``checked``: it must have one. Raises TraceError.
     """
-    fields = Fields(read_body(source, span, Opcode.METADATA, "the metadata"))
+    fields = RecordFields(read_body(source, span, Opcode.METADATA, "the metadata"))
     try:
         name, mapping = fields.text(), fields.mapping()
         said = mapping.pop(CHECKSUM_KEY, None)
         if (checked or said is not None) and said != metadata_checksum(name, mapping):
-            raise Damaged(f"the checksum of {name!r} does not match")
+            raise DamageError(f"the checksum of {name!r} does not match")
         return mapping
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, span.offset, "the metadata", error) from error
 
 
@@ -121,10 +121,10 @@ def messages_in(records: bytes) -> Iterator[tuple[int, int]]:
     """Yield (channel, offset) of the messages of a chunk, in order. Raises Damaged."""
     for number, (opcode, start, end) in enumerate(records_in(records)):
         if number >= _RECORDS_PER_CHUNK_MAX:
-            raise Damaged("it holds more records than a chunk of a trace")
+            raise DamageError("it holds more records than a chunk of a trace")
         if opcode == MESSAGE:
             if end - start < _MESSAGE_BODY_MIN:
-                raise Damaged(f"a message at {start} of the chunk is too short")
+                raise DamageError(f"a message at {start} of the chunk is too short")
             channel_id = int.from_bytes(records[start : start + 2], "little")
             yield channel_id, start - RECORD_HEAD.size
 
@@ -209,7 +209,7 @@ def read_header(source: ByteSource) -> tuple[McapHeader, int]:
         raise TraceFormatError(
             f"{source.name} ends in its first record: nothing can be read of it"
         ) from error
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, len(MAGIC), "the header", error) from error
 
 
@@ -219,7 +219,7 @@ def read_summary(source: ByteSource) -> TraceIndex:
     index = TraceIndex(complete=True, header=header)
     try:
         footer = mcap_summary.read_footer(source)
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, source.size, "the footer before the end", error) from error
     # Other writers may leave out the summary, or its CRC.
     if not footer.summary_start or not footer.crc:
@@ -227,7 +227,7 @@ def read_summary(source: ByteSource) -> TraceIndex:
     index.summary_start = footer.summary_start
     try:
         summary = mcap_summary.read_summary(source, footer)
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, footer.summary_start, "the summary", error) from error
     index.take(summary)
     index.chunks_with = lambda channels: [_chunk_entry(c) for c in summary.chunks(channels)]

@@ -15,7 +15,7 @@ _DEPTH_MAX = 6
 
 
 @dataclass(frozen=True, slots=True)
-class Leaf:
+class ValueField:
     """A field by its name, with ``[]`` behind each array, and the type of one value (``float32``,
     ``string``; "" for messages).
 
@@ -27,24 +27,24 @@ class Leaf:
     length_max: int | None = None
 
 
-def leaves_of(name: str, types: dict[str, Any]) -> list[Leaf]:
+def leaves_of(name: str, types: dict[str, Any]) -> list[ValueField]:
     """Return the value fields of a type, which is defined in ``types``."""
     return list(_leaves(name, types, "", _DEPTH_MAX))
 
 
-def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator[Leaf]:
+def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator[ValueField]:
     for field, description in types[of][1]:
         name, (kind, detail) = f"{prefix}{field}", description
         if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
             (inner, inner_detail), size = detail
             if kind == Nodetype.SEQUENCE:
                 base = inner_detail[0] if inner == Nodetype.BASE else ""
-                yield Leaf(name, base, size or 1 << 20)
+                yield ValueField(name, base, size or 1 << 20)
             name, kind, detail = f"{name}[]", inner, inner_detail
         if kind == Nodetype.BASE:
             if field != NO_FIELD:
-                yield Leaf(name, detail[0])
+                yield ValueField(name, detail[0])
         elif detail == WIDE_TEXT_TYPE:
-            yield Leaf(name, "string")
+            yield ValueField(name, "string")
         elif depth > 1:
             yield from _leaves(detail, types, f"{name}.", depth - 1)

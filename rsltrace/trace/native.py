@@ -62,7 +62,7 @@ def timings(trace: Trace) -> npt.NDArray[np.void]:
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class DurationStatistics:
     """Statistics of durations in nanoseconds: number, median, 95 % quantile and maximum."""
 
     count: int
@@ -71,12 +71,12 @@ class Spread:
     max_ns: int
 
 
-def spread(values: npt.NDArray[np.int64]) -> Spread | None:
+def duration_statistics(values: npt.NDArray[np.int64]) -> DurationStatistics | None:
     """Return the statistics of durations, None without any."""
     if not len(values):
         return None
     median, p95 = np.quantile(values, (0.5, 0.95)).astype(np.int64).tolist()
-    return Spread(len(values), median, p95, int(values.max()))
+    return DurationStatistics(len(values), median, p95, int(values.max()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,10 +90,10 @@ class CallbackFigures:
     """
 
     entity: Entity
-    duration: Spread
-    wait: Spread | None
-    latency: Spread | None
-    jitter: Spread | None
+    duration: DurationStatistics
+    wait: DurationStatistics | None
+    latency: DurationStatistics | None
+    jitter: DurationStatistics | None
     lost: int | None
 
 
@@ -111,7 +111,7 @@ def callback_figures(trace: Trace) -> list[CallbackFigures]:
             continue
         mine = events["entity"] == number
         own = rows[mine]
-        duration = spread(own["duration"].astype(np.int64))
+        duration = duration_statistics(own["duration"].astype(np.int64))
         assert duration is not None
         inputs = entity.kind in _SUBSCRIPTION_INPUT
         figures.append(
@@ -162,16 +162,16 @@ def senders_of(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int
     return senders
 
 
-def _since(rows: npt.NDArray[np.void], column: str) -> Spread | None:
+def _since(rows: npt.NDArray[np.void], column: str) -> DurationStatistics | None:
     known = rows[rows[column] != 0]
-    return spread(known["wall"].astype(np.int64) - known[column].astype(np.int64))
+    return duration_statistics(known["wall"].astype(np.int64) - known[column].astype(np.int64))
 
 
-def _jitter(entity: Entity, rows: npt.NDArray[np.void]) -> Spread | None:
+def _jitter(entity: Entity, rows: npt.NDArray[np.void]) -> DurationStatistics | None:
     period = entity.detail.get("period_ns")
     if entity.kind is not EntityKind.TIMER or not isinstance(period, int):
         return None
-    return spread(np.abs(np.diff(rows["steady"].astype(np.int64)) - period))
+    return duration_statistics(np.abs(np.diff(rows["steady"].astype(np.int64)) - period))
 
 
 def missing_numbers(

@@ -25,7 +25,7 @@ from rsltrace.trace.index import (
     read_chunk,
 )
 from rsltrace.trace.mcap.chunk import message_at
-from rsltrace.trace.mcap.records import Damaged, Fields, RecordSpan
+from rsltrace.trace.mcap.records import DamageError, RecordFields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 
 _CHUNKS_CACHED = 4
@@ -62,7 +62,7 @@ class PayloadReader:
         records = self._records(entry.span)
         try:
             message = message_at(records, offsets[place], channel_id)
-        except Damaged as error:
+        except DamageError as error:
             raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
         if message.sequence != sequence:
             raise damage_error(
@@ -85,7 +85,7 @@ class PayloadReader:
                 for offset, channel_id in sorted(places):
                     _, sequence, log_time, start, end = message_at(records, offset, channel_id)
                     yield channel_id, log_time, sequence, records[start:end]
-            except Damaged as error:
+            except DamageError as error:
                 raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
 
     def messages_with_text(
@@ -122,14 +122,14 @@ class PayloadReader:
                     if at >= offset:
                         found.setdefault(channel_id, []).append(place)
                     at = folded.find(text, end)
-        except Damaged as error:
+        except DamageError as error:
             raise damage_error(self._source, span.offset, "the chunk", error) from error
         return found
 
     def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
         try:
             return self._index.chunks_with(channel_ids)
-        except Damaged as error:
+        except DamageError as error:
             raise TraceError(f"{self._source.name}: the index is damaged ({error})") from error
 
     def _of_channel(self, channel_id: int) -> tuple[list[int], list[ChunkEntry]]:
@@ -156,17 +156,17 @@ class PayloadReader:
             try:
                 walked = messages_in(self._records(span))
                 return [offset for channel, offset in walked if channel == channel_id]
-            except Damaged as error:
+            except DamageError as error:
                 raise damage_error(self._source, span.offset, "the chunk", error) from error
         body = read_body(self._source, index_span, Opcode.MESSAGE_INDEX, "the message index")
         try:
-            fields = Fields(body)
+            fields = RecordFields(body)
             if fields.u16() != channel_id:
-                raise Damaged("it is that of another channel")
+                raise DamageError("it is that of another channel")
             entries = fields.take(fields.u32())
             if len(entries) % _INDEX_DTYPE.itemsize:
-                raise Damaged("an entry is cut off")
-        except Damaged as error:
+                raise DamageError("an entry is cut off")
+        except DamageError as error:
             raise damage_error(
                 self._source, index_span.offset, "the message index", error
             ) from error

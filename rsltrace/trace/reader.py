@@ -55,22 +55,22 @@ from rsltrace.trace.mcap.reader import McapSummary, check_data, has_end, read_bo
 from rsltrace.trace.mcap.records import (
     ENTITY_ID_MAX,
     MAGIC,
-    Damaged,
+    DamageError,
     McapHeader,
     parse_channel,
     parse_schema,
 )
 from rsltrace.trace.mcap.source import ByteSource, open_source
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, Event, Output, OutputKind
-from rsltrace.trace.model.finding import Finding, GuardCount, Mode
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, EventRecord, Output, OutputKind
+from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder, Decoders
-    from rsltrace.trace.leaves import Leaf
+    from rsltrace.trace.leaves import ValueField
     from rsltrace.trace.tables import TraceTables
 
 # Checking a whole trace: every byte against the file's checksum, every event against its hashes.
@@ -84,7 +84,7 @@ def check_data_section(source: ByteSource, summary_start: int) -> None:
     """Raise TraceError unless the bytes before the summary match its checksum."""
     try:
         check_data(source, summary_start)
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, 0, "the data section", error) from error
 
 
@@ -99,7 +99,7 @@ def check_records(source: ByteSource, index: TraceIndex) -> None:
         for opcode, span in walk_records(source, len(MAGIC), index.summary_start):
             if opcode in _DEFINITIONS:
                 _add_unique(summary, opcode, read_body(source, span, opcode))
-    except Damaged as error:
+    except DamageError as error:
         raise damage_error(source, 0, "the data section", error) from error
     found = TraceIndex(complete=True, header=index.header)
     found.take(summary)
@@ -118,7 +118,7 @@ def _add_unique(summary: McapSummary, opcode: int, body: bytes) -> None:
         channel = parse_channel(body)
         is_only = summary.channels.setdefault(channel.id, channel) == channel
     if not is_only:
-        raise Damaged("a channel or schema is defined twice, in two ways")
+        raise DamageError("a channel or schema is defined twice, in two ways")
 
 
 def check_hashes(source: ByteSource, segments: SegmentReader) -> None:
@@ -382,7 +382,7 @@ class Trace:
             low, high = np.searchsorted(outputs["event"], bounds).tolist()
             yield outputs[low:high]
 
-    def event(self, index: int) -> Event:
+    def event(self, index: int) -> EventRecord:
         """Return event number ``index``. Raises IndexError if there is none."""
         segment = self._segment_of(index)
         first = int(self.segments["first_event"][segment])
@@ -399,7 +399,7 @@ class Trace:
     def findings(self) -> dict[int, list[Finding]]:
         """The guard's findings by event, in order; without entries for events that have none."""
         kept = {
-            event: [finding for finding in answers if finding.mode is not Mode.VIRTUAL]
+            event: [finding for finding in answers if finding.mode is not GuardMode.VIRTUAL]
             for event, answers in self.answers.items()
         }
         return {event: findings for event, findings in kept.items() if findings}
@@ -423,7 +423,7 @@ class Trace:
         return lines
 
     @cached_property
-    def sent_from(self) -> dict[tuple[int, int], list[CodeLine]]:
+    def output_lines(self) -> dict[tuple[int, int], list[CodeLine]]:
         """The code lines that outputs came from, by their entity and the one whose callback ran."""
         lines: dict[tuple[int, int], list[CodeLine]] = {}
         for line in chain.from_iterable(self.code_lines.values()):
@@ -497,7 +497,7 @@ class Trace:
         for _, stamp_ns, sequence, data in self.messages_of(channels):
             yield stamp_ns, sequence, data
 
-    def holding(self, channel: int, first: int, last: int, text: bytes) -> Iterator[int]:
+    def messages_with_text(self, channel: int, first: int, last: int, text: bytes) -> Iterator[int]:
         """Yield the numbers ``first`` … ``last`` of a channel's messages whose bytes contain
         ``text``, which is lower case, in any case; it may span two messages."""
         yield from self._payloads.messages_with_text(channel, first, last, text)
@@ -518,7 +518,7 @@ class Trace:
                         return fields
         return None
 
-    def leaves(self, topic: str) -> list[Leaf]:
+    def leaves(self, topic: str) -> list[ValueField]:
         """Return the fields of a topic's messages that hold values.
 
         Raises TraceError if the topic has no messages here, or no usable schema.
@@ -555,9 +555,9 @@ class Trace:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows, or why the trace cannot be read."""
-        from rsltrace.trace.model.html import Sheet
+        from rsltrace.trace.model.html import HtmlSheet
 
-        sheet = Sheet(f"trace {Path(self.name).name}")
+        sheet = HtmlSheet(f"trace {Path(self.name).name}")
         if not self.complete:
             sheet.line("cut off: the run was killed or crashed, or is still going on")
         try:

@@ -33,7 +33,7 @@ from rsltrace.trace.index import (
 )
 from rsltrace.trace.mcap.chunk import read_chunk
 from rsltrace.trace.mcap.reader import McapSummary, length_by_fields, read_body, whole_records
-from rsltrace.trace.mcap.records import Damaged, Fields, RecordSpan
+from rsltrace.trace.mcap.records import DamageError, RecordFields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 from rsltrace.trace.segments import check_numbered, events_in, outputs_in, segment_row
 
@@ -74,7 +74,7 @@ class _Scanner:
                 if opcode == Opcode.DATA_END:
                     break
                 self._whole, self._what = span.end, "the record"
-        except Damaged as error:
+        except DamageError as error:
             raise self._damaged(error) from error
         if METADATA_FORMAT not in summary.metadata:
             if number == 0 and begins_a_trace(index.header):
@@ -106,11 +106,11 @@ class _Scanner:
         body = read_body(self._source, span, opcode)
         said = length_by_fields(opcode, body)
         if said != len(body):
-            raise Damaged(f"its length is given as {len(body)}, its fields say {said}")
+            raise DamageError(f"its length is given as {len(body)}, its fields say {said}")
         if opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(span, Fields(body).u16())
+            self._message_index(span, RecordFields(body).u16())
         elif opcode in _NAMED_AFTER:
-            fields = Fields(body)
+            fields = RecordFields(body)
             fields.take(_NAMED_AFTER[opcode])
             metadata, attachments = self._summary.metadata, self._summary.attachments
             (metadata if opcode == Opcode.METADATA else attachments)[fields.text()] = span
@@ -122,7 +122,7 @@ class _Scanner:
 
     def _message_index(self, span: RecordSpan, channel_id: int) -> None:
         if not self._chunks or channel_id not in self._chunks[-1].counts:
-            raise Damaged("it is not the index of the chunk before it")
+            raise DamageError("it is not the index of the chunk before it")
         last = self._chunks[-1]
         self._chunks[-1] = last._replace(indexes={**last.indexes, channel_id: span})
 
@@ -139,14 +139,14 @@ class _Scanner:
         else:
             counts = Counter(channel_id for channel_id, _ in messages_in(records))
             for channel_id in counts.keys() - self._summary.channels.keys():
-                raise Damaged(f"it has messages of channel {channel_id}, which is not there")
+                raise DamageError(f"it has messages of channel {channel_id}, which is not there")
         self._chunks.append(ChunkEntry(span, counts, {}))
 
     def _check_channels(self) -> None:
         """Check that rsltrace's channels precede the chunks: no checksum covers their names."""
         topics = {channel.topic for channel in self._summary.channels.values()}
         for topic in _OWN - topics:
-            raise Damaged(f"there is no channel {topic} before it")
+            raise DamageError(f"there is no channel {topic} before it")
 
     def _events(self, span: RecordSpan, records: bytes) -> int:
         events = events_in(records, self._event_channel)
@@ -158,13 +158,13 @@ class _Scanner:
         check_numbered(events, first_event)
         outputs_span, outputs_count = self._pending_outputs
         if outputs_count != int(events["outputs"].sum(dtype=np.uint64)):
-            raise Damaged("its events have other outputs than are in the file")
+            raise DamageError("its events have other outputs than are in the file")
         firsts = (first_event, first_output)
         self._rows.append(segment_row(events, outputs_count, firsts, span, outputs_span)[0])
         self._pending_outputs = (RecordSpan(0, 0), 0)
         return len(events)
 
-    def _damaged(self, why: Damaged) -> TraceError:
+    def _damaged(self, why: DamageError) -> TraceError:
         name, whole, size = self._source.name, self._whole, self._source.size
         return TraceError(
             f"{name}: {self._what} at offset {whole} is damaged ({why}): the first {whole} of "

@@ -28,9 +28,16 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.index import damage_error, read_chunk
 from rsltrace.trace.mcap.chunk_builder import ChunkBody, rows_chunk
-from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, Damaged, RecordSpan
+from rsltrace.trace.mcap.records import MESSAGE, RECORD_HEAD, DamageError, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
-from rsltrace.trace.model.event import NO_SEQUENCE, Event, EventFlag, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import (
+    NO_SEQUENCE,
+    EventFlag,
+    EventKind,
+    EventRecord,
+    Output,
+    OutputKind,
+)
 
 _SEQUENCE_MASK = 2**32 - 1
 _CHAINED_DTYPE = np.dtype([("chain_hash", "<u8"), ("rest", f"V{EVENT_REST_DTYPE.itemsize}")])
@@ -150,14 +157,14 @@ def check_numbered(events: npt.NDArray[np.void], first: int) -> None:
     """Raise Damaged unless the events are numbered ``first``, ``first + 1``, …"""
     numbers = np.arange(first, first + len(events), dtype=np.uint64)
     if not np.array_equal(events["index"], numbers):
-        raise Damaged(f"its events are not numbered from {first} on")
+        raise DamageError(f"its events are not numbered from {first} on")
 
 
 def _bodies(
     records: bytes, message: np.dtype[np.void], body: np.dtype[np.void], channel_id: int
 ) -> npt.NDArray[np.void]:
     if len(records) % message.itemsize:
-        raise Damaged("its length is not a multiple of that of a message")
+        raise DamageError("its length is not a multiple of that of a message")
     messages = np.frombuffer(records, dtype=message)
     sound = (
         (messages["opcode"] == int(Opcode.MESSAGE))
@@ -166,7 +173,7 @@ def _bodies(
         & (messages["cdr"] == _CDR_LITTLE_ENDIAN)
     )
     if not sound.all():
-        raise Damaged("it holds other messages than it should")
+        raise DamageError("it holds other messages than it should")
     bodies: npt.NDArray[np.void] = np.ndarray(
         shape=messages.shape,
         dtype=body,
@@ -214,9 +221,9 @@ class SegmentReader:
             size_max = int(row["events"]) * EVENT_MESSAGE_DTYPE.itemsize
             events = events_in(read_chunk(self._source, span, size_max), self._event_channel)
             if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
-                raise Damaged("it is not the chunk of the index")
+                raise DamageError("it is not the chunk of the index")
             check_numbered(events, int(row["first_event"]))
-        except Damaged as error:
+        except DamageError as error:
             raise damage_error(self._source, span.offset, "the events chunk", error) from error
         return events
 
@@ -237,8 +244,8 @@ class SegmentReader:
                 or owners[-1] >= first + int(row["events"])
                 or (owners[1:] < owners[:-1]).any()
             ):
-                raise Damaged("it is not the chunk of the index")
-        except Damaged as error:
+                raise DamageError("it is not the chunk of the index")
+        except DamageError as error:
             raise damage_error(self._source, span.offset, "the outputs chunk", error) from error
         return outputs
 
@@ -265,13 +272,13 @@ def segment_row(
     return row
 
 
-def event_of(row: np.void, name: str = "trace") -> Event:
+def event_of(row: np.void, name: str = "trace") -> EventRecord:
     """Return a row of EVENT_DTYPE, from the file ``name``, as an Event. Raises TraceError."""
     chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
         row.item()
     )
     try:
-        return Event(
+        return EventRecord(
             index=index,
             stamp_ns=stamp,
             entity=entity,

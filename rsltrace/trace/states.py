@@ -18,15 +18,15 @@ from rsltrace.trace.reader import Trace
 BLOCK_BYTES = 4096
 ARRAY_BYTES_MAX = 1 << 32
 
-Leaf = str | npt.NDArray[Any]
+StateValue = str | npt.NDArray[Any]
 
 
-def state_after(trace: Trace, node: int, event: int) -> dict[str, Leaf]:
+def state_after(trace: Trace, node: int, event: int) -> dict[str, StateValue]:
     """Return a node's state by path (``estimator.P``) after an event; empty if not recorded.
 
     :raises TraceError: if the recorded changes are invalid.
     """
-    attributes: dict[str, dict[str, Leaf]] = {}
+    attributes: dict[str, dict[str, StateValue]] = {}
     try:
         for _, _, data in trace.messages(TOPIC_STATES):
             at, owner, text = unpack_detail(data)
@@ -44,7 +44,7 @@ def state_after(trace: Trace, node: int, event: int) -> dict[str, Leaf]:
     return {path: leaf for leaves in attributes.values() for path, leaf in leaves.items()}
 
 
-def _leaf(leaf: Any, before: Leaf | None) -> Leaf:
+def _leaf(leaf: Any, before: StateValue | None) -> StateValue:
     if not isinstance(leaf, dict):
         return str(leaf)
     dtype, shape = np.dtype(str(leaf["dtype"])), tuple(map(int, leaf["shape"]))

@@ -60,11 +60,11 @@ from rsltrace.adapters.rclpy.wire.interfaces import schema_text, type_name  # no
 from rsltrace.adapters.rclpy.wire.message_spec import (  # noqa: E402  # noqa: E402
     HEADER,
     START,
-    Array,
+    ArrayType,
     KnownOffset,
-    Message,
-    Primitive,
-    Text,
+    MessageSpec,
+    PrimitiveType,
+    StringType,
     message_spec,
 )
 from tests.tiers import cases  # noqa: E402
@@ -120,7 +120,7 @@ def test_there_are_many_classes_of_every_kind() -> None:
 LETTERS = "abcdefghij_/ äöß€漢😀\U0010ffff"
 
 
-def random_message(spec: Message, rng: random.Random) -> Any:
+def random_message(spec: MessageSpec, rng: random.Random) -> Any:
     message = spec.cls()
     for field in spec.fields:
         setattr(message, field.name, random_value(field.type, rng))
@@ -128,27 +128,27 @@ def random_message(spec: Message, rng: random.Random) -> Any:
 
 
 def random_value(type_: Any, rng: random.Random) -> Any:
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return random_primitive(type_, rng)
-    if isinstance(type_, Text):
+    if isinstance(type_, StringType):
         limit = 9 if type_.bound is None else min(9, type_.bound)
         return "".join(rng.choices(LETTERS, k=rng.randint(0, limit)))
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return random_message(type_, rng)
-    if isinstance(type_, Array):
+    if isinstance(type_, ArrayType):
         number = type_.length
     else:
         number = rng.choice((0, 0, 1, 2, 3) if type_.bound is None else range(type_.bound + 1))
         number = min(number, 3)
-    if isinstance(type_.item, Primitive) and type_.item.typecode:
+    if isinstance(type_.item, PrimitiveType) and type_.item.typecode:
         raw = rng.randbytes(number * type_.item.size)
-        if isinstance(type_, Array):
+        if isinstance(type_, ArrayType):
             return np.frombuffer(raw, type_.item.dtype)
         return array.array(type_.item.typecode, raw)
     return [random_value(type_.item, rng) for _ in range(number)]
 
 
-def random_primitive(type_: Primitive, rng: random.Random) -> Any:
+def random_primitive(type_: PrimitiveType, rng: random.Random) -> Any:
     if type_.name == "boolean":
         return rng.random() < 0.5
     if type_.name == "octet":
@@ -288,20 +288,20 @@ def big_endian(type_: Any, value: Any, out: bytearray) -> bytearray:
             out.extend(bytes(-len(out) % size))
             out.extend(struct.pack(">" + code, one))
 
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         put(type_.code, value)
-    elif isinstance(type_, Text) and type_.wide:
+    elif isinstance(type_, StringType) and type_.wide:
         units = np.frombuffer(value.encode("utf-16-le"), "<u2").tolist()
         put("I", len(units), *units)
-    elif isinstance(type_, Text):
+    elif isinstance(type_, StringType):
         put("I", len(value.encode()) + 1)
         out.extend(value.encode() + b"\0")
-    elif isinstance(type_, Message):
+    elif isinstance(type_, MessageSpec):
         for field in type_.fields:
             big_endian(field.type, getattr(value, field.name), out)
         out.extend(b"" if type_.fields else b"\0")
     else:
-        if not isinstance(type_, Array):
+        if not isinstance(type_, ArrayType):
             put("I", len(value))
         if isinstance(value, np.ndarray | array.array) and len(value):
             size = type_.item.size
@@ -742,24 +742,24 @@ def test_what_is_known_of_a_place_is_true_of_every_position_it_stands_for() -> N
 
 
 def has_wide_text(type_: Any) -> bool:
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return any(has_wide_text(field.type) for field in type_.fields)
     return has_wide_text(type_.item) if hasattr(type_, "item") else getattr(type_, "wide", False)
 
 
 def assert_foreign_equals(foreign: Any, type_: Any, value: Any) -> None:
     """A message decoded by another library holds the same values, in whatever types it uses."""
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         for field in type_.fields:
             assert_foreign_equals(getattr(foreign, field.name), field.type, value_of(value, field))
     elif hasattr(type_, "item"):
         assert len(foreign) == len(value)
         for one, other in zip(foreign, value, strict=True):
             assert_foreign_equals(one, type_.item, other)
-    elif isinstance(type_, Primitive) and type_.size == 1:
+    elif isinstance(type_, PrimitiveType) and type_.size == 1:
         number = value[0] if isinstance(value, bytes) else int(value)
         assert int(foreign) % 256 == number % 256  # some take byte and char for signed
-    elif isinstance(type_, Primitive) and type_.code in "fd":
+    elif isinstance(type_, PrimitiveType) and type_.code in "fd":
         rounded = struct.unpack(type_.code, struct.pack(type_.code, value))[0]
         assert foreign == rounded or (math.isnan(foreign) and math.isnan(rounded))
     else:

@@ -16,7 +16,7 @@ from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from rsltrace.cli.main import cli
-from rsltrace.trace.model.finding import waits_of
+from rsltrace.trace.model.finding import decode_waits
 from tests.adapters.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
@@ -147,7 +147,7 @@ def test_an_executor_that_a_callback_keeps_busy(simulate: Any) -> None:
     assert "/other: timer Other.tick" in note
     assert "Beside" not in note
     with recorded.trace() as trace:
-        (wait,) = waits_of(trace.result)
+        (wait,) = decode_waits(trace.result)
         names = {trace.entities[one].name for one in wait.held}
     assert wait.since_ns == 1_000_000_000
     line = Robot.begin.__code__.co_firstlineno + 2

@@ -18,7 +18,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace.errors import DeadlockError
-from rsltrace.trace.model.event import OutputKind, draw_text
+from rsltrace.trace.model.event import OutputKind, decision_text
 
 pytestmark = pytest.mark.ros
 
@@ -209,7 +209,7 @@ def test_durations_are_drawn_per_entity_and_are_in_the_trace(run: Any) -> None:
         with recorded.trace() as trace:
             ids = {e.id for e in trace.entities.values() if trace.node_of(e).name == node}
             return [
-                draw_text(o.hash)
+                decision_text(o.hash)
                 for i in range(trace.event_count)
                 for o in trace.outputs_of(i)
                 if o.kind is OutputKind.DRAW and o.entity in ids

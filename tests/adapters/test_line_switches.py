@@ -19,7 +19,7 @@ from std_msgs.msg import Int32
 
 from rsltrace.errors import NodeError, RunError
 from rsltrace.run.plans.recorded_order import ATTACHMENT_CHOICES
-from rsltrace.simulation.loop.policy import Candidate, Moment, decoded
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint, decode_choices
 from rsltrace.trace.model.event import is_switch
 from tests.forked_command import Forks
 
@@ -30,7 +30,7 @@ LINES = {"threads": {"switch": "every_line"}}
 class Turns:
     """Lets another one run whenever there is one: the one that has waited longest."""
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         return len(ready) > 1 and ready[0].kind == "resume"
 
 
@@ -217,7 +217,7 @@ def test_pct_and_a_recorded_order_switch_between_callbacks_of_one_subscription(
             break
     assert found[-1] > 1
     with recorded.trace() as trace:
-        assert any(decoded(trace.attachment(ATTACHMENT_CHOICES) or b""))
+        assert any(decode_choices(trace.attachment(ATTACHMENT_CHOICES) or b""))
     kept = recorded.path.rename(tmp_path / "kept.mcap")
     again = simulate(
         Sides, reentrant, duration=0.15, job={**LINES, "policy": {"recorded": kept.name}}
@@ -247,7 +247,7 @@ def test_finalizers_and_imports_are_not_interrupted(simulate: Any) -> None:
 
 
 class Bad:
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         if ready[0].kind == "resume" and len(ready) > 1:
             raise ValueError("at a line")
         return 0

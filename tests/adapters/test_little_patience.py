@@ -14,7 +14,7 @@ import rclpy
 from rclpy.node import Node
 
 from rsltrace import NodeSpec
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.texts import waiting_ns
 
 pytestmark = pytest.mark.ros
 
@@ -72,7 +72,7 @@ def test_a_semaphore_is_given_up(simulate: Any) -> None:
 
 
 def test_what_is_left_is_never_nothing() -> None:
-    assert [patience_ns(s) for s in (0.0, TINY, 1e-9, 0.1, 2.5, -TINY, -1.0)] == [
+    assert [waiting_ns(s) for s in (0.0, TINY, 1e-9, 0.1, 2.5, -TINY, -1.0)] == [
         0,
         1,
         1,

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 
-from rsltrace.simulation.chance.stream import ClockModel, Stream, WrongClock
+from rsltrace.simulation.chance.stream import ClockModel, RandomStream, SkewedClock
 
 MS = 1_000_000
 S = 1_000_000_000
 
 
-def clock(model: ClockModel, start_ns: int = 0, name: str = "c") -> WrongClock:
-    return WrongClock(model, Stream(1, name), start_ns)
+def clock(model: ClockModel, start_ns: int = 0, name: str = "c") -> SkewedClock:
+    return SkewedClock(model, RandomStream(1, name), start_ns)
 
 
 def test_offset_drift_and_jumps_add_up() -> None:

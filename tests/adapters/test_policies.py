@@ -14,7 +14,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from rsltrace.errors import JobError, RunError
-from rsltrace.simulation.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
 
 pytestmark = pytest.mark.ros
 
@@ -211,7 +211,7 @@ def test_a_permutation_has_every_order_and_the_seed_decides(order: Any) -> None:
 class Backwards:
     """A policy of one's own: last come, first served."""
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         assert all(candidate.node == "/burst" for candidate in ready)
         return len(ready) - 1
 
@@ -234,7 +234,7 @@ def test_a_policy_that_is_none_is_refused(order: Any, function: Any, message: st
 
 def test_a_policy_that_answers_nonsense_ends_the_run_with_its_name(order: Any) -> None:
     class Wild:
-        def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+        def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
             return 99
 
     with pytest.raises(RunError, match="Wild chose 99 of"):

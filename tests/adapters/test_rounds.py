@@ -14,8 +14,8 @@ pytest.importorskip("rclpy")
 
 from rsltrace import NodeSpec
 from rsltrace.adapters.rclpy.stacks.coroutines import _run_oldest_first
-from rsltrace.simulation.loop.policy import Candidate, Moment
-from rsltrace.simulation.loop.wait_set import RclpyWaitSet
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
+from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from tests.adapters.rounds_program import Busy, Shared, nodes_of
 
 pytestmark = pytest.mark.ros
@@ -107,12 +107,12 @@ class Task:
 )
 def test_tasks_run_as_the_release_has_it(oldest_first: bool, expected: list[int]) -> None:
     """Tasks 4 and 5 are made while the second of the first three runs."""
-    policy = RclpyWaitSet()
+    policy = RclpyWaitSetPolicy()
     left, ran = [1, 2, 3], []
     while left:
         item = Task(oldest_first=oldest_first)
         ready = [Candidate("/n", "", "task", 7, None, (), item, thread=one) for one in left]
-        ran.append(left.pop(policy.choose(ready, Moment(0, 0))))
+        ran.append(left.pop(policy.choose(ready, ChoicePoint(0, 0))))
         if len(ran) == 2:
             left += [4, 5]
     assert ran == expected

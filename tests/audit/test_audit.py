@@ -13,15 +13,15 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.audit import audit_job, audit_path
-from rsltrace.guard.audit.rules import Found
+from rsltrace.guard.audit.rules import AuditFinding
 from rsltrace.job import load_job
 
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture
-def found_in(tmp_path: Path) -> Callable[[str], list[Found]]:
-    def audit(code: str) -> list[Found]:
+def found_in(tmp_path: Path) -> Callable[[str], list[AuditFinding]]:
+    def audit(code: str) -> list[AuditFinding]:
         path = tmp_path / "node.py"
         path.write_text(code)
         result = audit_path(path)
@@ -208,7 +208,7 @@ NOT_FOUND = [
 
 @pytest.mark.parametrize(("code", "call", "treatment"), FOUND, ids=[case[0] for case in FOUND])
 def test_found(
-    found_in: Callable[[str], list[Found]], code: str, call: str, treatment: str
+    found_in: Callable[[str], list[AuditFinding]], code: str, call: str, treatment: str
 ) -> None:
     assert [(one.call, one.treatment.value) for one in found_in(code)] == [(call, treatment)]
 
@@ -218,7 +218,7 @@ def test_found(
     ["text = text.replace(text, 'x')", "s = s | {text, 'x'}", "self.a = self.a.b(self.a)"],
 )
 def test_a_name_that_is_bound_to_itself_again_and_again(
-    found_in: Callable[[str], list[Found]], line: str
+    found_in: Callable[[str], list[AuditFinding]], line: str
 ) -> None:
     # Each way through these lines was looked at once: of 50 there is no end.
     lines = "".join(f"    {line}\n" for _ in range(50))
@@ -227,17 +227,19 @@ def test_a_name_that_is_bound_to_itself_again_and_again(
 
 
 @pytest.mark.parametrize("code", NOT_FOUND)
-def test_not_found(found_in: Callable[[str], list[Found]], code: str) -> None:
+def test_not_found(found_in: Callable[[str], list[AuditFinding]], code: str) -> None:
     assert found_in(code) == []
 
 
-def test_line_and_column_are_those_of_an_editor(found_in: Callable[[str], list[Found]]) -> None:
+def test_line_and_column_are_those_of_an_editor(
+    found_in: Callable[[str], list[AuditFinding]],
+) -> None:
     (one,) = found_in("import time\n\nx = [1,\n     time.time()]\n")
     assert (one.line, one.column) == (4, 6)
 
 
 def test_a_comment_allows_a_line_or_one_kind_of_call_on_it(
-    found_in: Callable[[str], list[Found]],
+    found_in: Callable[[str], list[AuditFinding]],
 ) -> None:
     code = (
         "import os, time\n"

@@ -11,7 +11,7 @@ from rsltrace.guard.audit.audit import audit_path
 from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, NodeSpec, StopSpec
 from rsltrace.run import run
-from rsltrace.trace.model.finding import Mode
+from rsltrace.trace.model.finding import GuardMode
 
 pytestmark = pytest.mark.ros
 
@@ -83,7 +83,7 @@ def test_the_guard_treats_each_call_as_the_audit_says(tmp_path: Path) -> None:
     for n, call in enumerate(CALLS):
         met = [count for count in result.guarded if count.node == f"/n{n}"]
         if said[n].treatment is Treatment.VIRTUAL:
-            assert any(one.mode is Mode.VIRTUAL for one in met), call
+            assert any(one.mode is GuardMode.VIRTUAL for one in met), call
         else:
             assert said[n].treatment is Treatment.DETECTED, call
             assert any(one.source.value == said[n].kind and one.is_finding for one in met), call

@@ -19,7 +19,7 @@ from rsltrace.cli.bisect import _same_everywhere
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
-from rsltrace.search.bisect.repository import Repository
+from rsltrace.search.bisect.repository import GitRepository
 from rsltrace.search.bisect.runs import python_folders
 from rsltrace.search.bisect.worktree import Worktree
 from rsltrace.trace.reader import Trace
@@ -316,7 +316,7 @@ def test_packages_that_are_installed_in_place_are_those_of_the_revision(
     monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, finder])
     for name in ("src", "build"):
         monkeypatch.syspath_prepend(str(robot.top / name))
-    repository = Repository.of(robot.top / "job.yaml")
+    repository = GitRepository.of(robot.top / "job.yaml")
     assert python_folders(repository) == [robot.top / "src", robot.top / "flat"]
     (note,) = _same_everywhere(repository, load_job(robot.top / "job.yaml"))
     assert note.startswith(f"copied is loaded from {robot.top}/build/copied.py at every revision")
@@ -372,7 +372,7 @@ def test_hooks_and_a_search_of_the_users_own_are_left_alone(robot: Robot, tmp_pa
     robot.git("bisect", "start", "main", "main~1")
     (tmp_path / "hooked").unlink(missing_ok=True)
     before = robot.state()
-    with Worktree(Repository.of(robot.top / "job.yaml")) as tree:
+    with Worktree(GitRepository.of(robot.top / "job.yaml")) as tree:
         tree.check_out("main~1")
         assert not (tree.tree / "README.md").exists()
         (tree.tree / "job.yaml").write_text("a run may write what it likes")

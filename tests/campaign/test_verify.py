@@ -19,8 +19,8 @@ import pytest
 from rsltrace.child_processes import Done
 from rsltrace.cli.output import verify_text
 from rsltrace.search import perturb
-from rsltrace.search.perturb import KINDS, recorded, surroundings
-from rsltrace.search.verify import Verified
+from rsltrace.search.perturb import KINDS, perturbation, perturbed_run
+from rsltrace.search.verify import VerifyResult
 
 pytestmark = pytest.mark.ros
 
@@ -31,11 +31,11 @@ WriteJob = Callable[..., Path]
 
 
 def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None:
-    assert surroundings(0).values == {}
-    assert surroundings(3) == surroundings(3)
-    assert surroundings(3).values != surroundings(4).values != surroundings(4, seed=1).values
-    assert set(surroundings(1).values) <= set(KINDS)
-    assert list(surroundings(1).only(KINDS[0]).values) == [KINDS[0]]
+    assert perturbation(0).values == {}
+    assert perturbation(3) == perturbation(3)
+    assert perturbation(3).values != perturbation(4).values != perturbation(4, seed=1).values
+    assert set(perturbation(1).values) <= set(KINDS)
+    assert list(perturbation(1).only(KINDS[0]).values) == [KINDS[0]]
 
 
 def test_a_core_type_that_the_user_has_chosen_is_left_alone(
@@ -43,15 +43,15 @@ def test_a_core_type_that_the_user_has_chosen_is_left_alone(
 ) -> None:
     monkeypatch.setattr(perturb, "core_types", lambda: ("Nehalem", "Haswell"))
     monkeypatch.delenv(perturb.CORE_TYPE, raising=False)
-    assert perturb.KERNEL in surroundings(1).values
+    assert perturb.KERNEL in perturbation(1).values
     monkeypatch.setenv(perturb.CORE_TYPE, "Haswell")
-    values = surroundings(1).values
+    values = perturbation(1).values
     assert perturb.KERNEL not in values
     assert perturb.THREAD_COUNT in values
 
 
 def test_of_a_core_type_that_makes_a_difference_the_way_out_is_named() -> None:
-    found = Verified(cast(Any, None), 2, (), (), narrowed=True, provoked_by=(perturb.KERNEL,))
+    found = VerifyResult(cast(Any, None), 2, (), (), narrowed=True, provoked_by=(perturb.KERNEL,))
     told = verify_text._provoked(found, "rsltrace verify job.yaml --run 1")
     assert "OPENBLAS_CORETYPE=Haswell rsltrace" in told
     other = replace(found, provoked_by=(perturb.HEAP,))
@@ -61,7 +61,7 @@ def test_of_a_core_type_that_makes_a_difference_the_way_out_is_named() -> None:
 def test_one_digest_is_stated_as_what_was_tried(
     rsltrace: Command, job: WriteJob, tmp_path: Path
 ) -> None:
-    kinds = surroundings(1).values
+    kinds = perturbation(1).values
     asks = ORDER_OF_A_SET + ", print('Input {x}: ', end='')"  # where the result is printed, too
     # Relative paths lead to what they lead to in ``record``; what a run writes stays its own.
     (tmp_path / "gains").mkdir()
@@ -107,7 +107,7 @@ def test_the_result_is_found_in_what_nodes_print(before: str, after: str) -> Non
         "more": {"a": {"": 1}},
     }
     done = Done(0, before + json.dumps(result) + after, "")
-    found = recorded(surroundings(0), Path("run.mcap"), done)
+    found = perturbed_run(perturbation(0), Path("run.mcap"), done)
     assert (found.digest, found.events, found.path, found.failure) == (
         "12ab",
         7,
@@ -117,7 +117,7 @@ def test_the_result_is_found_in_what_nodes_print(before: str, after: str) -> Non
 
 
 def test_a_run_without_a_result_has_failed() -> None:
-    found = recorded(surroundings(0), Path("run.mcap"), Done(0, 'no {"digest": result', ""))
+    found = perturbed_run(perturbation(0), Path("run.mcap"), Done(0, 'no {"digest": result', ""))
     assert found.failure == "it ended with exit status 0 and no trace"
 
 
@@ -228,8 +228,8 @@ def test_what_record_takes_verify_takes(rsltrace: Command, job: WriteJob, tmp_pa
         "job.yaml", "--seed", "5", "--set", "stop.duration=2s", "--until", "1",
         "--ros-args", "--params-file", "more.yaml", "--",
     )  # fmt: skip
-    recorded = rsltrace("record", *words, "-o", "run.mcap")
-    assert "] [n]: 7" in recorded.stderr
-    digest = recorded.stdout.split()[1]
+    perturbed_run = rsltrace("record", *words, "-o", "run.mcap")
+    assert "] [n]: 7" in perturbed_run.stderr
+    digest = perturbed_run.stdout.split()[1]
     done = rsltrace("verify", *words, "--runs", "2")
     assert f"one digest {digest}" in done.stdout, done.stderr

@@ -15,13 +15,13 @@ from rsltrace.simulation.chance.channel import (
     LOST_BURST,
     LOST_DROP,
     LOST_OUTAGE,
-    Burst,
+    BurstLoss,
     LinkChannel,
+    LinkModel,
+    LinkOutage,
     LinkRule,
-    Model,
     NameRule,
     NetworkPlan,
-    Outage,
     OutageRule,
 )
 from rsltrace.simulation.chance.distribution import Constant, Distribution, Gamma, Normal, Uniform
@@ -32,7 +32,7 @@ MS = 1_000_000
 S = 1_000_000_000
 
 
-def channel(model: Model, *, reliable: bool = False, **options: Any) -> LinkChannel:
+def channel(model: LinkModel, *, reliable: bool = False, **options: Any) -> LinkChannel:
     return LinkChannel(model, seed=5, name="link", start_ns=0, reliable=reliable, **options)
 
 
@@ -45,7 +45,7 @@ def share(hits: int, probability: float) -> bool:
 
 
 def test_drops_are_as_frequent_as_asked_and_independent() -> None:
-    losses = [code == LOST_DROP for code in sent(channel(Model(drop=0.2)))]
+    losses = [code == LOST_DROP for code in sent(channel(LinkModel(drop=0.2)))]
     assert share(sum(losses), 0.2)
     both = sum(x and y for x, y in pairwise(losses))
     assert share(both, 0.04)
@@ -53,7 +53,7 @@ def test_drops_are_as_frequent_as_asked_and_independent() -> None:
 
 def test_bursts_follow_gilbert_and_elliott() -> None:
     p, r = 0.02, 0.2
-    losses = [code == LOST_BURST for code in sent(channel(Model(burst=Burst(p, r))))]
+    losses = [code == LOST_BURST for code in sent(channel(LinkModel(burst=BurstLoss(p, r))))]
     bad = p / (p + r)
     memory = 1 - p - r
     # The variance of a mean of a correlated chain is larger by (1 + memory) / (1 - memory).
@@ -72,13 +72,13 @@ def test_bursts_follow_gilbert_and_elliott() -> None:
 
 
 def test_bursts_may_lose_only_a_part() -> None:
-    burst = Burst(0.1, 0.1, loss_bad=0.5, loss_good=0.02)
-    lost = sum(code == LOST_BURST for code in sent(channel(Model(burst=burst))))
+    burst = BurstLoss(0.1, 0.1, loss_bad=0.5, loss_good=0.02)
+    lost = sum(code == LOST_BURST for code in sent(channel(LinkModel(burst=burst))))
     assert abs(lost / N - (0.5 * 0.5 + 0.5 * 0.02)) < 0.01
 
 
 def test_duplicates_are_as_frequent_as_asked() -> None:
-    link = channel(Model(delay=Uniform(0, 9), duplicate=0.1))
+    link = channel(LinkModel(delay=Uniform(0, 9), duplicate=0.1))
     twice = 0
     for i in range(N):
         link.transmit(i * MS)
@@ -88,17 +88,18 @@ def test_duplicates_are_as_frequent_as_asked() -> None:
 
 def test_no_message_overtakes_another_unless_it_may() -> None:
     delay = Uniform(0, 50 * MS)
-    ordered = [i * MS + d for i, d in enumerate(sent(channel(Model(delay=delay)), 1000))]
+    ordered = [i * MS + d for i, d in enumerate(sent(channel(LinkModel(delay=delay)), 1000))]
     assert ordered == sorted(ordered)
     free = [
-        i * MS + d for i, d in enumerate(sent(channel(Model(delay=delay, keep_order=False)), 1000))
+        i * MS + d
+        for i, d in enumerate(sent(channel(LinkModel(delay=delay, keep_order=False)), 1000))
     ]
     assert free != sorted(free)
     assert all(late >= early for late, early in zip(ordered, free, strict=True))
 
 
 def test_a_second_copy_keeps_the_order_too() -> None:
-    model = Model(delay=Uniform(0, 50 * MS), duplicate=0.3, drop=0.1)
+    model = LinkModel(delay=Uniform(0, 50 * MS), duplicate=0.3, drop=0.1)
     for reliable in (False, True):
         link = channel(model, reliable=reliable)
         arrivals, copies = [], 0
@@ -114,17 +115,17 @@ def test_a_second_copy_keeps_the_order_too() -> None:
 
 
 def test_a_reliable_link_sends_again_what_it_loses() -> None:
-    model = Model(delay=Constant(MS), drop=0.25, retransmit_ns=10 * MS, keep_order=False)
+    model = LinkModel(delay=Constant(MS), drop=0.25, retransmit_ns=10 * MS, keep_order=False)
     delays = sent(channel(model, reliable=True))
     assert min(delays) == MS
     for losses in range(4):  # geometric
         assert share(delays.count(MS + losses * 10 * MS), 0.75 * 0.25**losses)
-    assert channel(Model(drop=1.0), reliable=True).transmit(0) == LOST_DROP  # gives up
+    assert channel(LinkModel(drop=1.0), reliable=True).transmit(0) == LOST_DROP  # gives up
 
 
 def test_outages_lose_what_is_best_effort_and_hold_what_is_reliable() -> None:
-    outages = (Outage(10 * MS, 20 * MS), Outage(20 * MS, 25 * MS))
-    model = Model(delay=Constant(MS))
+    outages = (LinkOutage(10 * MS, 20 * MS), LinkOutage(20 * MS, 25 * MS))
+    model = LinkModel(delay=Constant(MS))
     link = channel(model, outages=outages)
     assert [link.transmit(t * MS) for t in (9, 10, 19, 24)] == [MS, *[LOST_OUTAGE] * 3]
     assert link.transmit(25 * MS) == MS
@@ -142,11 +143,14 @@ TOPICS = st.sampled_from(["/t", "/u", "/ns/v"])
 LINKS = st.tuples(TOPICS, NODES, NODES)
 DELAYS: list[Distribution] = [Uniform(0, 10**9), Normal(5 * MS, MS), Gamma(2.0, MS)]
 MODELS = st.builds(
-    Model, delay=st.sampled_from(DELAYS), drop=st.sampled_from([0.0, 0.3]), keep_order=st.booleans()
+    LinkModel,
+    delay=st.sampled_from(DELAYS),
+    drop=st.sampled_from([0.0, 0.3]),
+    keep_order=st.booleans(),
 )
 
 
-def plan_of(links: dict[tuple[str, str, str], Model]) -> NetworkPlan:
+def plan_of(links: dict[tuple[str, str, str], LinkModel]) -> NetworkPlan:
     rules = tuple(LinkRule(*names, model) for names, model in links.items())
     return NetworkPlan(links=rules, seed=3)
 
@@ -168,7 +172,10 @@ def drawn(plan: NetworkPlan, links: list[tuple[str, str, str]]) -> dict[object, 
 @settings(max_examples=cases(30, 200), deadline=None)
 @given(st.dictionaries(LINKS, MODELS, min_size=2, max_size=8), LINKS, MODELS, st.data())
 def test_adding_removing_or_renaming_a_link_leaves_all_others_as_they_were(
-    links: dict[tuple[str, str, str], Model], other: tuple[str, str, str], model: Model, data: Any
+    links: dict[tuple[str, str, str], LinkModel],
+    other: tuple[str, str, str],
+    model: LinkModel,
+    data: Any,
 ) -> None:
     before = drawn(plan_of(links), list(links))
     victim = data.draw(st.sampled_from(sorted(links)))
@@ -183,7 +190,7 @@ def test_adding_removing_or_renaming_a_link_leaves_all_others_as_they_were(
 
 
 def test_requests_never_arrive_twice_nor_wait_for_a_copy() -> None:
-    models = [Model(Uniform(0, 50 * MS), duplicate=share) for share in (0.0, 0.9)]
+    models = [LinkModel(Uniform(0, 50 * MS), duplicate=share) for share in (0.0, 0.9)]
     links = [
         NetworkPlan(default=model).service_channel("/s", ("/n", 0), ("/m", 0), "request")
         for model in models
@@ -195,13 +202,13 @@ def test_requests_never_arrive_twice_nor_wait_for_a_copy() -> None:
 
 def test_the_most_precise_rule_counts() -> None:
     plan = NetworkPlan(
-        links=(LinkRule("/t", "*", "/slow", Model(Constant(1))),),
+        links=(LinkRule("/t", "*", "/slow", LinkModel(Constant(1))),),
         topics=(
-            NameRule("/*", Model(Constant(2))),
-            NameRule("/t", Model(Constant(3))),
+            NameRule("/*", LinkModel(Constant(2))),
+            NameRule("/t", LinkModel(Constant(3))),
         ),
-        services=(NameRule("/s", Model(Constant(4))),),
-        default=Model(Constant(5)),
+        services=(NameRule("/s", LinkModel(Constant(4))),),
+        default=LinkModel(Constant(5)),
     )
 
     def delay(topic: str, receiver: str) -> int:
@@ -218,13 +225,13 @@ def test_the_most_precise_rule_counts() -> None:
     assert other is not None
     assert (service.transmit(0), other.transmit(0)) == (4, 5)
     assert NetworkPlan().topic_channel("/t", ("/n", 0), ("/m", 0), reliable=True) is None
-    only_default = NetworkPlan(default=Model(Constant(5)))
+    only_default = NetworkPlan(default=LinkModel(Constant(5)))
     quiet = only_default.topic_channel("/rosout", ("/n", 0), ("/m", 0), reliable=True)
     assert quiet is None
 
 
 def test_outages_find_topics_services_and_nodes() -> None:
-    cut = Outage(0, S)
+    cut = LinkOutage(0, S)
     plan = NetworkPlan(
         outages=(
             OutageRule("topic", "/t", cut),
@@ -249,12 +256,12 @@ def test_outages_find_topics_services_and_nodes() -> None:
 
 def test_losses_leave_the_delays_of_what_arrives_alone() -> None:
     delay = Normal(5 * MS, 2 * MS)
-    plain = sent(channel(Model(delay, keep_order=False)), 2000)
-    troubles: list[tuple[Model, dict[str, Any]]] = [
-        (Model(delay, keep_order=False, drop=0.3), {}),
-        (Model(delay, keep_order=False, burst=Burst(0.1, 0.2)), {}),
-        (Model(delay, keep_order=False), {"outages": (Outage(100 * MS, 900 * MS),)}),
-        (Model(delay, keep_order=False, duplicate=0.3), {}),
+    plain = sent(channel(LinkModel(delay, keep_order=False)), 2000)
+    troubles: list[tuple[LinkModel, dict[str, Any]]] = [
+        (LinkModel(delay, keep_order=False, drop=0.3), {}),
+        (LinkModel(delay, keep_order=False, burst=BurstLoss(0.1, 0.2)), {}),
+        (LinkModel(delay, keep_order=False), {"outages": (LinkOutage(100 * MS, 900 * MS),)}),
+        (LinkModel(delay, keep_order=False, duplicate=0.3), {}),
     ]
     for model, options in troubles:
         pairs = list(zip(plain, sent(channel(model, **options), 2000), strict=True))

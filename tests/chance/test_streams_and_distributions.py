@@ -20,13 +20,13 @@ from rsltrace.simulation.chance.distribution import (
     Empirical,
     Gamma,
     Lognormal,
+    MeasuredSamples,
     Normal,
-    Samples,
-    Series,
+    TimeSeries,
     Uniform,
     normal_quantile,
 )
-from rsltrace.simulation.chance.stream import Stream, exp, log
+from rsltrace.simulation.chance.stream import RandomStream, exp, log
 
 N = 100_000
 MS = 1_000_000
@@ -40,7 +40,7 @@ GOLDEN_SMALL_GAMMA = [2543, 450352, 1442693, 463350]
 
 
 def draws(distribution: Distribution, name: str = "test", count: int = N) -> list[int]:
-    draw = distribution.sampler(Stream(7, name), 0)
+    draw = distribution.sampler(RandomStream(7, name), 0)
     return [draw(0) for _ in range(count)]
 
 
@@ -61,7 +61,7 @@ def check_quantiles(values: list[int], cdf: object) -> None:
 
 def test_a_stream_is_the_same_everywhere() -> None:
     """Written down once; another number here means that every trace with delays changes."""
-    stream = Stream(0, "topic\0/scan")
+    stream = RandomStream(0, "topic\0/scan")
     assert [stream.uniform().hex() for _ in range(3)] == GOLDEN_UNIFORM
     assert draws(Normal(5 * MS, MS), count=4) == GOLDEN_NORMAL
     assert draws(Lognormal.of_moments(5 * MS, 2 * MS), count=4) == GOLDEN_LOGNORMAL
@@ -70,7 +70,7 @@ def test_a_stream_is_the_same_everywhere() -> None:
 
 
 def test_uniform_numbers_are_uniform_and_independent() -> None:
-    stream = Stream(3, "u")
+    stream = RandomStream(3, "u")
     values = [stream.uniform() for _ in range(N)]
     assert 0 < min(values) < max(values) < 1
     assert abs(fmean(values) - 0.5) < 4 * math.sqrt(1 / 12 / N)
@@ -87,8 +87,13 @@ def test_uniform_numbers_are_uniform_and_independent() -> None:
 
 
 def test_streams_of_other_names_or_seeds_have_nothing_in_common() -> None:
-    first = [Stream(1, "a").uniform() for _ in range(5)]
-    for other in (Stream(1, "b"), Stream(2, "a"), Stream(1, "a\0"), Stream(11, "a")):
+    first = [RandomStream(1, "a").uniform() for _ in range(5)]
+    for other in (
+        RandomStream(1, "b"),
+        RandomStream(2, "a"),
+        RandomStream(1, "a\0"),
+        RandomStream(11, "a"),
+    ):
         assert other.uniform() not in first
 
 
@@ -169,7 +174,7 @@ def test_gamma_of_moments() -> None:
 
 
 def test_samples_are_drawn_evenly() -> None:
-    values = draws(Samples((1, 1, 5, 9)))
+    values = draws(MeasuredSamples((1, 1, 5, 9)))
     for value, share in ((1, 0.5), (5, 0.25), (9, 0.25)):
         assert abs(values.count(value) / N - share) < 4 * math.sqrt(share * (1 - share) / N)
 
@@ -195,10 +200,10 @@ def test_constant() -> None:
 
 def test_series_follow_the_time_since_the_start() -> None:
     points = ((1000, 10), (2000, 30), (4000, 0))
-    value = Series(points).sampler(Stream(0, ""), 100_000)
+    value = TimeSeries(points).sampler(RandomStream(0, ""), 100_000)
     at = [100_000, 101_000, 101_500, 102_000, 103_000, 103_999, 104_000, 999_999]
     assert [value(t) for t in at] == [10, 10, 20, 30, 15, 0, 0, 0]
-    steps = Series(points, steps=True).sampler(Stream(0, ""), 100_000)
+    steps = TimeSeries(points, steps=True).sampler(RandomStream(0, ""), 100_000)
     assert [steps(t) for t in at] == [10, 10, 10, 30, 30, 30, 0, 0]
 
 

@@ -22,9 +22,9 @@ from rsltrace import (
     load_job,
     measure_latencies,
 )
-from rsltrace.checks.properties import Eventually, Never, Property, Rate
+from rsltrace.checks.properties import EventuallyProperty, NeverProperty, RateProperty, RunProperty
 from rsltrace.cli.main import cli
-from rsltrace.conditions.condition import Armed
+from rsltrace.conditions.condition import ActiveCondition
 from rsltrace.errors import CheckError, JobError
 
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"
@@ -152,7 +152,7 @@ def test_rates() -> None:
 def test_a_silent_topic_is_too_slow(
     at_least: float | None, end_ns: int, violations: int, undecided: int
 ) -> None:
-    rate = Rate("/x", at_least, 9)
+    rate = RateProperty("/x", at_least, 9)
     rate.end(end_ns, complete=True)
     assert (rate.count, rate.undecided) == (violations, undecided)
     for found in rate.found:
@@ -238,7 +238,7 @@ def test_functions_that_raise() -> None:
 # -- against the definition ------------------------------------------------------------------------
 
 
-class _Is(Armed):
+class _Is(ActiveCondition):
     def __init__(self, letter: str) -> None:
         self._letter = letter
 
@@ -251,9 +251,9 @@ class _Event:
         self.index, self.stamp_ns, self.letters = index, stamp_ns, letters
 
     def sent(self) -> Sequence[Any]:
-        from rsltrace.conditions.view import Sent
+        from rsltrace.conditions.view import SentOutput
 
-        return [Sent(1, letter, 0) for letter in self.letters]
+        return [SentOutput(1, letter, 0) for letter in self.letters]
 
 
 RUNS = st.lists(
@@ -261,7 +261,7 @@ RUNS = st.lists(
 )
 
 
-def _held(one: Property, run: list[tuple[int, str]], end: int) -> list[int | None]:
+def _held(one: RunProperty, run: list[tuple[int, str]], end: int) -> list[int | None]:
     for index, (stamp, letters) in enumerate(run):
         one.see(_Event(index, stamp, letters))  # type: ignore[arg-type]
     one.end(end, complete=True)
@@ -285,7 +285,7 @@ def test_eventually_is_what_it_says(steps: list[tuple[int, str]], within: int | 
         follows = any("x" in later and stamp <= last for stamp, later in run[at:])
         if "t" in letters and not follows and last <= end:
             wanted.append(at)
-    assert _held(Eventually(_Is("x"), _Is("t"), within), run, end) == wanted
+    assert _held(EventuallyProperty(_Is("x"), _Is("t"), within), run, end) == wanted
 
 
 @given(RUNS, st.one_of(st.none(), st.integers(1, 4)))
@@ -300,7 +300,7 @@ def test_never_is_what_it_says(steps: list[tuple[int, str]], within: int | None)
             for begin, before in run[:at]
         )
     ]
-    assert _held(Never(_Is("x"), _Is("t"), within), run, end) == wanted
+    assert _held(NeverProperty(_Is("x"), _Is("t"), within), run, end) == wanted
 
 
 @given(RUNS, st.integers(1, 4), st.integers(1, 5))
@@ -315,7 +315,7 @@ def test_rates_are_what_they_say(steps: list[tuple[int, str]], over: int, count:
     expected: list[int | None] = [*wanted] if sent else [None] if end >= over else []
     hz = count * S / over
     assert math.isclose(hz * over / S, count)
-    assert _held(Rate("x", hz, None, over), run, end) == expected
+    assert _held(RateProperty("x", hz, None, over), run, end) == expected
 
 
 # -- as a user runs it -----------------------------------------------------------------------------

@@ -327,13 +327,13 @@ def test_a_large_sequence_is_paid_for() -> None:
 
 @pytest.mark.parametrize("pattern", ["(a+)+$", "(a|a)+$", "a*a*a*a*a*a*a*a*a*b"])
 def test_no_pattern_of_logs_keeps_a_check_busy(pattern: str) -> None:
-    from rsltrace.conditions.view import Sent
+    from rsltrace.conditions.view import SentOutput
     from rsltrace.trace.model.event import OutputKind
 
     @dataclass
     class Logs(View):
-        def sent(self) -> list[Sent]:
-            return [Sent(OutputKind.LOG, "", 1, "a" * 50_000 + "c", 30)]
+        def sent(self) -> list[SentOutput]:
+            return [SentOutput(OutputKind.LOG, "", 1, "a" * 50_000 + "c", 30)]
 
     begin = time.process_time()
     watch = parse_condition(f"log /{pattern}/").arm(Logs())

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.words.logs import silent_topics, without_server
+from rsltrace.trace.words.logs import missing_servers, silent_topics
 
 
 def entities(*ends: tuple[str, EntityKind, str]) -> list[Entity]:
@@ -45,13 +45,13 @@ def test_nothing_is_said_of_what_nodes_listen_to_in_case_there_is_some(topic: st
 
 def test_what_is_said_of_clients() -> None:
     calls, serves = EntityKind.CLIENT, EntityKind.SERVICE
-    assert without_server(entities(("/a", calls, "/s"), ("/b", serves, "/s"))) == ""
-    assert without_server(entities(("/a", calls, "/s"), ("/b", serves, "/S"))) == (
+    assert missing_servers(entities(("/a", calls, "/s"), ("/b", serves, "/s"))) == ""
+    assert missing_servers(entities(("/a", calls, "/s"), ("/b", serves, "/S"))) == (
         "nobody serves /s, of which /a is a client"
     )
-    both = without_server(entities(("/a", calls, "/s"), ("/b", calls, "/s")))
+    both = missing_servers(entities(("/a", calls, "/s"), ("/b", calls, "/s")))
     assert both == "nobody serves /s, of which /a and /b are clients"
-    assert without_server(entities(*(("/b", calls, f"/s{n}") for n in range(4)))) == (
+    assert missing_servers(entities(*(("/b", calls, f"/s{n}") for n in range(4)))) == (
         "services without a server: /s0 (for /b), /s1 (for /b), /s2 (for /b) and 1 more services"
     )
 

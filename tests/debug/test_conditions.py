@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.condition import ActiveCondition, EventCondition
 from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.message_fields import loaded_fields
-from rsltrace.conditions.names import Names
+from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.text import parse_condition
-from rsltrace.conditions.view import Sent
+from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import ConditionError
 from rsltrace.trace.model.event import EventKind, OutputKind
 
@@ -37,7 +37,7 @@ FIELDS: dict[str, dict[str, str]] = {
     "geometry_msgs/msg/Point": {"x": "double", "y": "double", "z": "double"},
     "sensor_msgs/msg/LaserScan": {"ranges": "sequence<float>", "range_max": "float"},
 }
-NAMES = Names(
+NAMES = RunNames(
     nodes=NODES,
     topics=TOPICS,
     entities=(*NODES, *TOPICS, "Ekf.update"),
@@ -60,7 +60,7 @@ class View:
     node: str = "/ekf"
     output_hash: int = 0
     input: tuple[str, object] | None = None
-    outputs: Sequence[Sent] = ()
+    outputs: Sequence[SentOutput] = ()
     found: Sequence[str] = ()
     there: Mapping[str, object] = field(default_factory=dict)
 
@@ -70,14 +70,14 @@ class View:
     def received(self) -> tuple[str, object] | None:
         return self.input
 
-    def sent(self) -> Sequence[Sent]:
+    def sent(self) -> Sequence[SentOutput]:
         return self.outputs
 
     def findings(self) -> Sequence[str]:
         return self.found
 
 
-def armed(text: str, at: View | None = None) -> Armed:
+def armed(text: str, at: View | None = None) -> ActiveCondition:
     return parse_condition(text, NAMES).arm(at or View())
 
 
@@ -86,7 +86,7 @@ def odometry(x: float) -> SimpleNamespace:
     return SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(position=position)))
 
 
-def wrong(text: str, names: Names = NAMES) -> tuple[str, str]:
+def wrong(text: str, names: RunNames = NAMES) -> tuple[str, str]:
     """Return what is said of a wrong text, and the part that is pointed at."""
     with pytest.raises(ConditionError) as caught:
         parse_condition(text, names)
@@ -132,12 +132,12 @@ def test_nodes_and_entities_go_by_name_pattern_and_number() -> None:
 
 def test_a_topic_stops_after_who_sends_and_before_who_receives() -> None:
     watch = armed("topic /odom")
-    sent = [Sent(OutputKind.LOG, "", 1), Sent(OutputKind.MESSAGE, "/odom", 2)]
+    sent = [SentOutput(OutputKind.LOG, "", 1), SentOutput(OutputKind.MESSAGE, "/odom", 2)]
     assert watch.after(View(outputs=sent)) == "/ekf has published on /odom"
     assert watch.before(View(input=("/odom", None))) == "/ekf receives /odom"
     assert not watch.after(View(input=("/odom", None)))
     assert not watch.before(View(input=("/scan", None)))
-    call = View(outputs=[Sent(OutputKind.REQUEST, "/robot/plan", 3)])
+    call = View(outputs=[SentOutput(OutputKind.REQUEST, "/robot/plan", 3)])
     assert armed("/robot/plan").after(call) == "/ekf has called /robot/plan"
 
 
@@ -154,7 +154,7 @@ def test_a_message_stops_where_its_fields_say_so(text: str) -> None:
     assert watch.before(View(input=("/odom", odometry(3.5)))).endswith("pose.position.x > 3")
     assert not watch.before(View(input=("/odom", odometry(3.0))))
     assert not watch.before(View(input=("/scan", odometry(3.5))))
-    out = Sent(OutputKind.MESSAGE, "/odom", 2, message=lambda: odometry(4.0))
+    out = SentOutput(OutputKind.MESSAGE, "/odom", 2, message=lambda: odometry(4.0))
     assert watch.after(View(outputs=[out])).startswith("/ekf has published on /odom, and ")
 
 
@@ -170,7 +170,7 @@ def test_an_element_that_is_not_there_makes_it_false_and_a_wrong_field_is_an_err
 
 
 def test_hashes_of_all_outputs_and_of_each() -> None:
-    view = View(output_hash=0x3F2A << 48, outputs=[Sent(OutputKind.TIMER, "", 0xABC << 52)])
+    view = View(output_hash=0x3F2A << 48, outputs=[SentOutput(OutputKind.TIMER, "", 0xABC << 52)])
     for text in ("output 3f2a", "output 3F2A…", "hash:3f", "output abc", "output abc0000000000000"):
         assert armed(text).after(view), text
     assert not armed("output 3f2b").after(view)
@@ -178,17 +178,17 @@ def test_hashes_of_all_outputs_and_of_each() -> None:
 
 
 def test_exceptions_by_type_and_by_what_python_derives_it_from() -> None:
-    view = View(outputs=[Sent(OutputKind.EXCEPTION, "", 1, "FileNotFoundError: no map.yaml")])
+    view = View(outputs=[SentOutput(OutputKind.EXCEPTION, "", 1, "FileNotFoundError: no map.yaml")])
     for text in ("exception", "exception FileNotFoundError", "exception OSError", "raised"):
         assert armed(text).after(view) == "raised FileNotFoundError: no map.yaml", text
     assert not armed("exception ValueError").after(view)
-    own = View(outputs=[Sent(OutputKind.EXCEPTION, "", 1, "robot.errors.Lost: where am I")])
+    own = View(outputs=[SentOutput(OutputKind.EXCEPTION, "", 1, "robot.errors.Lost: where am I")])
     assert armed("exception Lost").after(own)
     assert not armed("exception Los").after(own)
 
 
 def test_log_records_by_level_and_text() -> None:
-    log = Sent(OutputKind.LOG, "", 1, "Too far: 3.2 m", 30)
+    log = SentOutput(OutputKind.LOG, "", 1, "Too far: 3.2 m", 30)
     view = View(outputs=[log])
     for text in ("log", "log warn", "log info too far", 'log "too far"', r"log warn /far: \d/"):
         assert armed(text).after(view) == "log 'Too far: 3.2 m'", text
@@ -294,7 +294,7 @@ def test_a_wrong_text_is_pointed_at(text: str, says: str, part: str) -> None:
 
 
 def test_of_a_run_that_may_make_more_a_name_is_no_mistake() -> None:
-    some = Names(nodes=("/ekf",))
+    some = RunNames(nodes=("/ekf",))
     for text in ("node /later", "topic /later", "watch later.x", "/later: x > 1"):
         assert parse_condition(text, some).text == text
 
@@ -315,7 +315,7 @@ _PIECES = st.sampled_from(
 _TEXTS = st.one_of(st.text(max_size=40), st.lists(_PIECES, max_size=8).map(" ".join))
 
 
-def read(text: str, names: Names) -> Condition | ConditionError:
+def read(text: str, names: RunNames) -> EventCondition | ConditionError:
     try:
         return parse_condition(text, names)
     except ConditionError as error:
@@ -324,9 +324,9 @@ def read(text: str, names: Names) -> Condition | ConditionError:
 
 @given(_TEXTS)
 def test_every_text_is_a_condition_or_an_error_with_its_place(text: str) -> None:
-    for names in (NAMES, Names()):
+    for names in (NAMES, RunNames()):
         found = read(text, names)
-        if isinstance(found, Condition):
+        if isinstance(found, EventCondition):
             assert found.before or found.after
         else:
             assert 0 <= found.start < found.end
@@ -430,7 +430,7 @@ def test_fields_are_those_of_loaded_classes() -> None:
     for package in ("geometry_msgs", "nav_msgs"):
         import_module(f"{package}.msg")
     interfaces = {"/odom": "nav_msgs/msg/Odometry"}
-    names = Names(topics=("/odom",), are_all=True, interfaces=interfaces, fields=loaded_fields)
+    names = RunNames(topics=("/odom",), are_all=True, interfaces=interfaces, fields=loaded_fields)
     parse_condition("/odom: pose.pose.position.x > 3 and pose.covariance[0] > 1", names)
     for text in ("/odom: pose.pose.position.w > 3", "/odom: pose.position.x > 3"):
         with pytest.raises(ConditionError, match="has no field"):

@@ -7,9 +7,9 @@ from collections.abc import Callable
 
 import pytest
 
-from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped
+from rsltrace.debug.checkpoints import Breakpoint, RunPosition, StopReport
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
-from rsltrace.debug.prompt.shell import Shell, completions
+from rsltrace.debug.prompt.shell import DebugPrompt, completions
 from rsltrace.debug.prompt.show import (
     graph_lines,
     position_line,
@@ -109,10 +109,10 @@ def test_where_a_run_stands() -> None:
 
 def test_why_a_run_has_stopped() -> None:
     at = RunPosition(8, 1_500_000_000, EVENT)
-    hit = Stopped("breakpoint", at, Breakpoint(2, "watch ekf.x"), "ekf.x: 1 -> 2")
+    hit = StopReport("breakpoint", at, Breakpoint(2, "watch ekf.x"), "ekf.x: 1 -> 2")
     assert next(stopped_lines(hit)) == "breakpoint 2 (watch ekf.x): ekf.x: 1 -> 2"
-    assert len(list(stopped_lines(Stopped("step", at)))) == 1
-    over = next(stopped_lines(Stopped("end", at, None, "duration of 2 s")))
+    assert len(list(stopped_lines(StopReport("step", at)))) == 1
+    over = next(stopped_lines(StopReport("end", at, None, "duration of 2 s")))
     assert over == "the run is over: duration of 2 s"
 
 
@@ -186,10 +186,10 @@ class Session:
 
 
 @pytest.fixture
-def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Shell]:
-    def made(text: str = "") -> Shell:
+def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], DebugPrompt]:
+    def made(text: str = "") -> DebugPrompt:
         monkeypatch.setattr("sys.stdin", io.StringIO(text))
-        return Shell(Session())  # type: ignore[arg-type]
+        return DebugPrompt(Session())  # type: ignore[arg-type]
 
     return made
 
@@ -207,7 +207,7 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Shell]:
     ],
 )
 def test_what_is_typed_wrong_ends_a_script_with_2(
-    shell: Callable[[str], Shell], line: str, says: str, capsys: pytest.CaptureFixture[str]
+    shell: Callable[[str], DebugPrompt], line: str, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert shell(f"# first\n\n{line}\nbreak\n").run() == 2
     shown = capsys.readouterr()
@@ -216,7 +216,7 @@ def test_what_is_typed_wrong_ends_a_script_with_2(
 
 
 def test_a_script_ends_where_it_ends(
-    shell: Callable[[str], Shell], capsys: pytest.CaptureFixture[str]
+    shell: Callable[[str], DebugPrompt], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert shell("break\nquit\nblah\n").run() == 0
     assert capsys.readouterr().out.splitlines()[1:] == [
@@ -245,6 +245,6 @@ def test_a_script_ends_where_it_ends(
     ],
 )
 def test_what_a_line_could_become(
-    shell: Callable[[str], Shell], text: str, found: list[str]
+    shell: Callable[[str], DebugPrompt], text: str, found: list[str]
 ) -> None:
     assert completions(text, shell("")) == found

@@ -15,7 +15,7 @@ from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of
 
 from rsltrace import DebugSession
-from rsltrace.debug.checkpoints import Stopped
+from rsltrace.debug.checkpoints import StopReport
 from rsltrace.job import load_job
 from rsltrace.run import record
 from rsltrace.trace.model.event import EventKind, OutputKind
@@ -134,7 +134,7 @@ def events_of(trace: Trace, name: str) -> list[int]:
     return found
 
 
-def stops(session: DebugSession) -> list[Stopped]:
+def stops(session: DebugSession) -> list[StopReport]:
     """Run to the end; return where breakpoints have stopped on the way."""
     found = []
     while (stopped := session.go_on()).reason == "breakpoint":

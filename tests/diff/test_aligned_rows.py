@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation
 
 from rsltrace.diff.alignment import blocks
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.traces import aligned_runs
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.reader import Trace
@@ -52,22 +52,22 @@ def check(runs: AlignedRuns, a: Trace, b: Trace) -> None:
                 assert rows.place_of(index, of_b=of_b) == place
         if row.elsewhere is not None:
             there = rows.row(rows.place_of(row.elsewhere, of_b=row.b is None))
-            assert row.sign in (Sign.MOVED, Sign.DIFFERS)
-            if there.sign is not Sign.UNKNOWN:
+            assert row.sign in (RowSign.MOVED, RowSign.DIFFERS)
+            if there.sign is not RowSign.UNKNOWN:
                 assert (there.pair, there.sign) == (row.pair, row.sign)
 
 
 def check_signs(runs: AlignedRuns, a: Trace, b: Trace) -> None:
     """Check the signs by the events, of runs whose entities have the same ids."""
     for row in rows_of(runs):
-        if row.sign in (Sign.ONLY_A, Sign.ONLY_B):
-            assert (row.a is None) == (row.sign is Sign.ONLY_B)
+        if row.sign in (RowSign.ONLY_A, RowSign.ONLY_B):
+            assert (row.a is None) == (row.sign is RowSign.ONLY_B)
             assert row.elsewhere is None
             continue
         event_a, event_b = (t.event(i or 0) for t, i in zip((a, b), row.pair, strict=True))
         alike = all(getattr(event_a, name) == getattr(event_b, name) for name in _COMPARED)
-        assert alike == (row.sign is not Sign.DIFFERS)
-        if row.sign is Sign.MATCH:
+        assert alike == (row.sign is not RowSign.DIFFERS)
+        if row.sign is RowSign.MATCH:
             assert event_a.stamp_ns == event_b.stamp_ns
 
 
@@ -87,7 +87,7 @@ def test_planted_pairs(kind: str, tmp_path: Path, per_block: int) -> None:
             while not runs.done:
                 runs.take(runs.fetch())
                 check(runs, a, b)
-            assert all(row.sign is not Sign.UNKNOWN for row in rows_of(runs))
+            assert all(row.sign is not RowSign.UNKNOWN for row in rows_of(runs))
             if runs.matching.same_ids:
                 check_signs(runs, a, b)
 
@@ -133,7 +133,7 @@ def test_events_that_swap_places_stand_in_both(tmp_path: Path) -> None:
         assert [row.pair for row in moved] == [(left, left + 1)] * 2 or [
             row.pair for row in moved
         ] == [(left + 1, left)] * 2
-        assert {row.sign for row in moved} == {Sign.MOVED}
+        assert {row.sign for row in moved} == {RowSign.MOVED}
         assert runs.rows.count == a.event_count + 1
         assert list(runs.rows.divergences) == [runs.first_place, (runs.first_place or 0) + 2]
 

@@ -20,7 +20,7 @@ from rsltrace.diff.facts.causes import Root, Verdict
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
 from rsltrace.diff.result import Diff
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
@@ -504,7 +504,7 @@ def test_a_node_that_starts_late_stands_where_it_starts(tmp_path: Path) -> None:
         constructed = step(51, 0)
         assert run_a.trace.event(constructed).kind is EventKind.CONSTRUCT
         assert [view.a(place) for place in range(view.count)] == list(range(run_a.count))
-        assert view.sign(constructed) is Sign.DIFFERS
+        assert view.sign(constructed) is RowSign.DIFFERS
 
 
 def test_the_function_is_also_the_package(tmp_path: Path) -> None:

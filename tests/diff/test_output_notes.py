@@ -12,7 +12,12 @@ from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow
 from rsltrace.diff.sentences.values import durations
 from rsltrace.trace.model.event import OutputKind
-from rsltrace.trace.model.texts import durations_apart, format_duration, printable, told_apart
+from rsltrace.trace.model.texts import (
+    contrasting_durations,
+    contrasting_texts,
+    format_duration,
+    printable,
+)
 from rsltrace.trace.words.entities import EntityKey
 
 MESSAGE = int(OutputKind.MESSAGE)
@@ -64,14 +69,14 @@ def test_durations_that_differ_are_shown_so_that_one_sees_it(
 
 @given(st.integers(0, 10**15), st.integers(-3, 3))
 def test_two_durations_never_look_the_same(a_ns: int, more_ns: int) -> None:
-    one, other = durations_apart(a_ns, a_ns + more_ns)
+    one, other = contrasting_durations(a_ns, a_ns + more_ns)
     assert (one == other) == (more_ns == 0)
 
 
 @given(st.text(max_size=80), st.text(max_size=80))
 def test_two_texts_never_look_the_same(a: str, b: str) -> None:
     prefix = "same " * 20
-    one, other = told_apart(prefix + a, prefix + b)
+    one, other = contrasting_texts(prefix + a, prefix + b)
     assert max(len(one), len(other)) <= 40
     assert (one == other) == (printable(a) == printable(b))
 

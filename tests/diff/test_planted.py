@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks
 from rsltrace.diff.alignment.entity_matching import match_entities
-from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.causes.propagation import Propagation
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.options import DiffOptions
@@ -125,7 +125,9 @@ def test_a_second_fault_outside_of_the_cone_is_found_too(
 def _check_order(a: Trace, b: Trace, start: int, window: int) -> None:
     """All events from ``start`` on are listed once, by the time at which either run did them."""
     matching = match_entities(a, b)
-    blocks = AlignedBlocks(Run(a, matching, False), Run(b, matching, True), start, window)
+    blocks = AlignedBlocks(
+        ComparedTrace(a, matching, False), ComparedTrace(b, matching, True), start, window
+    )
     items = [i for block in blocks if isinstance(block, AlignedBlock) for i in block.items]
     times_a, times_b = _times(a), _times(b)
     times = [min(times_a[i.a : i.a + 1] + times_b[i.b : i.b + 1]) for i in items]

@@ -37,12 +37,12 @@ from rsltrace.diff.facts.causes import (
 from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CauseLink,
+    CauseLinkKind,
     CauseStep,
-    EventView,
+    EventSummary,
     FieldDifference,
     FieldNote,
     FieldNoteKind,
-    LinkKind,
     MessageDifference,
     NoFieldsReason,
     Presence,
@@ -109,8 +109,8 @@ def event(
     entity: EntityKey = SCAN,
     kind: EventKind = EventKind.SUBSCRIPTION,
     **changes: Any,
-) -> EventView:
-    made = EventView(
+) -> EventSummary:
+    made = EventSummary(
         index=index,
         stamp_ns=ms * MS,
         entity=entity,
@@ -170,7 +170,7 @@ def nondeterministic() -> Diff:
         a,
         b,
         messages=(message, log),
-        chain=(CauseStep(tick, tick, CauseLink(LinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
+        chain=(CauseStep(tick, tick, CauseLink(CauseLinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
         before_a=before,
         before_b=before,
         same_node_a=(event(100, 1200),),

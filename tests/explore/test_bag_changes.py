@@ -20,9 +20,9 @@ from rsltrace.errors import BagError  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
 from rsltrace.run.plans.faults import (  # noqa: E402
-    UnfitError,
-    changer,
+    FieldChangeError,
     check_changes,
+    field_changer,
 )
 from rsltrace.search.explore.outcome import TrialOptions  # noqa: E402
 from rsltrace.search.explore.strategies.faults import FaultWalk  # noqa: E402
@@ -70,8 +70,8 @@ def test_changes_that_a_search_tries_fit_the_types_and_hit_all_fields(tmp_path: 
                 cls = type(message)
                 check_changes(trial, fault.name, cls)
                 try:
-                    changer(cls, fault)(codec_for(cls).serialize(message))
-                except UnfitError:
+                    field_changer(cls, fault)(codec_for(cls).serialize(message))
+                except FieldChangeError:
                     assert "values[" in str(fault.field), "only the first status has some"
     assert kinds == {"drop", "delay", "duplicate", "change", "swap", "repeat"}
     assert {"/scan ranges", "/scan ranges[*]", "/scan header.frame_id", "/image data"} <= fields

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.search.explore.table import rows
+from rsltrace.search.explore.table import result_rows
 
 CHECKED = """\
 nodes:
@@ -36,7 +36,7 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     done = command("explore", job, "--budget", 60, "--jobs", 1, "--stop-at-first", "-o", folder)
     assert done.returncode == 1, done.stderr
     assert "check: the second comes last: /last: data == 1" in done.stdout
-    found = [one for one in rows(folder) if one.failure is not None]
+    found = [one for one in result_rows(folder) if one.failure is not None]
     assert found[0].failure.key == "the second comes last"
     again = shlex.split(re.search(r"again: rsltrace (.*)", done.stdout)[1])
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
@@ -58,7 +58,7 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     assert replaced.returncode == 0, replaced.stderr
     assert "the job has no checks: only exceptions" in replaced.stdout
     assert sorted(path.name for path in (folder / "traces").iterdir()) == ["000000.mcap"]
-    assert len(list(rows(folder))) == 1
+    assert len(list(result_rows(folder))) == 1
     assert (folder / "mine.txt").exists()
 
 
@@ -71,7 +71,7 @@ def test_what_becomes_of_runs_that_do_not_end_well(
     timeout = ["--timeout", "5"] if how == "hangs" else []
     done = command("explore", job, "--budget", 2, "--jobs", 1, "-o", folder, *timeout)
     assert done.returncode == 1
-    failures = [one.failure for one in rows(folder)]
+    failures = [one.failure for one in result_rows(folder)]
     kind, key = {
         "raises": ("exception", r"ValueError at nodes_under_search.py:\d+"),
         "dies": ("crash", "crash: SIGSEGV"),

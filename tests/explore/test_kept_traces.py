@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from rsltrace.search.explore.outcome import TrialOptions
-from rsltrace.search.explore.search import Budget, Search
-from rsltrace.search.explore.small.causes import make_small
+from rsltrace.search.explore.search import Explorer, SearchBudget
+from rsltrace.search.explore.small.causes import reduce_failures
 from rsltrace.search.explore.strategies.named import RandomWalk
-from rsltrace.search.explore.table import Table, rows
+from rsltrace.search.explore.table import ResultsFolder, result_rows
 from rsltrace.search.explore.trial import CHECK, Failure, JobSource, KeptTraces, Trial, TrialResult
 
 _TRIALS = 8
@@ -48,10 +48,10 @@ class Late:
             yield TrialResult(trial, f"{number:016x}", choices=1, failure=failure, trace=str(trace))
 
 
-def searched(job: Path, folder: Path, order: Callable[[list[int]], list[int]]) -> Search:
+def searched(job: Path, folder: Path, order: Callable[[list[int]], list[int]]) -> Explorer:
     loaded = JobSource(str(job)).job()
-    with Table(folder, {}, resume=False) as table:
-        search = Search(loaded, RandomWalk(0), table, budget=Budget(trials=_TRIALS))
+    with ResultsFolder(folder, {}, resume=False) as table:
+        search = Explorer(loaded, RandomWalk(0), table, budget=SearchBudget(trials=_TRIALS))
         with search:
             search.run(Late(order))
     return search
@@ -73,7 +73,7 @@ def test_a_search_keeps_the_same_traces_whichever_run_ends_first(
     kept = []
     for name, order in (("in order", list), ("backwards", lambda numbers: numbers[::-1])):
         search = searched(job, tmp_path / name, order)
-        of_rows = {one.trial.number: one.trace is not None for one in rows(tmp_path / name)}
+        of_rows = {one.trial.number: one.trace is not None for one in result_rows(tmp_path / name)}
         files = sorted(path.name for path in (tmp_path / name / "traces").iterdir())
         assert sorted(f"{number:06d}.mcap" for number in of_rows if of_rows[number]) == files
         first = {key: one.trial.number for key, one in search.tally.first.items()}
@@ -94,7 +94,7 @@ checks: [{name: none, never: /last.data == 0}]
     job = write_job("lost", text)
     failure = Failure(CHECK, "none", "none")
     lost = TrialResult(Trial(1, {"seed": 3}), failure=failure)
-    found = make_small(JobSource(str(job)), {"none": lost}, tmp_path)
+    found = reduce_failures(JobSource(str(job)), {"none": lost}, tmp_path)
     assert not found["none"].trouble
     assert (found["none"].folder / "failing.mcap").is_file()
 

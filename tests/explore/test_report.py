@@ -14,7 +14,7 @@ import pytest
 from rsltrace.search.explore.report.exploration import (
     FAILS,
     Exploration,
-    Reduced,
+    ReducedRun,
     causes,
     effects,
     repeat_command,
@@ -54,7 +54,7 @@ def explored(count: int = 300) -> Exploration:
         coverage=["Every order of up to 2 departures was tried."],
         wall_s=12.5,
         units={"error": "m"},
-        reduced={LATE.key: Reduced("out/small", "/scan before /tf decides")},
+        reduced={LATE.key: ReducedRun("out/small", "/scan before /tf decides")},
     )
 
 

@@ -7,12 +7,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_NATIVE, TIMING
-from rsltrace.trace.model.event import NO_EVENT, Draw, OutputKind, encode_draw
+from rsltrace.trace.model.event import NO_EVENT, OutputKind, RandomDecision, encode_decision
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
-BITS = encode_draw(1).bit_length() - 1
+BITS = encode_decision(1).bit_length() - 1
 AHEAD_NS = 1_700_000_000 * 10**9
 """By how much the system clock is ahead of the steady one."""
 
@@ -57,9 +57,9 @@ def as_native(
                         recorder.entity(trace.entity(output.entity))
                     else:
                         recorder.output(int(output.kind), output.entity, output.hash)
-                elif kind == Draw.EXECUTION:
+                elif kind == RandomDecision.EXECUTION:
                     busy_ns = value
-                elif kind == Draw.DELAY:
+                elif kind == RandomDecision.DELAY:
                     delays[index, sent, output.entity] = value
             cause = event.cause_event, event.cause_output
             source_ns = left.get(cause, 0)

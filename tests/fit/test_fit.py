@@ -17,11 +17,11 @@ from rsltrace import Trace, record
 from rsltrace.checks.latency.measure import measure_latencies
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
-from rsltrace.native.fit.measured import NativeTimes, measured
+from rsltrace.native.fit.measured import NativeTimes, measure_times
 from rsltrace.native.fit.models import ks_distance
-from rsltrace.run.plans.network import distribution_of
-from rsltrace.simulation.chance.stream import Stream
-from rsltrace.trace.model.event import Draw, OutputKind
+from rsltrace.run.plans.network import make_distribution
+from rsltrace.simulation.chance.stream import RandomStream
+from rsltrace.trace.model.event import OutputKind, RandomDecision
 from tests.fit.native_like import AHEAD_NS, BITS, as_native
 
 pytestmark = pytest.mark.ros
@@ -133,7 +133,7 @@ def drawn(path: Path) -> dict[tuple[int, str, str, str], list[int]]:
                 node = trace.node_of(entity).name
                 key = (
                     kind,
-                    "" if kind == Draw.EXECUTION else nodes_of(trace, sender),
+                    "" if kind == RandomDecision.EXECUTION else nodes_of(trace, sender),
                     entity.name,
                     node,
                 )
@@ -147,7 +147,7 @@ def nodes_of(trace: Trace, entity: int) -> str:
 
 def look(path: Path) -> NativeTimes:
     with Trace.open(path) as trace:
-        return measured(trace)
+        return measure_times(trace)
 
 
 def test_what_was_drawn_is_what_is_measured(known: Known) -> None:
@@ -157,7 +157,7 @@ def test_what_was_drawn_is_what_is_measured(known: Known) -> None:
     expected = {
         (node, name): values
         for (kind, _, name, node), values in truth.items()
-        if kind == Draw.EXECUTION
+        if kind == RandomDecision.EXECUTION
     }
     assert times == expected
     assert len(times) == 6
@@ -170,7 +170,7 @@ def test_what_was_drawn_is_what_is_measured(known: Known) -> None:
     }
     for (topic, sender, receiver), link in links.items():
         if not link.is_service:
-            values = truth[int(Draw.DELAY), sender or "", topic, receiver]
+            values = truth[int(RandomDecision.DELAY), sender or "", topic, receiver]
             assert link.delays.tolist() == values[: len(link.delays)]
             assert len(values) - len(link.delays) <= 2
     assert found.idle == (("/asker", "/never"),)
@@ -206,7 +206,7 @@ def test_the_job_that_comes_out_has_the_distributions_that_went_in(
         samples = []
         for spec in (given, found):
             assert spec is not None
-            draw = distribution_of(job, spec).sampler(Stream(1, "any"), 0)
+            draw = make_distribution(job, spec).sampler(RandomStream(1, "any"), 0)
             samples.append(np.array([draw(0) for _ in range(20_000)]))
         assert ks_distance(*samples) < 1.95 / np.sqrt(780) + 0.02, (given, found)
         if how == "distributions":

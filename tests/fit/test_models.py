@@ -11,7 +11,7 @@ from rsltrace.native.fit.comparison import compare_samples
 from rsltrace.native.fit.measured import clock_steps
 from rsltrace.native.fit.models import ks_distance, model_of, table_of
 from rsltrace.simulation.chance.distribution import Empirical, Gamma, Lognormal, Normal, Uniform
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from tests.tiers import cases
 
 MS = 1_000_000
@@ -30,7 +30,7 @@ def test_a_table_is_near_every_value_that_was_measured(durations: list[int]) -> 
         at = np.linspace(0, 100, len(ordered))
         off = np.abs(np.interp(at, percent, values) - ordered)
         assert (off <= np.maximum(ordered * 0.02, 400) + 1).all()
-    draw = Empirical(percent, values).sampler(Stream(0, "any"), 0)
+    draw = Empirical(percent, values).sampler(RandomStream(0, "any"), 0)
     drawn = [draw(0) for _ in range(50)]
     assert values[0] <= min(drawn)
     assert max(drawn) <= values[-1]
@@ -43,7 +43,7 @@ def test_a_table_is_near_every_value_that_was_measured(durations: list[int]) -> 
 )
 def test_a_family_is_found_again(known: Uniform | Normal | Lognormal | Gamma) -> None:
     pytest.importorskip("scipy")
-    draw = known.sampler(Stream(4, "any"), 0)
+    draw = known.sampler(RandomStream(4, "any"), 0)
     durations = np.array([draw(0) for _ in range(3000)])
     found = model_of(durations, family=True)
     assert isinstance(found.distribution, type(known))

@@ -16,7 +16,7 @@ import pytest
 import rsltrace.guard.virtual.original_code as original_code
 from rsltrace.adapters.rclpy.hints import hint_for
 from rsltrace.guard.virtual.user_modules import rewritten
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
@@ -111,7 +111,7 @@ def test_numba_compiles_what_was_written(tmp_path: Path) -> None:
             texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
         assert texts == ["[6.0, 6.0, 4.0, 5.0]"] * 2
         if name == "compiled":
-            calls = {one.call for one in found if one.source is Source.ORDER}
+            calls = {one.call for one in found if one.source is NondeterminismSource.ORDER}
             assert calls == {"order of sets in first, which numba compiles"}
     assert digests[0] == digests[1]
 

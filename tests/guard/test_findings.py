@@ -16,7 +16,7 @@ from hypothesis.strategies import none
 from rsltrace.errors import GuardError, JobError
 from rsltrace.job import load_job
 from rsltrace.run import run
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 
@@ -59,7 +59,9 @@ def test_a_finding_says_where_what_and_what_it_gave(
             (2, "/n", "os.environ['SHIFT']", "'7'"),
         ]
         assert found[0].value.startswith("SHA-256 "), "what may be a secret is not written down"
-        assert {(f.source, f.mode) for f in found} == {(Source.ENVIRONMENT, Mode.WARN)}
+        assert {(f.source, f.mode) for f in found} == {
+            (NondeterminismSource.ENVIRONMENT, GuardMode.WARN)
+        }
         assert found[1].stack == TICK
         assert trace.guarded == result.guarded
     assert b"s3cret" not in result.path.read_bytes()
@@ -86,7 +88,7 @@ def test_an_error_ends_the_run_and_says_what_to_do(recorded: Callable[..., Any])
     assert "os.environ['MY_TOKEN'] at " + INIT in str(result.error)
     assert "make it a parameter of the node" in str(result.error)
     with Trace.open(result.path) as trace:
-        assert [f.mode for f in trace.findings[0]] == [Mode.ERROR]
+        assert [f.mode for f in trace.findings[0]] == [GuardMode.ERROR]
 
 
 @pytest.mark.few(1)
@@ -253,7 +255,7 @@ def test_the_c_library_through_cffi_is_a_finding(recorded: Callable[..., Any]) -
     result = recorded(node_code(tick, imports="import cffi"))
     assert result.error is None
     found = [(met.source, met.node, met.call, met.count) for met in result.guarded]
-    assert (Source.CLOCK, "/n", "C library: clock()", 2) in found
+    assert (NondeterminismSource.CLOCK, "/n", "C library: clock()", 2) in found
     assert not [call for _, _, call, _ in found if "abs" in call or "environ" in call]
     refused = recorded(node_code(tick, imports="import cffi"), "{clock: error}", "x").error
     assert isinstance(refused, GuardError)

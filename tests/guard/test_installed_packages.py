@@ -15,7 +15,7 @@ import pytest
 
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.object_numbers import ObjectNumbers
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
@@ -81,7 +81,7 @@ def test_what_cannot_be_put_in_order_is_found_at_its_line(
     with Trace.open(tmp_path / "run.mcap") as trace:
         (found,) = [one for many in trace.findings.values() for one in many]
     line = 1 + HELPER.splitlines().index("        return list(self.things)")
-    assert found.source is Source.ORDER
+    assert found.source is NondeterminismSource.ORDER
     assert found.call == "order of a set of Thing"
     assert f"__init__.py:{line} in" in found.stack.splitlines()[0]
 

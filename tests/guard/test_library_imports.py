@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
@@ -103,7 +103,7 @@ def test_a_thread_that_an_import_leaves_running_is_named(
     said(node_code("import lib_that_goes_on"))
     with Trace.open(tmp_path / "run.mcap") as trace:
         found = [one for per_event in trace.findings.values() for one in per_event]
-    calls = [one.call for one in found if one.source is Source.THREAD]
+    calls = [one.call for one in found if one.source is NondeterminismSource.THREAD]
     assert calls == ["threading.Thread.start() while lib_that_goes_on is imported"] * 2
 
 

@@ -23,9 +23,9 @@ from rsltrace.search.perturb import (
     LOCALE,
     THREAD_COUNT,
     TIME_ZONE,
-    Surroundings,
-    record_in,
-    surroundings,
+    Perturbation,
+    perturbation,
+    record_perturbed,
 )
 from rsltrace.trace.reader import Trace
 from tests.golden_files import check_golden
@@ -53,7 +53,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Runs:
 
         def go(number: int, *, guarded: bool) -> None:
             job = _job(folder, listed, number, guarded=guarded)
-            done = record_in(_around(number), [str(job)], folder)
+            done = record_perturbed(_around(number), [str(job)], folder)
             assert done.exit_code == 0, done.errors
             with Trace.open(done.path) as trace:
                 seen[guarded].append(_said(trace))
@@ -82,14 +82,14 @@ def _cannot_differ(name: str) -> str:
     return ""
 
 
-def _around(number: int) -> Surroundings:
-    values = dict(surroundings(number).values)
+def _around(number: int) -> Perturbation:
+    values = dict(perturbation(number).values)
     values.pop(KERNEL, None)  # has a case of its own
     odd = number % 2
     values[LOCALE] = ("C.UTF-8", "C")[odd]
     values[TIME_ZONE] = ("UTC", "XYZ+5:17")[odd]
     values[THREAD_COUNT] = (str(len(os.sched_getaffinity(0))), "1")[odd]
-    return Surroundings(number, values)
+    return Perturbation(number, values)
 
 
 def _job(folder: Path, place: Path, number: int, *, guarded: bool) -> Path:
@@ -174,8 +174,8 @@ def test_another_kernel_of_the_numerical_library_is_in_the_environment(tmp_path:
     content = json.loads(job.read_text())
     content["nodes"] = [n for n in content["nodes"] if n["arguments"]["case"] == "threaded_blas"]
     job.write_text(json.dumps(content))
-    around = [Surroundings(n, {KERNEL: kernels[-n]}) for n in (0, 1)]
-    runs = [record_in(one, [str(job)], tmp_path) for one in around]
+    around = [Perturbation(n, {KERNEL: kernels[-n]}) for n in (0, 1)]
+    runs = [record_perturbed(one, [str(job)], tmp_path) for one in around]
     found = diff_files(str(runs[0].path), str(runs[1].path))
     with Trace.open(runs[0].path) as one, Trace.open(runs[1].path) as other:
         if one.environment["numerics"] == other.environment["numerics"]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 
@@ -91,4 +91,4 @@ def test_what_keeps_its_address_is_found(
     said(node_code(code, module=_MODULE), job=f"nodes: [{{node: 'm:N'}}]\n{guard}")
     with Trace.open(tmp_path / "run.mcap") as trace:
         findings = [one for per_event in trace.findings.values() for one in per_event]
-    assert len([one for one in findings if one.source is Source.ADDRESS]) == found
+    assert len([one for one in findings if one.source is NondeterminismSource.ADDRESS]) == found

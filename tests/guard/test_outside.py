@@ -1,4 +1,4 @@
-"""Mode ``record``: what came from outside is in the trace, and a re-run gets it again."""
+"""GuardMode ``record``: what came from outside is in the trace, and a re-run gets it again."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 from rsltrace.errors import GuardError, JobError, TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
-from rsltrace.trace.model.finding import Mode
+from rsltrace.trace.model.finding import GuardMode
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 
@@ -82,7 +82,7 @@ def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
     first = go(code, "{clock: record}", "first")
     assert go(code, "{clock: record}", "again", replay=first.path).digest == first.digest
     with Trace.open(first.path) as trace:
-        assert {f.mode for found in trace.findings.values() for f in found} == {Mode.RECORD}
+        assert {f.mode for found in trace.findings.values() for f in found} == {GuardMode.RECORD}
 
 
 @pytest.mark.long

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -281,13 +281,15 @@ class N(Node):
 _LINES_BEFORE = SOURCE.count("\n")
 
 
-def _recorded(folder: Path, turn: int) -> tuple[dict[str, str], dict[str, set[Source]]]:
+def _recorded(
+    folder: Path, turn: int
+) -> tuple[dict[str, str], dict[str, set[NondeterminismSource]]]:
     """Return what each line gave, and the sources of the findings in it."""
     path = folder / f"{'long' * turn}{turn}.mcap"
     environment = {**os.environ, "PAD": "x" * (37 + 411 * turn)}
     words = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-q", "-o", path.name]
     subprocess.run(words, cwd=folder, env=environment, check=True, capture_output=True, timeout=300)
-    found: dict[str, set[Source]] = {}
+    found: dict[str, set[NondeterminismSource]] = {}
     with Trace.open(path) as trace:
         texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
         for findings in trace.findings.values():
@@ -303,7 +305,7 @@ def _recorded(folder: Path, turn: int) -> tuple[dict[str, str], dict[str, set[So
 @pytest.fixture(scope="module")
 def runs(
     tmp_path_factory: pytest.TempPathFactory,
-) -> list[tuple[dict[str, str], dict[str, set[Source]]]]:
+) -> list[tuple[dict[str, str], dict[str, set[NondeterminismSource]]]]:
     folder = tmp_path_factory.mktemp("lines")
     cases = [f"def case_{number}(s):\n    return {line}\n" for number, line in enumerate(LINES)]
     (folder / "m.py").write_text("".join((SOURCE, *cases, NODE)))
@@ -313,7 +315,7 @@ def runs(
 
 @pytest.mark.parametrize("number", range(len(LINES)), ids=[line[:50] for line in LINES])
 def test_a_line_gives_the_same_in_every_process_or_a_finding(
-    runs: list[tuple[dict[str, str], dict[str, set[Source]]]], number: int
+    runs: list[tuple[dict[str, str], dict[str, set[NondeterminismSource]]]], number: int
 ) -> None:
     case = f"case_{number}"
     said = [json.dumps(texts[case]) for texts, _ in runs]

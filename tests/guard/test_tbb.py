@@ -16,7 +16,7 @@ import pytest
 
 from rsltrace.job import load_job
 from rsltrace.run import record
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.reader import Trace
 from tests.guard.conftest import node_code
 
@@ -73,7 +73,11 @@ def _findings(folder: Path, code: str, thread: str = "warn") -> list[str]:
     record(load_job(folder / "job.yaml"), folder / "run.mcap")
     with Trace.open(folder / "run.mcap") as trace:
         found = [one for many in trace.findings.values() for one in many]
-    return [f"{one.call}: {one.value} {one.stack}" for one in found if one.source is Source.THREAD]
+    return [
+        f"{one.call}: {one.value} {one.stack}"
+        for one in found
+        if one.source is NondeterminismSource.THREAD
+    ]
 
 
 @pytest.mark.skipif(ONE_CPU, reason="needs two processors")

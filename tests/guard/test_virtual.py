@@ -24,7 +24,7 @@ from rsltrace.guard import frames
 from rsltrace.guard.callers import STANDARD, USER
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 from tests.guard.conftest import node_code
 
 pytestmark = pytest.mark.ros
@@ -375,7 +375,7 @@ def test_no_clock_shows_the_same_twice(steps: list[tuple[str, int]]) -> None:
 
     def shown(nodes: str) -> list[int]:
         context, found = Standing(), []
-        guard = Guard(context, policy=Policy())
+        guard = Guard(context, policy=GuardPolicy())
         for node, advance_ns in steps:
             context.time_ns += advance_ns
             context.runs = node
@@ -415,7 +415,7 @@ def test_a_long_busy_wait_takes_few_events_and_ends_in_time() -> None:
             self.passes += 1
 
     context = Waiting()
-    guard = Guard(context, policy=Policy())
+    guard = Guard(context, policy=GuardPolicy())
     frame = sys._getframe()
     while _look(guard, frame) < 10**9:
         pass
@@ -425,7 +425,7 @@ def test_a_long_busy_wait_takes_few_events_and_ends_in_time() -> None:
 
 def test_a_clock_that_jumps_backwards_is_followed() -> None:
     context = Standing()
-    guard = Guard(context, policy=Policy())
+    guard = Guard(context, policy=GuardPolicy())
     frame = sys._getframe()
     context.time_ns = 10**9
     assert [_look(guard, frame), _look(guard, frame)] == [10**9, 10**9 + 1_000]
@@ -492,7 +492,7 @@ def test_a_clock_that_is_given_something_refuses_it_as_ever(said: Said) -> None:
 
 def test_whose_code_reads_a_clock_is_told_from_its_file_and_not_from_its_modules() -> None:
     """A decorator's text is of no file, and what a program has compiled is of the file it says."""
-    guard = Guard(Standing(), policy=Policy(), packages=frozenset(("pack",)))
+    guard = Guard(Standing(), policy=GuardPolicy(), packages=frozenset(("pack",)))
     places = {"here": sys._getframe().f_code.co_filename, "json": json.__file__}
 
     def whose(name: str, file: str, **more: str) -> tuple[int, dict[str, int]]:

@@ -10,15 +10,15 @@ import pytest
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
 from rsltrace.run.plans.network import network_plan
-from rsltrace.simulation.chance.channel import Burst, Model, Outage
+from rsltrace.simulation.chance.channel import BurstLoss, LinkModel, LinkOutage
 from rsltrace.simulation.chance.distribution import (
     Constant,
     Empirical,
     Gamma,
     Lognormal,
+    MeasuredSamples,
     Normal,
-    Samples,
-    Series,
+    TimeSeries,
     Uniform,
 )
 
@@ -46,7 +46,7 @@ def mistake(delay: str) -> str:
     return str(caught.value).splitlines()[0]
 
 
-def model(spec: str) -> Model:
+def model(spec: str) -> LinkModel:
     plan = network_plan(load(f"default: {spec}\n"), 0)
     assert plan is not None
     assert plan.default is not None
@@ -65,14 +65,14 @@ def model(spec: str) -> Model:
         ("{lognormal: {mean: 5ms, sd: 2ms}}", Lognormal.of_moments(5 * MS, 2 * MS)),
         ("{gamma: {shape: 2, scale: 1ms}}", Gamma(2.0, MS)),
         ("{gamma: {mean: 5ms, sd: 2ms}}", Gamma.of_moments(5 * MS, 2 * MS)),
-        ("{samples: {values: [1ms, 2ms]}}", Samples((MS, 2 * MS))),
+        ("{samples: {values: [1ms, 2ms]}}", MeasuredSamples((MS, 2 * MS))),
         ("{empirical: {values: [1ms, 1ms, 4ms]}}", Empirical((0, 50, 100), (MS, MS, 4 * MS))),
         (
             "{empirical: {values: [0s, 1ms, 4ms], percent: [0, 99.5, 100]}}",
             Empirical((0, 99.5, 100), (0, MS, 4 * MS)),
         ),
-        ("{series: {points: [[0s, 1ms], [1s, 2ms]]}}", Series(((0, MS), (S, 2 * MS)))),
-        ("{series: {points: [[0, 1ms]], steps: true}}", Series(((0, MS),), True)),
+        ("{series: {points: [[0s, 1ms], [1s, 2ms]]}}", TimeSeries(((0, MS), (S, 2 * MS)))),
+        ("{series: {points: [[0, 1ms]], steps: true}}", TimeSeries(((0, MS),), True)),
         ("{drop: 0.1}", None),
     ],
 )
@@ -84,7 +84,7 @@ def test_everything_else_of_a_model() -> None:
     assert model(
         "{drop: 0.1, duplicate: 0.2, keep_order: false, retransmit: 3ms, "
         "burst: {good_to_bad: 0.1, bad_to_good: 0.5, loss_bad: 0.9, loss_good: 0.01}}"
-    ) == Model(None, 0.1, Burst(0.1, 0.5, 0.9, 0.01), 0.2, False, 3 * MS)
+    ) == LinkModel(None, 0.1, BurstLoss(0.1, 0.5, 0.9, 0.01), 0.2, False, 3 * MS)
 
 
 def test_rules_and_outages_of_a_plan() -> None:
@@ -102,15 +102,15 @@ def test_rules_and_outages_of_a_plan() -> None:
     plan = network_plan(job, 100 * S)
     assert plan is not None
     assert [(rule.name, rule.model) for rule in plan.topics] == [
-        ("/a", Model(Constant(MS))),
-        ("/b*", Model(drop=0.5)),
+        ("/a", LinkModel(Constant(MS))),
+        ("/b*", LinkModel(drop=0.5)),
     ]
     (link,) = plan.links
     assert (link.topic, link.sender, link.receiver) == ("/a", "/x", "/y")
-    assert plan.outages[0].outage == Outage(101 * S, 102 * S)
+    assert plan.outages[0].outage == LinkOutage(101 * S, 102 * S)
     assert (plan.outages[1].kind, plan.outages[1].outage) == (
         "node",
-        Outage(100 * S, 100 * S + 500 * MS),
+        LinkOutage(100 * S, 100 * S + 500 * MS),
     )
     again = job.to_yaml()
     Path("again.yaml").write_text(again)
@@ -220,11 +220,11 @@ def test_mistakes_are_shown_where_they_are(delay: str, message: str | None) -> N
 
 def test_samples_and_series_from_files(folder: Path) -> None:
     (folder / "s.txt").write_text("# measured\n4.5\n5ms\n\n0.1  # odd\n")
-    assert model("{samples: {file: s.txt, unit: ms}}").delay == Samples(
+    assert model("{samples: {file: s.txt, unit: ms}}").delay == MeasuredSamples(
         (4_500_000, 5 * MS, 100_000)
     )
     (folder / "s.csv").write_text("time,delay\n0,0.001\n10,20ms\n")
-    assert model("{series: {file: s.csv}}").delay == Series(((0, MS), (10 * S, 20 * MS)))
+    assert model("{series: {file: s.csv}}").delay == TimeSeries(((0, MS), (10 * S, 20 * MS)))
     (folder / "bad.txt").write_text("1\nnan\n")
     assert mistake("default: {samples: {file: bad.txt, unit: ms}}\n").startswith("bad.txt:2:1: ")
     (folder / "bad.csv").write_text("0,1\n0,2\n")
@@ -236,9 +236,9 @@ def test_samples_and_series_from_files(folder: Path) -> None:
 def test_measured_values_are_rounded_to_nanoseconds(folder: Path) -> None:
     # As numpy.savetxt writes them, and a difference of two time.perf_counter().
     (folder / "s.txt").write_text("4.812345678912345678e-03\n0.0000000005\n1e-40\n")
-    assert model("{samples: {file: s.txt}}").delay == Samples((4_812_346, 0, 0))
+    assert model("{samples: {file: s.txt}}").delay == MeasuredSamples((4_812_346, 0, 0))
     (folder / "s.csv").write_text("t0,v1\n0.1234567891,0.00123456789\n")
-    assert model("{series: {file: s.csv}}").delay == Series(((123_456_789, 1_234_568),))
+    assert model("{series: {file: s.csv}}").delay == TimeSeries(((123_456_789, 1_234_568),))
 
 
 @pytest.mark.parametrize(

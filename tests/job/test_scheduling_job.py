@@ -10,7 +10,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
-from rsltrace.run.plans.network import clocks_of
+from rsltrace.run.plans.network import clock_rules
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.simulation.chance.stream import ClockModel
 
@@ -63,7 +63,7 @@ def test_clocks() -> None:
         "     jumps: [{at: 1s, by: -0.5}, {at: 2s, by: 1s}]}\n"
         "  - {node: '*', random_jumps: {every: 10s, most: 5ms}}\n"
     )
-    assert tuple((rule.node, rule.model) for rule in clocks_of(job)) == (
+    assert tuple((rule.node, rule.model) for rule in clock_rules(job)) == (
         (
             "/a",
             ClockModel(

@@ -29,7 +29,14 @@ from rsltrace.trace.format import (
     TOPIC_TIMINGS,
 )
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    EventFlag,
+    EventKind,
+    OutputKind,
+    RandomDecision,
+    encode_decision,
+)
 from tests.tiers import cases
 
 NODES, TOPICS = 3, 4
@@ -143,7 +150,7 @@ def random_run(seed: int) -> tuple[Any, list[Sent], list[Sent]]:
         busy_ns = chance.randint(0, 4) if kind != EventKind.RESUME else 0
         place = 0
         if busy_ns:
-            draw = encode_draw(Draw.EXECUTION, busy_ns)
+            draw = encode_decision(RandomDecision.EXECUTION, busy_ns)
             run.sent.append((index, OutputKind.DRAW, entity, draw))
             place += 1
         goes_on = entity not in waiting and chance.random() < 0.3
@@ -156,7 +163,7 @@ def random_run(seed: int) -> tuple[Any, list[Sent], list[Sent]]:
             sent.last = dict(last[node])
             for other in chance.sample(range(NODES), chance.randint(0, NODES)):
                 receiver, delay_ns = subscriptions[other][topic], chance.randint(0, 5)
-                draw = encode_draw(Draw.DELAY, delay_ns)
+                draw = encode_decision(RandomDecision.DELAY, delay_ns)
                 run.sent.append((index, OutputKind.DRAW, receiver, draw))
                 place += 1
                 sent.delays[receiver] = delay_ns
@@ -245,9 +252,9 @@ def observed(run: Any, messages: list[Sent], ahead_ns: int) -> Any:
     """Return a run as if it had been native: nothing was drawn, but clocks were read. That of the
     system is ``ahead_ns`` of the trace's."""
     busy = {
-        event: value & (encode_draw(1) - 1)
+        event: value & (encode_decision(1) - 1)
         for event, kind, _, value in run.sent
-        if kind == OutputKind.DRAW and value // encode_draw(1) == Draw.EXECUTION
+        if kind == OutputKind.DRAW and value // encode_decision(1) == RandomDecision.EXECUTION
     }
     by_place = {message.cause: message for message in messages}
     for index, stamp_ns, entity, _, _, *cause in run.rows:

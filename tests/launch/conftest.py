@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.reader import read_launch_file
 
 
@@ -53,10 +53,10 @@ def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path
 
 
 @pytest.fixture
-def read(write: Callable[..., Path]) -> Callable[..., Launched]:
+def read(write: Callable[..., Path]) -> Callable[..., LaunchResult]:
     """Write a launch file and read it with the reader that needs no ROS."""
 
-    def go(text: str, name: str = "a.launch.xml", **arguments: str) -> Launched:
+    def go(text: str, name: str = "a.launch.xml", **arguments: str) -> LaunchResult:
         return read_launch_file(write(text, name), arguments)
 
     return go

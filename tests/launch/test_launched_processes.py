@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.adapters.launch.expand import read_apart
-from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.expand import read_in_child_process
+from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.job import NodeSpec
 from rsltrace.job.parts.process import RespawnSpec
@@ -73,7 +73,7 @@ def generate_launch_description():
 """
 
 
-def _specs(launched: Launched, *, compiled: bool = True) -> list[NodeSpec]:
+def _specs(launched: LaunchResult, *, compiled: bool = True) -> list[NodeSpec]:
     def why_not(package: str, name: str) -> str | None:
         return None if compiled or package == "demo" else "it is not installed"
 
@@ -86,14 +86,14 @@ def _specs(launched: Launched, *, compiled: bool = True) -> list[NodeSpec]:
 
 
 @pytest.fixture(params=["xml", "python"])
-def launched(request: Any, read: Any, write: Callable[..., Path]) -> Launched:
+def launched(request: Any, read: Any, write: Callable[..., Path]) -> LaunchResult:
     """The same launch file in two languages."""
     if request.param == "xml":
         return read(XML)  # type: ignore[no-any-return]
-    return read_apart(write(PYTHON, "a.launch.py"), {}, [])
+    return read_in_child_process(write(PYTHON, "a.launch.py"), {}, [])
 
 
-def test_compiled_nodes_are_processes_with_all_that_is_said_of_them(launched: Launched) -> None:
+def test_compiled_nodes_are_processes_with_all_that_is_said_of_them(launched: LaunchResult) -> None:
     driver = _specs(launched)[0]
     assert (driver.executable, driver.arguments) == ("demo/driver", ("--rate", "10"))
     assert (driver.parameters, driver.working_directory) == ({"rate": 5}, "/data")
@@ -105,7 +105,7 @@ def test_compiled_nodes_are_processes_with_all_that_is_said_of_them(launched: La
     assert "prefix: processes are started as they are" in said
 
 
-def test_containers_load_the_components_that_are_no_python(launched: Launched) -> None:
+def test_containers_load_the_components_that_are_no_python(launched: LaunchResult) -> None:
     _, container, fast, here, slow = _specs(launched)
     assert container.executable == "rclcpp_components/component_container"
     assert (container.name, container.namespace) == ("c", "/cam")
@@ -119,7 +119,7 @@ def test_containers_load_the_components_that_are_no_python(launched: Launched) -
     assert lost.why == "it is a C++ component, and its container /nobody is not there"
 
 
-def test_without_the_container_only_its_python_components_run(launched: Launched) -> None:
+def test_without_the_container_only_its_python_components_run(launched: LaunchResult) -> None:
     driver, here = _specs(launched, compiled=False)
     assert (driver.environment, driver.respawn, driver.required) == ({}, None, True)
     assert here.node == "demo.nodes:Filter"

@@ -14,8 +14,8 @@ import pytest
 
 from rsltrace import Trace
 from rsltrace.adapters.launch import ros_launch
-from rsltrace.adapters.launch.expand import read_apart
-from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.expand import read_in_child_process
+from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.python_file import read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
@@ -56,12 +56,12 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture
 def read(
     write: Callable[..., Path], prefix: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., Launched]]:
+) -> Iterator[Callable[..., LaunchResult]]:
     """Read the body of a ``generate_launch_description``, next to ``sub.launch.xml``: here."""
     write(SUB, "sub.launch.xml")
     environment = dict(os.environ)
 
-    def go(body: str, **arguments: str) -> Launched:
+    def go(body: str, **arguments: str) -> LaunchResult:
         return read_launch_file(write_body(write, body), arguments)
 
     yield go
@@ -76,14 +76,14 @@ def write_body(write: Callable[..., Path], body: str) -> Path:
     return write(HEAD + lines, "a.launch.py")
 
 
-def specs_of(launched: Launched) -> list[Any]:
+def specs_of(launched: LaunchResult) -> list[Any]:
     def why_not(package: str, name: str) -> str | None:
         return "it is not installed" if package == "rclcpp_components" else None
 
     return node_specs(launched, skip_unsupported=True, why_not=why_not)
 
 
-def parameters(launched: Launched) -> dict[str, Any]:
+def parameters(launched: LaunchResult) -> dict[str, Any]:
     (spec,) = specs_of(launched)
     return dict(spec.parameters)
 
@@ -96,7 +96,7 @@ BODY = len(HEAD.splitlines()) + 1
 def test_everything(write: Callable[..., Path], prefix: Path) -> None:
     write(SUB, "sub.launch.xml")
     path = write((FILES / "everything.launch.py").read_text(), "a.launch.py")
-    launched = read_apart(path, {"robot": "jackal"}, [])
+    launched = read_in_child_process(path, {"robot": "jackal"}, [])
     specs = specs_of(launched)
     assert "RSLTRACE_T" not in os.environ
     assert [(spec.target, spec.namespace, spec.name) for spec in specs] == [
@@ -296,7 +296,9 @@ def test_the_process_that_reads_is_another(
     write: Any, prefix: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(JobError, match=r"ended the process that read it \(exit status 7\)"):
-        read_apart(write_body(write, "print('\\x1b[2J'); sys.stdout.flush(); os._exit(7)"), {}, [])
+        read_in_child_process(
+            write_body(write, "print('\\x1b[2J'); sys.stdout.flush(); os._exit(7)"), {}, []
+        )
     assert capsys.readouterr().err == "\\x1b[2J\n"
     body = """
 os.chdir('/'); os.environ['RSLTRACE_T'] = '1'
@@ -304,7 +306,7 @@ import threading, time
 threading.Thread(target=time.sleep, args=(1000,)).start()
 return LaunchDescription([])
 """
-    read_apart(write_body(write, body), {}, [])
+    read_in_child_process(write_body(write, body), {}, [])
     assert "launch" not in sys.modules
     assert (Path.cwd(), os.environ.get("RSLTRACE_T")) == (tmp_path, None)
 
@@ -334,7 +336,7 @@ def test_what_a_launch_file_does_to_its_process_is_no_traceback_of_ours(
     write: Any, body: str, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(JobError) as info:
-        read_apart(write_body(write, body), {}, [])
+        read_in_child_process(write_body(write, body), {}, [])
     assert message in str(info.value)
     assert capsys.readouterr().err == ""
 
@@ -473,6 +475,6 @@ def words(context):
     print(context.argv, sys.argv[:2], sys.argv[2][-11:], sys.argv[3:])
 return LaunchDescription([DeclareLaunchArgument("laps"), OpaqueFunction(function=words)])
 """
-    read_apart(write_body(write, body), {"laps": "2"}, [])
+    read_in_child_process(write_body(write, body), {"laps": "2"}, [])
     said = "['laps:=2'] ['ros2', 'launch'] a.launch.py ['laps:=2']\n"
     assert capsys.readouterr().err == said

@@ -7,16 +7,16 @@ from typing import Any
 
 import pytest
 
-from rsltrace.adapters.launch.model import Launched, LaunchedNode
+from rsltrace.adapters.launch.model import LaunchedNode, LaunchResult
 from rsltrace.adapters.launch.specs import node_specs as specs_of
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
 from rsltrace.job.parts.launch import StartAfterSpec
-from rsltrace.run.plans.executables import why_not
+from rsltrace.run.plans.executables import why_not_runnable
 
 
-def node_specs(launched: Launched, *, skip_unsupported: bool) -> list[NodeSpec]:
-    return specs_of(launched, skip_unsupported=skip_unsupported, why_not=why_not)
+def node_specs(launched: LaunchResult, *, skip_unsupported: bool) -> list[NodeSpec]:
+    return specs_of(launched, skip_unsupported=skip_unsupported, why_not=why_not_runnable)
 
 
 FILES = Path(__file__).parent / "files"

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rsltrace.adapters.launch import ros_launch
-from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.reader import read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.errors import JobError
@@ -34,8 +34,8 @@ def _why_not(package: str, name: str) -> str | None:
 
 
 @pytest.fixture
-def evaluate(write: Callable[..., Path], prefix: Path) -> Callable[..., Launched]:
-    def go(text: str, name: str, **arguments: str) -> Launched:
+def evaluate(write: Callable[..., Path], prefix: Path) -> Callable[..., LaunchResult]:
+    def go(text: str, name: str, **arguments: str) -> LaunchResult:
         write(SUB, "sub.launch.xml")
         path = write(text, name)
         assert ros_launch.can_read(path)
@@ -94,7 +94,7 @@ def test_both_readers_agree(
     ros = evaluate(text, name, **arguments)
     own = read_launch_file(tmp_path / name, arguments)
 
-    def specs(launched: Launched) -> list[Any]:
+    def specs(launched: LaunchResult) -> list[Any]:
         nodes = [replace(node, where="") for node in launched.nodes]
         return node_specs(replace(launched, nodes=nodes), skip_unsupported=True, why_not=_why_not)
 

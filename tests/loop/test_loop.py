@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rsltrace.errors import LivelockError
 from rsltrace.simulation.loop.loop import ORDER_BAG, EventLoop
-from rsltrace.simulation.loop.ordered import OrderedLoop, Place
+from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.loop.stop import Progress, Stop, stop_after_events, stop_at
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue, TimerState
@@ -157,7 +157,7 @@ def test_those_who_poll_look_again_until_nothing_comes_of_it(ordered: bool) -> N
 
 def ordered_loop() -> OrderedLoop:
     loop = OrderedLoop(start_ns=0, timers=CreationOrderQueue())
-    loop.place = lambda item: Place(Candidate("/n", "e", "task", 1, None, (), item), None, None)
+    loop.place = lambda item: ReadyItem(Candidate("/n", "e", "task", 1, None, (), item), None, None)
     return loop
 
 

@@ -5,8 +5,15 @@ from __future__ import annotations
 import pytest
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.chance.stream import Stream
-from rsltrace.simulation.loop.policy import Candidate, Departure, Departures, Moment, Pct, pct_bound
+from rsltrace.simulation.chance.stream import RandomStream
+from rsltrace.simulation.loop.policy import (
+    Candidate,
+    ChoicePoint,
+    Departure,
+    Departures,
+    Pct,
+    pct_bound,
+)
 
 THREADS, EVENTS = 4, 3
 
@@ -20,7 +27,7 @@ def order_of(policy: Departures | Pct, lengths: list[int]) -> list[int]:
     left, order = list(lengths), []
     while any(left):
         ready = [number for number, count in enumerate(left) if count]
-        chosen = policy.choose([candidate(number) for number in ready], Moment(0, len(order)))
+        chosen = policy.choose([candidate(number) for number in ready], ChoicePoint(0, len(order)))
         left[ready[chosen]] -= 1
         order.append(ready[chosen])
     return order
@@ -59,7 +66,9 @@ def test_pct_meets_orders_no_less_often_than_it_promises(depth: int) -> None:
         return all(place[one] < place[other] for one, other in constraints)
 
     runs = {1: 300, 2: 600, 3: 2_000}[depth]
-    orders = (order_of(Pct(Stream(seed, "pct"), depth, choices), lengths) for seed in range(runs))
+    orders = (
+        order_of(Pct(RandomStream(seed, "pct"), depth, choices), lengths) for seed in range(runs)
+    )
     met = sum(map(is_met, orders))
     bound = pct_bound(THREADS, choices, depth)
     deviation = (runs * bound * (1 - bound)) ** 0.5

@@ -14,7 +14,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
-from rsltrace.trace.model.event import EventKind, OutputKind, draw_text
+from rsltrace.trace.model.event import EventKind, OutputKind, decision_text
 
 pytestmark = pytest.mark.ros
 
@@ -105,7 +105,7 @@ def test_each_delay_is_in_the_trace_and_is_the_one_that_happened(run: Run) -> No
                 took_ns = event.stamp_ns - events[event.cause_event].stamp_ns
                 assert draw.hash & (2**56 - 1) == took_ns
                 assert draw.entity == event.entity
-                assert draw_text(draw.hash).startswith("delay ")
+                assert decision_text(draw.hash).startswith("delay ")
                 checked += 1
     assert checked >= 8
 
@@ -139,7 +139,7 @@ def test_best_effort_loses_and_is_told_so(run: Run) -> None:
     assert run.nodes["listener"].lost == heard[-1] - len(heard)
     with recorded.trace() as trace:
         texts = [
-            draw_text(output.hash)
+            decision_text(output.hash)
             for i in range(trace.event_count)
             for output in trace.outputs_of(i)
             if output.kind is OutputKind.DRAW
@@ -192,7 +192,7 @@ def test_the_longest_tail_is_a_delay_and_nothing_else(run: Run, model: dict[str,
     assert run.nodes["talker"].count == 30
     with recorded.trace() as trace:
         outputs = [out for i in range(trace.event_count) for out in trace.outputs_of(i)]
-    said = [draw_text(out.hash) for out in outputs if out.kind is OutputKind.DRAW]
+    said = [decision_text(out.hash) for out in outputs if out.kind is OutputKind.DRAW]
     assert {text.split()[0] for text in said} == {"delay"}
     assert len(said) == 30
 

@@ -13,7 +13,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
 from rsltrace.run import RunResult, run
-from rsltrace.trace.model.drop import Drop, drops_of
+from rsltrace.trace.model.drop import QueueDrops, decode_drops
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
@@ -54,7 +54,9 @@ stop: {duration: 1s}
 """
 
 
-def _run(folder: Path, who: str, more: str) -> tuple[RunResult, list[Drop], dict[EventKind, int]]:
+def _run(
+    folder: Path, who: str, more: str
+) -> tuple[RunResult, list[QueueDrops], dict[EventKind, int]]:
     (folder / "queue_nodes.py").write_text(NODES)
     (folder / "job.yaml").write_text(JOB.replace("WHO", who) + more)
     result = run(load_job(folder / "job.yaml"), folder / "t.mcap")
@@ -66,7 +68,7 @@ def _run(folder: Path, who: str, more: str) -> tuple[RunResult, list[Drop], dict
             event = trace.event(index)
             if event.entity in mine:
                 kinds[event.kind] = kinds.get(event.kind, 0) + 1
-        return result, drops_of(trace.result), kinds
+        return result, decode_drops(trace.result), kinds
 
 
 @pytest.mark.parametrize(
@@ -106,4 +108,4 @@ def test_what_a_publisher_cannot_keep_in_an_outage_is_counted_with_its_depth(
 ) -> None:
     outage = "delay: {default: 0ms, outages: [{node: /slow, from: 200ms, to: 400ms}]}\n"
     _, drops, _ = _run(tmp_path, "node: queue_nodes:Slow", outage)
-    assert Drop(drops[0].entity, 5, 15, in_outage=True) in drops
+    assert QueueDrops(drops[0].entity, 5, 15, in_outage=True) in drops

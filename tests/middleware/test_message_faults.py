@@ -8,7 +8,7 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.simulation.chance.channel import Model, NetworkPlan
+from rsltrace.simulation.chance.channel import LinkModel, NetworkPlan
 from rsltrace.simulation.chance.distribution import Constant
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.stop import stop_at
@@ -32,7 +32,7 @@ def arrivals(faults: list[Any], delay: int | None) -> list[tuple[int, int]]:
     loop.stop_conditions = (stop_at(PERIOD * (MESSAGES + 20), "the end"),)
     domain = Domain(loop)
     if delay is not None:
-        plan = NetworkPlan(default=Model(delay=Constant(delay)))
+        plan = NetworkPlan(default=LinkModel(delay=Constant(delay)))
         domain.transport.network = Network(domain.dispatcher, plan)
     domain.transport.faults["/n"] = TopicFaults(
         [

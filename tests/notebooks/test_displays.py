@@ -7,7 +7,7 @@ from pathlib import Path
 
 import rsltrace
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.html import Sheet
+from rsltrace.trace.model.html import HtmlSheet
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -99,7 +99,7 @@ def test_names_are_no_markup(tmp_path: Path) -> None:
 
 
 def test_much_is_cut() -> None:
-    sheet = Sheet("t" * 100_000)
+    sheet = HtmlSheet("t" * 100_000)
     sheet.table(("n",), ((f"row {n} " + "x" * 1000,) for n in range(10_000)))
     sheet.text("\n".join("y" * 1000 for _ in range(10_000)), summary="all")
     html = sheet.html()

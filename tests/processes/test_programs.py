@@ -17,7 +17,7 @@ import pytest
 
 from rsltrace.adapters.processes import build
 from rsltrace.adapters.processes.build import interpreter, why_not_run
-from rsltrace.adapters.processes.child import Child
+from rsltrace.adapters.processes.child import ProcessHandle
 from rsltrace.adapters.workspace import cache
 from rsltrace.errors import SetupError
 
@@ -80,7 +80,7 @@ def test_a_program_with_the_rights_of_another_user_is_not_run(
 
 
 def test_a_process_that_says_nothing_is_given_up() -> None:
-    child = Child(["/bin/sleep", "600"], {}, None, "sleeper")
+    child = ProcessHandle(["/bin/sleep", "600"], {}, None, "sleeper")
     child.give_up_after(0.2)
     assert child.receive() is None
     assert child.reap().said == "was killed by SIGKILL"

@@ -13,10 +13,16 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.adapters.processes.child import Child, Life, has_memory
+from rsltrace.adapters.processes.child import Life, ProcessHandle, has_memory
 from rsltrace.job import load_job
 from rsltrace.run import run
-from rsltrace.search.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings
+from rsltrace.search.perturb import (
+    ADDRESSES,
+    HEAP,
+    can_fix_addresses,
+    perturbation,
+    record_perturbed,
+)
 from rsltrace.trace.reader import Trace
 
 JOB = """
@@ -64,12 +70,12 @@ nodes: [{{program: {compiled("counter.c")}, arguments: ["100", address]}}]
 stop: {{duration: 1s}}
 """)
     job = str(tmp_path / "job.yaml")
-    first = surroundings(1)
-    ways = [surroundings(0), first.only(ADDRESSES), first.only(HEAP)]
-    free = [record_in(way, [job, "--no-pin"], tmp_path).digest for way in ways]
+    first = perturbation(1)
+    ways = [perturbation(0), first.only(ADDRESSES), first.only(HEAP)]
+    free = [record_perturbed(way, [job, "--no-pin"], tmp_path).digest for way in ways]
     assert "" not in free
     assert len(set(free)) == len(ways)
-    pinned = [record_in(way, [job], tmp_path).digest for way in ways[:2]]
+    pinned = [record_perturbed(way, [job], tmp_path).digest for way in ways[:2]]
     assert len(set(pinned)) == 1
 
 
@@ -166,7 +172,7 @@ def test_a_process_that_was_stopped_is_not_given_up() -> None:
 
 
 def test_a_process_that_goes_in_circles_is_given_up() -> None:
-    child = Child([sys.executable, "-c", "while True: pass"], {}, None, "circles")
+    child = ProcessHandle([sys.executable, "-c", "while True: pass"], {}, None, "circles")
     child.give_up_after(0.2)
     assert child.receive() is None
     assert child.reap().said == "was killed by SIGKILL"

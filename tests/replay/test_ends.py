@@ -13,7 +13,7 @@ import pytest
 
 import rsltrace
 from rsltrace.job import load_job
-from rsltrace.run import Observer, run
+from rsltrace.run import RunCallbacks, run
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.reader import Trace
 from tests.replay.conftest import JOB
@@ -48,7 +48,7 @@ def interrupted(job: Path, path: Path, stop: Stop) -> Any:
         if events > 1000:
             ends[0](stop)
 
-    return run(load_job(job), path, observer=Observer(interrupt=ends.append, progress=end))
+    return run(load_job(job), path, observer=RunCallbacks(interrupt=ends.append, progress=end))
 
 
 @pytest.mark.long

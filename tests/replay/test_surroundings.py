@@ -17,7 +17,7 @@ import pytest
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.search import perturb
-from rsltrace.search.perturb import surroundings
+from rsltrace.search.perturb import perturbation
 from rsltrace.trace.reader import Trace
 from sample_traces.make_samples import PAIRS
 from tests.replay.test_jobs_replay import EXAMPLES, ROOT
@@ -40,7 +40,7 @@ def check(trace: Path, folder: Path, place: Path, numbers: range) -> None:
         expected = opened.event_count, opened.digest, True
     words = ["replay", str(trace), "--job-folder", str(folder), "--trust", "--quiet", "--json"]
     for number in numbers:
-        around = surroundings(number)
+        around = perturbation(number)
         if "PYTHONHASHSEED" in os.environ:
             values = {**around.values, perturb.HASH_SEED: os.environ["PYTHONHASHSEED"]}
             around = replace(around, values=values)

@@ -15,7 +15,7 @@ import rsltrace
 from rsltrace.cli.main import cli
 from rsltrace.errors import ReplayError
 from rsltrace.job import load_job
-from rsltrace.replay.preparation import prepared
+from rsltrace.replay.preparation import prepare_replay
 from rsltrace.run import run
 from rsltrace.run.provenance import write_job
 from rsltrace.trace.writer import TraceWriter
@@ -102,7 +102,7 @@ def test_code_elsewhere(here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.chdir(above)
     with pytest.raises(ReplayError, match="which is not the working directory"):
         rsltrace.replay(tmp_path / "run.mcap")
-    with prepared(tmp_path / "run.mcap") as plan:
+    with prepare_replay(tmp_path / "run.mcap") as plan:
         (code,) = plan.code
         assert code.change == "has changed"
     assert not marker.exists()
@@ -123,7 +123,7 @@ def test_looking_at_packages_imports_none(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(tmp_path)
     run(load_job("job.yaml"), "run.mcap")
     Path("ran").unlink()
-    with prepared("run.mcap") as plan:
+    with prepare_replay("run.mcap") as plan:
         files = {one.name: one.file for one in plan.code}
     assert files == {"pack": package / "__init__.py", "pack.nodes": package / "nodes.py"}
     assert not Path("ran").exists()

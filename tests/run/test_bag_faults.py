@@ -25,7 +25,7 @@ from rsltrace.errors import JobError, RsltraceError  # noqa: E402
 from rsltrace.job import Job, NodeSpec  # noqa: E402
 from rsltrace.job.parts.fault import FaultSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
-from rsltrace.run.plans.faults import UnfitError, changer  # noqa: E402
+from rsltrace.run.plans.faults import FieldChangeError, field_changer  # noqa: E402
 from rsltrace.trace.reader import Trace  # noqa: E402
 from tests.tiers import cases  # noqa: E402
 
@@ -108,7 +108,7 @@ def test_a_field_that_is_not_there_or_cannot_be_that_is_an_error_with_its_place(
 def changed(message: Any, field: str, **what: Any) -> Any:
     codec = codec_for(type(message))
     spec = FaultSpec(change="/t", message=1, field=field, **what)
-    return codec.deserialize(changer(type(message), spec)(codec.serialize(message)))
+    return codec.deserialize(field_changer(type(message), spec)(codec.serialize(message)))
 
 
 def test_items_lengths_texts_and_bytes_change() -> None:
@@ -152,7 +152,7 @@ def test_items_lengths_texts_and_bytes_change() -> None:
 def test_what_a_field_cannot_be_is_refused(
     message: Any, field: str, what: dict[str, Any], said: str
 ) -> None:
-    with pytest.raises(UnfitError, match=said):
+    with pytest.raises(FieldChangeError, match=said):
         changed(message, field, **what)
 
 

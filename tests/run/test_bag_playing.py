@@ -16,7 +16,7 @@ import pytest
 from rsltrace import Trace
 from rsltrace.errors import BagError, JobError
 from rsltrace.job import load_job
-from rsltrace.run import Observer, run
+from rsltrace.run import RunCallbacks, run
 
 pytestmark = pytest.mark.ros
 
@@ -80,7 +80,7 @@ def play(tmp_path: Path) -> Any:
         path = tmp_path / "job.yaml"
         path.write_text(text, encoding="utf-8")
         go.notes = []  # type: ignore[attr-defined]
-        observer = Observer(note=go.notes.append)  # type: ignore[attr-defined]
+        observer = RunCallbacks(note=go.notes.append)  # type: ignore[attr-defined]
         (tmp_path / "run.mcap").unlink(missing_ok=True)
         return run(load_job(path), tmp_path / "run.mcap", observer=observer)
 

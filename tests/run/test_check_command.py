@@ -312,17 +312,24 @@ class Picky(Node):
 def test_an_arrow_back_has_one_head_and_a_way_of_its_own() -> None:
     pytest.importorskip("fast_sugiyama")
     from rsltrace.cli.output.graph_svg import graph_svg
-    from rsltrace.simulation.middleware.overview import End, GraphNode, Link, Overview
+    from rsltrace.simulation.middleware.overview import (
+        GraphEnd,
+        GraphLink,
+        GraphNode,
+        GraphOverview,
+    )
 
     nodes = tuple(GraphNode(name, "", ()) for name in ("/plan", "/drive"))
-    plan, drive = End("/plan"), End("/drive")
+    plan, drive = GraphEnd("/plan"), GraphEnd("/drive")
     links = (
-        Link("topic", "/cmd", "", (plan,), (drive,)),
-        Link("topic", "/odom", "", (drive,), (plan,)),
-        Link("topic", "/own", "", (plan,), (plan,)),
+        GraphLink("topic", "/cmd", "", (plan,), (drive,)),
+        GraphLink("topic", "/odom", "", (drive,), (plan,)),
+        GraphLink("topic", "/own", "", (plan,), (plan,)),
     )
     paths = [
-        e.attrib for e in ET.fromstring(graph_svg(Overview(nodes, links))).iter() if "d" in e.attrib
+        e.attrib
+        for e in ET.fromstring(graph_svg(GraphOverview(nodes, links))).iter()
+        if "d" in e.attrib
     ]
     arrows = [path for path in paths if path.get("class", "").startswith("edge")]
     assert len(arrows) == 6

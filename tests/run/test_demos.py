@@ -18,7 +18,7 @@ import demo_packages as demos
 import pytest
 
 import rsltrace
-from rsltrace.search.perturb import LOAD, Surroundings, record_in, surroundings
+from rsltrace.search.perturb import LOAD, Perturbation, perturbation, record_perturbed
 from tests.tiers import cases
 
 pytestmark = [
@@ -96,9 +96,9 @@ def test_one_digest_whatever_surrounds_the_run(prefix: Path, tmp_path: Path) -> 
     job = everybody(prefix, tmp_path)
 
     def perturbed(number: int) -> tuple[str, int]:
-        values = surroundings(number).values
-        around = Surroundings(number, {k: v for k, v in values.items() if k != LOAD})
-        recorded = record_in(around, [str(job)], tmp_path)
+        values = perturbation(number).values
+        around = Perturbation(number, {k: v for k, v in values.items() if k != LOAD})
+        recorded = record_perturbed(around, [str(job)], tmp_path)
         assert recorded.digest, recorded.failure
         return recorded.digest, recorded.events
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.search.perturb import LOAD, Recorded, Surroundings, record_in, surroundings
+from rsltrace.search.perturb import LOAD, Perturbation, PerturbedRun, perturbation, record_perturbed
 from tests.tiers import cases
 
 pytestmark = [pytest.mark.ros, pytest.mark.repeated]
@@ -61,15 +61,15 @@ class Mixed(Node):
 """
 
 
-def quiet(number: int) -> Surroundings:
-    """Surroundings in which nobody keeps a processor busy: half the work."""
-    around = surroundings(number)
-    return Surroundings(number, {k: v for k, v in around.values.items() if k != LOAD})
+def quiet(number: int) -> Perturbation:
+    """Perturbation in which nobody keeps a processor busy: half the work."""
+    around = perturbation(number)
+    return Perturbation(number, {k: v for k, v in around.values.items() if k != LOAD})
 
 
-def recorded(around: Surroundings, job: Path, out: Path) -> Recorded:
+def recorded(around: Perturbation, job: Path, out: Path) -> PerturbedRun:
     """Record the job in surroundings of its own."""
-    done = record_in(around, [str(job)], out)
+    done = record_perturbed(around, [str(job)], out)
     assert done.exit_code == 0, done.errors
     left = [path for path in out.rglob("*.cwd/**/*") if path.is_file() and not path.is_symlink()]
     assert left == [], "a run leaves nothing behind but its trace"
@@ -82,7 +82,7 @@ def test_one_digest_and_identical_files_whatever_surrounds_the_run(tmp_path: Pat
     job = tmp_path / "job.yaml"
     job.write_text(JOB.replace("NETWORK", str(network)))
     with ThreadPoolExecutor(max_workers=2) as pool:
-        around = map(surroundings, range(RUNS))
+        around = map(perturbation, range(RUNS))
         runs = list(pool.map(lambda each: recorded(each, job, tmp_path), around))
     assert len({run.digest for run in runs}) == 1, runs
     files = {hashlib.sha256(run.path.read_bytes()).hexdigest() for run in runs}

@@ -21,7 +21,7 @@ import pytest
 
 from rsltrace import Trace
 from rsltrace.job import load_job
-from rsltrace.run import Observer, run
+from rsltrace.run import RunCallbacks, run
 from rsltrace.simulation.loop.stop import Stop
 
 pytestmark = pytest.mark.ros
@@ -208,7 +208,7 @@ def test_a_trace_is_closed_that_was_interrupted_while_it_was_opened(
     module = importlib.import_module("rsltrace.run.session")
     write = module.write_job
     monkeypatch.setattr(module, "write_job", write_job)
-    observer = Observer(interrupt=ends.append)
+    observer = RunCallbacks(interrupt=ends.append)
     result = run(load_job("job.yaml"), "out.mcap", observer=observer)
     assert result.exit_code == 130
     with Trace.open("out.mcap") as trace:

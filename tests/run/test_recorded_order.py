@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import JobError
-from rsltrace.simulation.loop.policy import PolicyChoices, decoded
+from rsltrace.simulation.loop.policy import PolicyChoices, decode_choices
 from rsltrace.trace.reader import Trace
 
 MIXED = """
@@ -131,7 +131,7 @@ def test_choices_as_a_trace_holds_them() -> None:
     for number in numbers:
         choices.add(number)
     assert choices
-    assert list(decoded(choices.encoded())) == numbers
+    assert list(decode_choices(choices.encoded())) == numbers
 
 
 PAIR = """\

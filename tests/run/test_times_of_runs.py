@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import rsltrace
-from rsltrace.conditions.names import Names
+from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.text import parse_condition
 from rsltrace.job import load_job
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
@@ -108,6 +108,6 @@ def test_a_time_is_read_with_or_without_a_start() -> None:
 
 
 def test_a_condition_takes_both(folder: Path) -> None:
-    names = Names.__new__(Names)
+    names = RunNames.__new__(RunNames)
     for text in ("t=2.5s", f"t=@{START_S}s"):
         assert parse_condition(text, names).text == text

@@ -22,7 +22,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rclpy.node import Node
 
 import rsltrace
-from rsltrace.run import Observer, run, watchdog
+from rsltrace.run import RunCallbacks, run, watchdog
 from rsltrace.simulation.loop.stop import Stop
 from tests.guard.conftest import list_as_wheel
 
@@ -219,7 +219,7 @@ def test_one_interrupt_ends_what_was_told_of(
 
     stop = rsltrace.StopSpec(duration="20s")
     job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Busy)], stop=stop)
-    result = run(job, tmp_path / "a.mcap", observer=Observer(interrupt=ends.append))
+    result = run(job, tmp_path / "a.mcap", observer=RunCallbacks(interrupt=ends.append))
     assert (result.exit_code, result.stop_reason) == (130, "interrupted")
     assert seen == went_on
 

@@ -30,9 +30,9 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
-    Event,
     EventFlag,
     EventKind,
+    EventRecord,
     Output,
     OutputKind,
 )
@@ -104,7 +104,7 @@ class Feeder:
     """Feeds a writer and remembers what it was given."""
 
     writer: TraceWriter
-    events: list[Event] = field(default_factory=list)
+    events: list[EventRecord] = field(default_factory=list)
     outputs: list[list[Output]] = field(default_factory=list)
     payloads: dict[int, list[tuple[int, bytes]]] = field(default_factory=dict)
     details: list[tuple[int, int, str]] = field(default_factory=list)
@@ -180,7 +180,7 @@ class Feeder:
             flags,
         )
         chain_hash = hash64(rest, self.events[-1].chain_hash if self.events else 0)
-        event = Event(
+        event = EventRecord(
             index=index,
             stamp_ns=stamp_ns,
             entity=entity,

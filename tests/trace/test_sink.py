@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 import pytest
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.mcap.sink import Sink, unfinished
+from rsltrace.trace.mcap.sink import Sink, unfinished_path
 
 MAGIC = b"\x89MCAP0\r\n"
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="traces are recorded on Linux")
@@ -174,7 +174,7 @@ def test_what_is_replaced_stays_until_the_new_one_is_whole(path: Path) -> None:
     path.write_bytes(MAGIC + b"old")
     path.chmod(0o640)
     sink = begun(path, force=True)
-    assert sink.place == unfinished(path) == path.parent / "run.unfinished.mcap"
+    assert sink.place == unfinished_path(path) == path.parent / "run.unfinished.mcap"
     assert sink.place.read_bytes() == MAGIC + b"first"
     assert path.read_bytes() == MAGIC + b"old"
     sink.finish()
@@ -190,7 +190,7 @@ def test_what_was_given_up_is_beside_what_was_there(path: Path) -> None:
     sink = begun(path, force=True)  # takes the place of what was given up
     sink.write(b"more")
     sink.finish(replace=False)
-    assert sink.place == unfinished(path)
+    assert sink.place == unfinished_path(path)
     assert sink.place.read_bytes() == MAGIC + b"firstmore"
     assert path.read_bytes() == MAGIC + b"old"
 
@@ -227,13 +227,13 @@ def test_a_link_leads_to_what_is_replaced(path: Path) -> None:
 
 def test_nothing_but_a_trace_is_taken_for_one_that_was_given_up(path: Path) -> None:
     path.write_bytes(MAGIC)
-    unfinished(path).write_text("precious")
+    unfinished_path(path).write_text("precious")
     with pytest.raises(
         OutputError, match=r"run\.unfinished\.mcap: the existing file is not a trace"
     ):
         Sink(path, force=True)
-    unfinished(path).unlink()
-    unfinished(path).symlink_to(path.parent / "elsewhere")
+    unfinished_path(path).unlink()
+    unfinished_path(path).symlink_to(path.parent / "elsewhere")
     with pytest.raises(OutputError, match=r"run\.unfinished\.mcap"):
         Sink(path, force=True)
     assert not (path.parent / "elsewhere").exists()
@@ -307,6 +307,6 @@ def test_a_folder_of_somebody_else(there: str) -> None:
             text=True,
             check=True,
         )
-        place = unfinished(path) if there else path
+        place = unfinished_path(path) if there else path
         assert f"cannot write the trace {place}: Permission denied; choose another" in done.stdout
         assert path.exists() == bool(there)

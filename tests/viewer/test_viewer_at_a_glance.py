@@ -27,9 +27,9 @@ from rsltrace_viewer.terminal.screens.logs import LogScreen
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.source import SourceView
 
-from rsltrace.trace.contents import count
+from rsltrace.trace.contents import count_trace
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import Draw, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.event import EventKind, OutputKind, RandomDecision, encode_decision
 
 Drive = Callable[..., None]
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
@@ -37,7 +37,7 @@ SAMPLES = Path(__file__).parents[2] / "sample_traces"
 
 def test_the_overview_counts_what_the_trace_has(long_run: Run) -> None:
     overview = list(read_overview(long_run))[-1]
-    counts = count(long_run.trace)
+    counts = count_trace(long_run.trace)
     assert {e: s.count for e, s in overview.events.items()} == {
         e: s.count for e, s in counts.events.items()
     }
@@ -77,9 +77,9 @@ def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: P
         publisher = feeder.entity(EntityKind.PUBLISHER, "/out", node=node)
         feeder.event(EventKind.CONSTRUCT, 0, 0)
         for place, value in enumerate(took_ns):
-            feeder.output(OutputKind.DRAW, timer, encode_draw(Draw.EXECUTION, value))
+            feeder.output(OutputKind.DRAW, timer, encode_decision(RandomDecision.EXECUTION, value))
             if place == 1:
-                feeder.output(OutputKind.DRAW, publisher, encode_draw(Draw.BURST))
+                feeder.output(OutputKind.DRAW, publisher, encode_decision(RandomDecision.BURST))
             feeder.event(EventKind.TIMER, timer, 10_000_000 * place)
         feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
     run = Run.open(path)

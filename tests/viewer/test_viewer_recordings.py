@@ -29,7 +29,7 @@ from rsltrace_viewer.terminal.screenshot import settle, text_of
 from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.job.values.times import START, parse_time_in_run
 from rsltrace.trace.decode import to_plain
 
@@ -85,7 +85,7 @@ def test_pairs_have_every_message_once_and_in_order(a: list[int], b: list[int]) 
     assert [one for one, _ in rows if one is not None] == list(range(len(a)))
     assert [other for _, other in rows if other is not None] == list(range(len(b)))
     for row, (one, other) in enumerate(rows):
-        if pairs.sign(row) is Sign.MATCH:
+        if pairs.sign(row) is RowSign.MATCH:
             assert one is not None
             assert other is not None
             assert a[one] == b[other]

@@ -19,7 +19,7 @@ from rsltrace_viewer.model.timeline.message_values import message_values, sample
 from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 
@@ -177,7 +177,7 @@ def test_rows_and_plots_of_two_runs_show_what_differs(
         assert comparison is not None
         comparison.finish_diff()
         assert session.plots().first() == plot
-        rows = [row for row in range(comparison.count) if comparison.sign(row) is Sign.DIFFERS]
+        rows = [row for row in range(comparison.count) if comparison.sign(row) is RowSign.DIFFERS]
         list(session.read_values(rows))
         assert any(session.row(row).event.outputs.startswith(text) for row in rows)
     finally:

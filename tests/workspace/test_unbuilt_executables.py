@@ -13,7 +13,7 @@ from rsltrace import Trace
 from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.adapters.workspace.installs import executables, modules
 from rsltrace.errors import JobError
-from rsltrace.run.plans.executables import find_executable, why_not
+from rsltrace.run.plans.executables import find_executable, why_not_runnable
 from rsltrace.source_packages import SourcePackage, workspace_of
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
@@ -342,7 +342,7 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
             with pytest.raises(JobError) as caught:
                 find_executable(target, where="job.yaml:1:1")
             assert said in str(caught.value)
-            assert str(caught.value) == f"job.yaml:1:1: {why_not(*target.split('/'))}"
+            assert str(caught.value) == f"job.yaml:1:1: {why_not_runnable(*target.split('/'))}"
 
 
 def test_the_workspace_around_a_launch_file(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
@@ -268,9 +268,9 @@ class Session:
         assert self.b is not None
         a, b = row.pair
         text, short, raised = event.outputs, "", event.raised
-        if a is not None and b is not None and row.sign is Sign.DIFFERS:
+        if a is not None and b is not None and row.sign is RowSign.DIFFERS:
             text, short, raised = self._differing(a, b)
-        elif row.sign in (Sign.ONLY_A, Sign.ONLY_B):
+        elif row.sign in (RowSign.ONLY_A, RowSign.ONLY_B):
             text = f"only in {'a' if row.b is None else 'b'}{text and ': '}{text}"
         delta = ""
         if a is not None and b is not None and (later_ns := self.b.stamp(b) - self.a.stamp(a)):
@@ -330,7 +330,7 @@ class Session:
             return None
         row = self.comparison.row(place)
         a, b = row.pair
-        if row.sign is not Sign.DIFFERS or a is None or b is None:
+        if row.sign is not RowSign.DIFFERS or a is None or b is None:
             return None
         return a, b
 

@@ -12,7 +12,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from rsltrace.adapters.launch import ros_launch
-from rsltrace.adapters.launch.model import Argument, Expanded, Launched, argument_words
+from rsltrace.adapters.launch.model import (
+    JobExpansion,
+    LaunchArgument,
+    LaunchResult,
+    argument_words,
+)
 from rsltrace.adapters.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.adapters.launch.specs import node_specs
 from rsltrace.adapters.workspace.imports import unbuilt_packages
@@ -29,7 +34,9 @@ from rsltrace.terminal import tell
 _OUTPUT_MAX = 1 << 16
 
 
-def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]) -> Launched:
+def read_in_child_process(
+    path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
+) -> LaunchResult:
     """Return what a launch file starts; it and what it includes may be in Python.
 
     ``folders`` are where packages and modules are looked for, before Python's own path. What the
@@ -67,7 +74,7 @@ def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
             found = pickle.loads(answer.read_bytes())
         except Exception:
             found = None
-    if isinstance(found, Launched):
+    if isinstance(found, LaunchResult):
         return found
     if isinstance(found, str):
         raise JobError(found)
@@ -78,7 +85,7 @@ def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
 
 
 def main(order: Mapping[str, object]) -> None:
-    """Do what an order asks, and write the answer: a ``Launched``, or the text of an error."""
+    """Do what an order asks, and write the answer: a ``LaunchResult``, or the text of an error."""
     from rsltrace.adapters.launch.api.basics import as_job_error, shown
     from rsltrace.adapters.launch.python_file import read_launch_file
     from rsltrace.adapters.workspace.imports import unbuilt_packages
@@ -88,7 +95,7 @@ def main(order: Mapping[str, object]) -> None:
     sys.path[:0] = map(str, folders)
     arguments: Mapping[str, str] = order["arguments"]  # type: ignore[assignment]
     sys.argv[:] = ["ros2", "launch", str(order["file"]), *argument_words(arguments)]
-    found: Launched | str
+    found: LaunchResult | str
     try:
         with unbuilt_packages(folders):
             found = read_launch_file(Path(str(order["file"])), arguments)
@@ -116,7 +123,7 @@ def expand(
     why_not: Callable[[str, str], str | None],
     is_process: Callable[[str, str], bool],
     programs: bool = True,
-) -> Expanded:
+) -> JobExpansion:
     """Return a job whose launch files have become nodes.
 
     A Python launch file is a program, and so is the ``setup.py`` of a package that nobody has
@@ -127,7 +134,7 @@ def expand(
     :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
-        return Expanded(job)
+        return JobExpansion(job)
     if not programs:
         return _expand(job, None, why_not, is_process)
     folders = [job.resolve(folder) for folder in job.search_path]
@@ -140,7 +147,7 @@ def expand(
     if new and not named.isdisjoint(source_packages(new)):
         more = [os.path.relpath(folder, job.base_dir) for folder in new]
         job = job.replace(search_path=[*job.search_path, *more])
-    return Expanded(job, expanded.notes)
+    return JobExpansion(job, expanded.notes)
 
 
 def _expand(
@@ -148,7 +155,7 @@ def _expand(
     folders: Sequence[Path] | None,
     why_not: Callable[[str, str], str | None],
     is_process: Callable[[str, str], bool],
-) -> Expanded:
+) -> JobExpansion:
     """Do so; ``folders`` are those of packages and modules, None if no programs are to run."""
     nodes: list[NodeSpec] = list(job.nodes)
     notes: list[str] = []
@@ -170,10 +177,10 @@ def _expand(
             "the launch file starts nothing that can be simulated",
             where=where if in_file else job.launch[0].file,
         )
-    return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
+    return JobExpansion(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 
-def _read(job: Job, index: int, folders: Sequence[Path] | None) -> Launched:
+def _read(job: Job, index: int, folders: Sequence[Path] | None) -> LaunchResult:
     spec = job.launch[index]
     path = job.resolve(spec.file)
     try:
@@ -182,12 +189,12 @@ def _read(job: Job, index: int, folders: Sequence[Path] | None) -> Launched:
     except ProgramNeededError:
         if folders is None:
             raise JobError("a Python launch file is a program", where=spec.file) from None
-        launched = read_apart(path, spec.arguments, folders)
+        launched = read_in_child_process(path, spec.arguments, folders)
     _check_known(job, index, launched.arguments)
     return launched
 
 
-def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
+def _check_known(job: Job, index: int, known: Mapping[str, LaunchArgument]) -> None:
     """Raise ``JobError`` if an argument is given that no launch file declares."""
     spec = job.launch[index]
     for name in spec.arguments:

@@ -14,7 +14,7 @@ from ruamel.yaml.error import YAMLError
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job
-from rsltrace.job.reading.yaml_source import Place
+from rsltrace.job.reading.yaml_source import SourcePlace
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import printable
 
@@ -178,7 +178,7 @@ def equal_texts(a: str, b: str) -> bool:
 # What becomes of a job with launch files.
 
 
-class Expanded(NamedTuple):
+class JobExpansion(NamedTuple):
     """A job without launch files, and what of them it leaves out or has no use for."""
 
     job: Job
@@ -195,7 +195,7 @@ class Attribute:
     """A value as written: text (with substitutions in it), or a typed value or list of YAML."""
 
     value: Any
-    place: Place
+    place: SourcePlace
 
 
 @dataclass(eq=False)
@@ -203,7 +203,7 @@ class Element:
     """One tag of a launch file."""
 
     tag: str
-    place: Place
+    place: SourcePlace
     attributes: dict[str, Attribute] = field(default_factory=dict)
     children: list[Element] = field(default_factory=list)
 
@@ -329,7 +329,7 @@ class UnsupportedItem:
 
 
 @dataclass(frozen=True, slots=True)
-class Argument:
+class LaunchArgument:
     """A declared launch argument; ``default`` is as written, None for a required one."""
 
     name: str
@@ -347,12 +347,12 @@ def argument_words(arguments: Mapping[str, str]) -> list[str]:
 
 
 @dataclass(slots=True)
-class Launched:
+class LaunchResult:
     """All of a launch file. ``ignored`` is what has no meaning in a simulation, for information.
     Where a node of which ``required`` has the number ends, everything does."""
 
     nodes: list[LaunchedNode] = field(default_factory=list)
     unsupported: list[UnsupportedItem] = field(default_factory=list)
     ignored: list[str] = field(default_factory=list)
-    arguments: dict[str, Argument] = field(default_factory=dict)
+    arguments: dict[str, LaunchArgument] = field(default_factory=dict)
     required: set[int] = field(default_factory=set)

@@ -22,12 +22,12 @@ from rsltrace.adapters.launch.api.description_sources import (
 )
 from rsltrace.adapters.launch.api.packages import missing_packages_allowed
 from rsltrace.adapters.launch.api.ros_modules import own_launch
-from rsltrace.adapters.launch.model import Launched
+from rsltrace.adapters.launch.model import LaunchResult
 from rsltrace.adapters.launch.reader import LaunchFileReader
 from rsltrace.errors import JobError
 
 
-def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
+def read_launch_file(path: Path, arguments: Mapping[str, str]) -> LaunchResult:
     """Return what a launch file starts, given ``name:=value`` arguments.
 
     :raises JobError: with file and line, if something in it is wrong, missing or not known here.

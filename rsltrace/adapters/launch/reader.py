@@ -17,13 +17,13 @@ from rsltrace.adapters.launch.frontend import launch_description
 from rsltrace.adapters.launch.model import (
     Attribute,
     Element,
-    Launched,
+    LaunchResult,
     argument_words,
     not_a_launch_file,
 )
 from rsltrace.adapters.launch.xml_file import parse_xml
 from rsltrace.errors import JobError
-from rsltrace.job.reading.yaml_source import Item, parse_yaml
+from rsltrace.job.reading.yaml_source import YamlValue, parse_yaml
 from rsltrace.job.values.times import ExactFloat
 from rsltrace.trace.model.regular_file import read_regular
 
@@ -40,7 +40,7 @@ def parse_launch_yaml(text: str, name: str, folder: str) -> Element:
     return _element("launch", root.value["launch"])
 
 
-def _element(tag: str, item: Item) -> Element:
+def _element(tag: str, item: YamlValue) -> Element:
     element = Element(tag, item.key_place or item.place)
     if isinstance(item.value, list):
         element.children = _entities(item)
@@ -61,7 +61,7 @@ def _element(tag: str, item: Item) -> Element:
     return element
 
 
-def _entities(item: Item) -> list[Element]:
+def _entities(item: YamlValue) -> list[Element]:
     if not isinstance(item.value, list):
         raise item.place.error("expected a list of actions (- node: …)")
     found = []
@@ -73,7 +73,7 @@ def _entities(item: Item) -> list[Element]:
     return found
 
 
-def _is_list_of_mappings(item: Item) -> bool:
+def _is_list_of_mappings(item: YamlValue) -> bool:
     return isinstance(item.value, list) and any(isinstance(one.value, dict) for one in item.value)
 
 
@@ -93,7 +93,7 @@ class ProgramNeededError(BaseException):
     """There is a Python launch file, and it must not run here. No error of a launch file."""
 
 
-def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
+def read_launch_file(path: Path, arguments: Mapping[str, str]) -> LaunchResult:
     """Return what an XML or YAML launch file starts, given ``name:=value`` arguments.
 
     :raises JobError: with file, line and column, if something in it is wrong or missing.
@@ -118,7 +118,7 @@ class LaunchFileReader:
         self._load_python = load_python
         self._open: list[Path] = []
 
-    def read(self, path: Path) -> Launched:
+    def read(self, path: Path) -> LaunchResult:
         """Read a file, then do what its event handlers bring."""
         self._include(path)
         later = self.context.later

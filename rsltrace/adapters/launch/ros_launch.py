@@ -19,9 +19,9 @@ from typing import Any
 
 from rsltrace.adapters.launch.model import (
     ENVIRONMENT,
-    Argument,
-    Launched,
+    LaunchArgument,
     LaunchedNode,
+    LaunchResult,
     ParameterFilePath,
     Parameters,
     ProcessSettings,
@@ -46,7 +46,7 @@ def can_read(path: Path) -> bool:
     return all(find_spec(name) is not None for name in needed)
 
 
-def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
+def read_launch_file(path: Path, arguments: Mapping[str, str]) -> LaunchResult:
     """Return what a launch file would start, given ``name:=value`` arguments.
 
     :raises JobError: with what launch says is wrong.
@@ -89,7 +89,7 @@ def _own_environment(argv: list[str]) -> Iterator[None]:
 
 class _LaunchVisitor:
     def __init__(self, context: Any, path: Path) -> None:
-        self.launched = Launched()
+        self.launched = LaunchResult()
         self._context = context
         self._environment = dict(os.environ)
         self._path = path
@@ -220,7 +220,7 @@ class _LaunchVisitor:
     def _declare(self, action: Any) -> None:
         default = action.default_value
         text = None if default is None else "".join(part.describe() for part in default)
-        argument = Argument(action.name, text, action.description or "")
+        argument = LaunchArgument(action.name, text, action.description or "")
         self.launched.arguments.setdefault(action.name, argument)
 
     # -- nodes -------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from rsltrace.adapters.launch.model import (
-    Launched,
     LaunchedNode,
+    LaunchResult,
     ParameterFilePath,
     ProcessSettings,
     UnsupportedItem,
@@ -27,7 +27,7 @@ _LISTED_MAX = 30
 
 
 def node_specs(
-    launched: Launched,
+    launched: LaunchResult,
     *,
     skip_unsupported: bool,
     why_not: Callable[[str, str], str | None],
@@ -78,7 +78,7 @@ def _position(item: UnsupportedItem) -> tuple[str, list[int]]:
     return file, [int(number) for number in numbers if number.isdigit()]
 
 
-def _without_orphans(nodes: list[LaunchedNode], launched: Launched) -> list[LaunchedNode]:
+def _without_orphans(nodes: list[LaunchedNode], launched: LaunchResult) -> list[LaunchedNode]:
     """Return the nodes but those that wait for one that is left out, which are left out, too."""
     while True:
         there = {node.number for node in nodes}
@@ -109,7 +109,7 @@ def _without_idle_containers(
 
 
 def _note_what_is_lost(
-    nodes: Sequence[LaunchedNode], launched: Launched, is_process: Callable[[str, str], bool]
+    nodes: Sequence[LaunchedNode], launched: LaunchResult, is_process: Callable[[str, str], bool]
 ) -> None:
     for node in nodes:
         said = node.surroundings

@@ -7,7 +7,7 @@ from xml.parsers import expat
 
 from rsltrace.adapters.launch.model import Attribute, Element, not_a_launch_file
 from rsltrace.errors import JobError
-from rsltrace.job.reading.yaml_source import Mark, Place, YamlSource
+from rsltrace.job.reading.yaml_source import SourcePlace, TextPosition, YamlSource
 
 _DEPTH_MAX = 100
 
@@ -36,16 +36,18 @@ class _XmlReader:
         try:
             self._parser.Parse(self._source.text.encode(), True)
         except expat.ExpatError as error:
-            mark = Mark(error.lineno, error.offset + 1)
+            mark = TextPosition(error.lineno, error.offset + 1)
             said = expat.ErrorString(error.code)
             raise self._source.error(f"not XML: {said}", mark) from None
         if self._root is None:
             raise not_a_launch_file(self._source.name, "the file is empty")
         return self._root
 
-    def _place(self) -> Place:
+    def _place(self) -> SourcePlace:
         parser = self._parser
-        return Place(self._source, Mark(parser.CurrentLineNumber, parser.CurrentColumnNumber + 1))
+        return SourcePlace(
+            self._source, TextPosition(parser.CurrentLineNumber, parser.CurrentColumnNumber + 1)
+        )
 
     def _start(self, tag: str, values: dict[str, str]) -> None:
         place = self._place()
@@ -64,7 +66,7 @@ class _XmlReader:
             self._root = element
         self._open.append(element)
 
-    def _attribute_place(self, start: Place, name: str) -> Place:
+    def _attribute_place(self, start: SourcePlace, name: str) -> SourcePlace:
         """Return where an attribute stands: expat tells only where its element begins."""
         lines = self._source.text.split("\n")
         line, column = start.mark.line, start.mark.column - 1
@@ -73,7 +75,7 @@ class _XmlReader:
             for before in (" ", "\t", ""):
                 at = text.find(f"{before}{name}=", column)
                 if at >= 0 and (before or at == 0):
-                    return Place(self._source, Mark(line, at + len(before) + 1))
+                    return SourcePlace(self._source, TextPosition(line, at + len(before) + 1))
             line, column = line + 1, 0
         return start
 

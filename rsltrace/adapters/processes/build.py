@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.adapters.processes.door import Program
+from rsltrace.adapters.processes.door import ProcessProgram
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError
@@ -93,7 +93,7 @@ def find_compiler() -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Library:
+class PreloadLibrary:
     """What is preloaded into processes. ``python_symbols`` stands in for what libraries of ROS
     want from Python, in programs that have none."""
 
@@ -102,7 +102,7 @@ class Library:
     ros: RosInstallation
 
 
-def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
+def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> PreloadLibrary:
     """Return the library; it is built if it has not been, and ``told`` is given one line then.
 
     :raises SetupError: if a compiler or headers are missing, or the compiler refuses the sources.
@@ -134,7 +134,7 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
     if not _is_whole(folder):
         shutil.rmtree(folder, ignore_errors=True)
         folder = cached_folder("processes", name, make)
-    return Library(folder / _NAME, folder / _STUB, ros)
+    return PreloadLibrary(folder / _NAME, folder / _STUB, ros)
 
 
 def _digest(folder: Path) -> str:
@@ -232,7 +232,7 @@ def _check(name: str, status: int, said: str) -> None:
     )
 
 
-__all__ = ["Library", "RosInstallation", "find_compiler", "find_ros", "library"]
+__all__ = ["PreloadLibrary", "RosInstallation", "find_compiler", "find_ros", "library"]
 
 
 # From a file to a command line: what runs it, and the environment it needs.
@@ -303,7 +303,7 @@ def is_python(path: Path) -> bool:
 
 def program(
     command: Sequence[str],
-    library: Library,
+    library: PreloadLibrary,
     *,
     surroundings: Mapping[str, str],
     environment: Mapping[str, str],
@@ -311,7 +311,7 @@ def program(
     search_path: Sequence[str] = (),
     prefixes: Sequence[str] = (),
     pinned: bool = True,
-) -> Program:
+) -> ProcessProgram:
     """Return a command as a process of the run: with variables of ``surroundings`` but for those of
     ``environment``.
 
@@ -334,7 +334,7 @@ def program(
     if prefixes:  # what is built comes first
         found = [*_listed(around, "AMENT_PREFIX_PATH"), *prefixes]
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
-    return Program(list(command), around, folder, pinned)
+    return ProcessProgram(list(command), around, folder, pinned)
 
 
 def _listed(environment: Mapping[str, str], name: str) -> list[str]:

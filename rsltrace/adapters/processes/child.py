@@ -13,7 +13,7 @@ from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.adapters.processes.wire import HEAD, RECORD, Told, WireError
+from rsltrace.adapters.processes.wire import HEAD, RECORD, CommandKind, WireError
 from rsltrace.child_processes import how_ended, kill_group
 from rsltrace.errors import JobError
 from rsltrace.guard.pin import fix_addresses
@@ -24,7 +24,7 @@ _LENGTH = struct.Struct("<Q")
 _SIZE = 1 << 16
 
 
-class Shared:
+class SharedMemory:
     """A file in memory, mapped; it never shrinks."""
 
     def __init__(self, name: str) -> None:
@@ -57,7 +57,7 @@ class Shared:
         self.fd = -1
 
 
-class Said(Shared):
+class ProcessMessages(SharedMemory):
     """What a process has said and nobody has taken: the length, then whole records."""
 
     def batch(self, size: int) -> memoryview:
@@ -137,7 +137,7 @@ _LOST_LINK = 120  # of native/link.cpp
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class ProcessEnd:
     """How a process ended: its exit status (negative: the signal that killed it), in words.
 
     ``broken_link`` says what it has done to the link, if that is why it was ended.
@@ -159,7 +159,7 @@ class Ended:
         return how_ended(self.status)
 
 
-class Child:
+class ProcessHandle:
     """A running executable with the library in it, in a process group of its own.
 
     Its addresses are the same in every run if they are ``fixed``, where the system allows that; if
@@ -184,7 +184,7 @@ class Child:
             here.setsockopt(
                 socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, int(_LOOK_S * 1e6))
             )
-            self._said, self._told = Said("rsltrace-said"), Shared("rsltrace-told")
+            self._said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
             files = (there.fileno(), self._said.fd, self._told.fd)
             # Of one length: the environment lies on the stack, and what comes after it moves.
             link = ":".join(f"{number:010d}" for number in (files[0], os.getpid(), *files[1:]))
@@ -217,7 +217,7 @@ class Child:
         if len(data) > _LARGE:
             self._told.grow(len(data))
             self._told.data[: len(data)] = data
-            data = RECORD.pack(len(data), Told.SHARED)
+            data = RECORD.pack(len(data), CommandKind.SHARED)
         with suppress(BrokenPipeError, ConnectionResetError):
             self._socket.sendall(data)
 
@@ -265,20 +265,20 @@ class Child:
             except ConnectionResetError:
                 return 0
 
-    def reap(self) -> Ended:
+    def reap(self) -> ProcessEnd:
         """Wait for the end of a process that says no more; one that lives on is killed."""
         while self._process.poll() is None:
             if has_memory(self.pid):  # what ends has given its memory back before its descriptors
                 self.kill()
-                return Ended(self._process.returncode, "closed")
+                return ProcessEnd(self._process.returncode, "closed")
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(_LOOK_S)
         status = self._process.returncode
-        return Ended(status, "closed" if status == _LOST_LINK else "")
+        return ProcessEnd(status, "closed" if status == _LOST_LINK else "")
 
     def dismiss(self) -> None:
         """End the process: it is told to, and killed if it does not."""
-        self.send(RECORD.pack(0, Told.KILL))
+        self.send(RECORD.pack(0, CommandKind.KILL))
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_GRACE_S)
         self.kill()

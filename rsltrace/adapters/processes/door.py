@@ -7,15 +7,15 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rsltrace.adapters.processes.child import Child
+from rsltrace.adapters.processes.child import ProcessHandle
 from rsltrace.adapters.processes.process import Process
 from rsltrace.errors import RunError
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.events.event import OutsideEvent
-from rsltrace.simulation.middleware.events.failure import end_run, note_raised
+from rsltrace.simulation.middleware.events.failure import end_run, record_exception
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 
@@ -23,7 +23,7 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 
 
 @dataclass(frozen=True, slots=True)
-class Program:
+class ProcessProgram:
     """What to start as a process: the whole command line, and what it finds around it.
 
     It has the same addresses in every run if it is ``pinned``.
@@ -36,7 +36,7 @@ class Program:
 
 
 @dataclass(frozen=True, slots=True)
-class Interfaces:
+class TypeLookup:
     """Where the door gets types from, which it knows by name only."""
 
     message: Callable[[str], MessageType]
@@ -47,13 +47,13 @@ Log = Callable[[int, str, str], None]
 """Shows a log record: severity, name of the logger, text."""
 
 
-class ProcessDoor:
+class ProcessAdapter:
     """The processes of one run. ``on_end`` is called with the key of each that has ended;
     ``follows_clock`` says of a node whether /clock drives its ROS time. ``clock`` is there if nodes
     have clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it
     says what is shown, and whether that stays so throughout the event."""
 
-    def __init__(self, domain: Domain, interfaces: Interfaces, *, seed: int, log: Log) -> None:
+    def __init__(self, domain: Domain, interfaces: TypeLookup, *, seed: int, log: Log) -> None:
         self.domain = domain
         self.log = log
         self.message_type = interfaces.message
@@ -66,11 +66,11 @@ class ProcessDoor:
 
     def seed_of(self, key: str) -> int:
         """Return the number from which a process draws what others take for entropy."""
-        return Stream(self._seed, f"process\0{key}").below(1 << 53)
+        return RandomStream(self._seed, f"process\0{key}").below(1 << 53)
 
     def start(
         self,
-        program: Program,
+        program: ProcessProgram,
         *,
         name: str,
         key: str,
@@ -89,7 +89,9 @@ class ProcessDoor:
         def begin() -> None:
             on_start()
             argv, environment, folder = program.argv, program.environment, program.folder
-            process.begin(lambda: Child(argv, environment, folder, name, fixed=program.pinned))
+            process.begin(
+                lambda: ProcessHandle(argv, environment, folder, name, fixed=program.pinned)
+            )
 
         domain.dispatcher.run_outside(
             OutsideEvent(process.describe),
@@ -135,5 +137,5 @@ class ProcessDoor:
         if isinstance(error, KeyboardInterrupt):
             dispatcher.loop.stop(Stop("interrupted", 130))
             return
-        raised = note_raised(dispatcher, error, handle)
+        raised = record_exception(dispatcher, error, handle)
         end_run(dispatcher, raised, error if isinstance(error, RunError) else raised.as_error())

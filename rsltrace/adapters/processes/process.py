@@ -8,7 +8,7 @@ from contextlib import suppress
 from typing import Protocol
 
 from rsltrace.adapters.processes import graph_answers
-from rsltrace.adapters.processes.child import Child, Ended
+from rsltrace.adapters.processes.child import ProcessEnd, ProcessHandle
 from rsltrace.adapters.processes.endpoints import (
     ProcessClient,
     ProcessService,
@@ -27,9 +27,9 @@ from rsltrace.adapters.processes.wire import (
     HEAD,
     NEVER_NS,
     RECORD,
+    CommandKind,
     RecordKind,
     RecordReader,
-    Told,
     WakeReason,
     WireError,
     gid_of,
@@ -89,8 +89,8 @@ class Process:
         self.entity_id = 0
         self.announced = True
         self.begun_ns = 0
-        self.child: Child
-        self.ended: Ended | None = None
+        self.child: ProcessHandle
+        self.ended: ProcessEnd | None = None
         self.things = ProcessEntities(door, self)
         self._wanted: dict[int, int] = {}
         """Which thread waits for a thing."""
@@ -153,7 +153,7 @@ class Process:
 
     # -- going on --------------------------------------------------------------------------------
 
-    def begin(self, child: Callable[[], Child]) -> None:
+    def begin(self, child: Callable[[], ProcessHandle]) -> None:
         """Start it, and let it run up to its first wait, within the event under way."""
         self.child = child()
         self._converse()
@@ -200,7 +200,7 @@ class Process:
             waking.off()
         self._running_thread = thread
         now_ns = self.dispatcher.loop.now_ns
-        head = GO.pack(GO.size - 8 + len(item), Told.GO, now_ns, thread, ready, number)
+        head = GO.pack(GO.size - 8 + len(item), CommandKind.GO, now_ns, thread, ready, number)
         self.child.send(head + item)
         self._converse()
 
@@ -243,7 +243,7 @@ class Process:
             question = self._questions.get(kind)
             if question is not None:
                 answer = question(fields)
-                return RECORD.pack(len(answer), Told.ANSWER) + answer
+                return RECORD.pack(len(answer), CommandKind.ANSWER) + answer
             self._records[kind](fields)
         return b""
 
@@ -310,14 +310,14 @@ class Process:
     # -- its end ---------------------------------------------------------------------------------
 
     def _has_ended(self, broken_link: str = "") -> None:
-        """Take it out of the graph, within the event under way; ``broken_link`` as in ``Ended``.
+        """Take it out of the graph, within the event under way; ``broken_link``: ``ProcessEnd``.
 
         :raises NodeError: if it has failed, and the job does not say to go on.
         """
         ended = self.child.reap()
         with suppress(*_NOT_A_BATCH):
             self._take_batch(self.child.left())
-        self.ended = Ended(ended.status, broken_link or ended.broken_link)
+        self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.door.has_ended(self)
         if not self.ended.failed or self._is_stopping:
@@ -337,7 +337,7 @@ class Process:
         waits again."""
         self._is_stopping = True
         self.child.give_up_after(_GRACE_S)
-        self.child.send(RECORD.pack(0, Told.STOP))
+        self.child.send(RECORD.pack(0, CommandKind.STOP))
         self._converse()
         if self.ended is None:
             self.child.dismiss()

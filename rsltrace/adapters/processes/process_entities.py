@@ -21,7 +21,7 @@ from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.entity import DomainEntity, Runnable
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import Door
+from rsltrace.simulation.middleware.events.event import ExceptionHandler
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant, QosEvent, full_name
 from rsltrace.simulation.middleware.publisher import Publisher
@@ -196,7 +196,7 @@ class ProcessQosEvent(QosEvent):
 _TIMER = struct.Struct("<IIq")
 
 
-class EntityFactory(Door, Protocol):
+class EntityFactory(ExceptionHandler, Protocol):
     """Where a process finds its peers, and types by their names."""
 
     domain: Domain

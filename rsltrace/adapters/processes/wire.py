@@ -64,7 +64,7 @@ class RecordKind(IntEnum):
     DROPPED = 31
 
 
-class Told(IntEnum):
+class CommandKind(IntEnum):
     """What a process is told."""
 
     GO = 1

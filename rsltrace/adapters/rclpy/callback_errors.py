@@ -17,11 +17,11 @@ from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.failure import (
-    Raised,
-    described,
+    RaisedException,
+    describe_exception,
     end_run,
-    note_raised,
-    text_of,
+    exception_text,
+    record_exception,
     user_traceback,
 )
 from rsltrace.terminal import tell
@@ -42,7 +42,7 @@ def end_child(error: BaseException) -> NoReturn:
     if not isinstance(error, SystemExit):
         tell(user_traceback(error), end="")
     elif error.code is not None and not isinstance(error.code, int):
-        tell(text_of(error))
+        tell(exception_text(error))
     with contextlib.suppress(Exception):
         sys.stdout.flush()
         sys.stderr.flush()
@@ -70,7 +70,7 @@ class RclpyExceptionHandler:
         if os.getpid() != stacks.runners.process:
             end_child(error)
         is_ending = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
-        note = described if is_ending else note_raised
+        note = describe_exception if is_ending else record_exception
         raised = note(stacks.dispatcher, error, handle)
         mailbox = None if isinstance(handle, OutsideEvent) else mailbox_of(handle)
         node = self._logging_node(error)
@@ -89,12 +89,12 @@ class RclpyExceptionHandler:
         else:
             end_run(stacks.dispatcher, raised, self._run_error(raised))
 
-    def _hand_on(self, mailbox: Mailbox, raised: Raised) -> None:
+    def _hand_on(self, mailbox: Mailbox, raised: RaisedException) -> None:
         """Raise an exception out of the spin that runs the callback."""
         mailbox.raised = raised.error
         self._stacks.programs.present.failures.append(raised)
 
-    def _run_error(self, raised: Raised) -> RunError:
+    def _run_error(self, raised: RaisedException) -> RunError:
         failures = self._stacks.programs.present.failures
         earlier = next((one for one in failures if one.error is raised.error), None)
         if earlier is not None:

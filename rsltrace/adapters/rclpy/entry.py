@@ -12,7 +12,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.errors import JobError
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,13 +28,13 @@ class StartRule:
     ended: str | None = None
 
 
-Typed = tuple[int | None, bytes | None]
+TypedInput = tuple[int | None, bytes | None]
 """When something is typed (ns since the start of the run; None: when it is read), and the bytes
 (None: the end of the input)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class JobEntry:
     """One entry of a job, ready to be constructed.
 
     ``make`` returns a node or a list of nodes. ``arguments`` are those of ``ros2 run``, in lists of
@@ -47,12 +47,12 @@ class Entry:
     log_exceptions: bool = False
     """Whether exceptions of callbacks are logged instead of ending the run."""
     key: str = ""
-    policy: Policy | None = None
+    policy: GuardPolicy | None = None
     argv: list[str] | None = None
     """The command line, if ``make`` is a main."""
     start_after: StartRule | None = None
     """None: it starts with the run."""
-    stdin: Sequence[Typed] | None = None
+    stdin: Sequence[TypedInput] | None = None
     """The input of its terminal, None if it has none."""
     program: object | None = None
     """The executable of a real process, for ``World.start_process``."""

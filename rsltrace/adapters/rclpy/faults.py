@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon
 from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, SpinningExecutor
@@ -24,7 +24,7 @@ from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.trace.model.event import NO_EVENT, Draw, EventKind, encode_draw
+from rsltrace.trace.model.event import NO_EVENT, EventKind, RandomDecision, encode_decision
 from rsltrace.trace.model.texts import format_seconds
 
 
@@ -38,7 +38,7 @@ class FaultedNodes:
     """
 
     def __init__(
-        self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: Entry | None
+        self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: JobEntry | None
     ) -> None:
         self._stacks = stacks
         self._nodes = nodes
@@ -114,7 +114,11 @@ class FaultedNodes:
         )
 
 
-_DRAWS = {"crash": Draw.CRASH, "hang": Draw.HANG, "restart": Draw.RESTART}
+_DRAWS = {
+    "crash": RandomDecision.CRASH,
+    "hang": RandomDecision.HANG,
+    "restart": RandomDecision.RESTART,
+}
 
 
 class RealProcess(Protocol):
@@ -200,7 +204,7 @@ class _ScheduledFault:
         if self._faulted is not None:
             faulted, self._faulted = self._faulted, None
             if not faulted.are_destroyed:
-                self._event(self._node(), Draw.GOES_ON, 0, faulted.release)
+                self._event(self._node(), RandomDecision.GOES_ON, 0, faulted.release)
             return
         node = self._node()
         if node is None:
@@ -221,13 +225,17 @@ class _ScheduledFault:
         return self._world.domain.graph.node_named(self.fault.node)
 
     def _event(
-        self, node: Participant | None, draw: Draw, value_ns: int, body: Callable[[], None]
+        self,
+        node: Participant | None,
+        draw: RandomDecision,
+        value_ns: int,
+        body: Callable[[], None],
     ) -> None:
         dispatcher = self._world.domain.dispatcher
         entity = 0 if node is None else node.entity_id
 
         def happen() -> None:
-            dispatcher.draw(entity, encode_draw(draw, value_ns))
+            dispatcher.draw(entity, encode_decision(draw, value_ns))
             body()
 
         event = OutsideEvent(self.describe)
@@ -262,7 +270,7 @@ class _ScheduledFault:
         elif entry is not None:
             world.stacks.programs.tell("ended", entry.key)
 
-    def _nodes(self, node: NodeHandle, entry: Entry | None) -> list[Any]:
+    def _nodes(self, node: NodeHandle, entry: JobEntry | None) -> list[Any]:
         """Return the nodes of a node's process."""
         own = [one for one in self._world.domain.graph.nodes if one.process is node.process]
         if node.process.entry is not None:
@@ -270,7 +278,7 @@ class _ScheduledFault:
         same = [one for one in own if isinstance(one, NodeHandle) and one.entry is entry]
         return [node] if entry is None else same
 
-    def _entry(self, node: Participant) -> Entry | None:
+    def _entry(self, node: Participant) -> JobEntry | None:
         if not isinstance(node, NodeHandle):
             if node.process is None:
                 return None

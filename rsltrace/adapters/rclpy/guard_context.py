@@ -8,7 +8,7 @@ from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
 from rsltrace.adapters.rclpy.stacks.entry_starts import entry_of, policy_of
 from rsltrace.adapters.rclpy.stacks.runtime import Runtime
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 
 
 class GuardContext:
@@ -43,7 +43,7 @@ class GuardContext:
         programs = self._stacks.programs
         return 0 if programs.is_hosted else programs.all.index(programs.present) + 1
 
-    def policy(self) -> Policy | None:
+    def policy(self) -> GuardPolicy | None:
         return policy_of(self._stacks.event)
 
     def place(self) -> tuple[int, int]:

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from rsltrace.guard.virtual import set_order
-from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.simulation.middleware.events.failure import exception_text
 
 
 def is_unmade(value: object) -> bool:
@@ -130,7 +130,7 @@ def hint_for(error: BaseException) -> str:
 
 def _is_of_order(error: BaseException) -> bool:
     """Return whether an error comes from the guard's functions that order sets."""
-    if "__rsltrace_" in text_of(error):
+    if "__rsltrace_" in exception_text(error):
         return True
     traceback, last = error.__traceback__, None
     while traceback is not None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from rsltrace.simulation.chance.stream import ClockModel, Stream, WrongClock
+from rsltrace.simulation.chance.stream import ClockModel, RandomStream, SkewedClock
 from rsltrace.simulation.middleware.domain import Domain
-from rsltrace.trace.model.event import encode_clock
+from rsltrace.trace.model.event import encode_clock_change
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class NodeClocks:
         self._seed = seed
         self._rules = rules
         self._start_ns = start_ns
-        self._clocks: dict[str, WrongClock | None] = {}
+        self._clocks: dict[str, SkewedClock | None] = {}
         self._rule_of: dict[str, ClockRule | None] = {}
         self._ahead: dict[str, tuple[int, int]] = {}
         """For clocks that advance: the time of the last reading, and how far ahead it was."""
@@ -50,8 +50,8 @@ class NodeClocks:
             rule = self._rule(node)
             self._clocks[node] = None
             if rule is not None:
-                stream = Stream(self._seed, f"clock\0{node}")
-                self._clocks[node] = WrongClock(rule.model, stream, self._start_ns)
+                stream = RandomStream(self._seed, f"clock\0{node}")
+                self._clocks[node] = SkewedClock(rule.model, stream, self._start_ns)
         clock = self._clocks[node]
         if clock is None:
             return now_ns
@@ -92,4 +92,4 @@ class NodeClocks:
 
     def _note(self, node: str, by_ns: int) -> None:
         for handle in self._domain.graph.nodes_named(node):
-            self._domain.dispatcher.draw(handle.entity_id, encode_clock(by_ns))
+            self._domain.dispatcher.draw(handle.entity_id, encode_clock_change(by_ns))

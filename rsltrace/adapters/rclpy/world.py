@@ -14,7 +14,7 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.boundary.boundary import BoundaryContext, RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.installation import installed
 from rsltrace.adapters.rclpy.callback_errors import RclpyExceptionHandler
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.executors.user_executors import note_replaced_functions, own_executors
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
@@ -73,10 +73,10 @@ class World:
         self._boundary: RclpyBoundary
         self._terminals: Terminals
         self._stack = ExitStack()
-        self.constructed: list[Entry] = []
+        self.constructed: list[JobEntry] = []
         """The entries in the order of their construction."""
         self.starts = EntryStarts(self.stacks, self.construct)
-        self.start_process: Callable[[Entry, tuple[int, int]], None]
+        self.start_process: Callable[[JobEntry, tuple[int, int]], None]
         """EntryStarts an entry that runs as a process of its own, as one event."""
 
     def __enter__(self) -> World:
@@ -137,7 +137,7 @@ class World:
         """Delay and lose messages. Call it before the first node is made."""
         self.domain.transport.network = Network(self.domain.dispatcher, plan)
 
-    def plan(self, entries: Sequence[Entry], start_ns: int) -> None:
+    def plan(self, entries: Sequence[JobEntry], start_ns: int) -> None:
         """Register the mains before the first begins: one that ends must know of later ones."""
         programs = self.stacks.programs
         programs.all = [
@@ -182,7 +182,7 @@ class World:
 
     # -- the stages of a run ---------------------------------------------------------------------
 
-    def construct(self, entry: Entry, cause: tuple[int, int] = (NO_EVENT, 0)) -> bool:
+    def construct(self, entry: JobEntry, cause: tuple[int, int] = (NO_EVENT, 0)) -> bool:
         """Construct an entry as one event; return False if that ended the run.
 
         ``cause``: the event and output that it follows from.

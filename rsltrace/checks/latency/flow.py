@@ -22,7 +22,14 @@ from rsltrace.checks.latency.observed import native_times
 from rsltrace.checks.latency.paths import NO_PATH, ChainPaths, ChainSelection, Hop, sink_hop
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    EventFlag,
+    EventKind,
+    OutputKind,
+    RandomDecision,
+    encode_decision,
+)
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.reader import Trace
 
@@ -34,9 +41,9 @@ _PATHS_MAX = 256
 _MESSAGE, _DRAW = int(OutputKind.MESSAGE), int(OutputKind.DRAW)
 _SUBSCRIPTION, _RESUME = int(EventKind.SUBSCRIPTION), int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
-_KIND_BITS = encode_draw(1).bit_length() - 1
-_VALUE = encode_draw(1) - 1
-_LOST = (int(Draw.DROP), int(Draw.BURST), int(Draw.OUTAGE))
+_KIND_BITS = encode_decision(1).bit_length() - 1
+_VALUE = encode_decision(1) - 1
+_LOST = (int(RandomDecision.DROP), int(RandomDecision.BURST), int(RandomDecision.OUTAGE))
 _Columns = tuple[list[int], ...]
 _Selected = tuple[int, int, int, int]
 """An output: which of its event's, its kind, entity and hash."""
@@ -186,11 +193,11 @@ class MessageFlow:
                 follows = place
                 continue
             draw, value_ns = number >> _KIND_BITS, number & _VALUE
-            if draw == Draw.EXECUTION and sender == entity:
+            if draw == RandomDecision.EXECUTION and sender == entity:
                 busy_ns = value_ns
             elif row != NONE and place == follows + 1:
                 follows = place
-                if draw == Draw.DELAY:
+                if draw == RandomDecision.DELAY:
                     self._delays.add(row, sender, value_ns)
                 elif draw in _LOST:
                     self.lost.add(row, sender)

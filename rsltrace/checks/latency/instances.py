@@ -18,7 +18,7 @@ Durations = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class LatencyFigures:
     """Durations in ns: how many, the least, quantiles, the most, their mean and deviation.
 
     A quantile is one of the durations, the smallest that so many do not exceed.
@@ -39,12 +39,12 @@ class Figures:
         return self.max_ns - self.min_ns
 
 
-def figures(durations: Durations) -> Figures | None:
+def figures(durations: Durations) -> LatencyFigures | None:
     """Return the figures of durations, None if there are none."""
     if not len(durations):
         return None
     ordered = np.sort(durations)
-    return Figures(
+    return LatencyFigures(
         len(ordered),
         int(ordered[0]),
         quantile(ordered, 50),

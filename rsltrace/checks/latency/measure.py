@@ -14,9 +14,9 @@ from rsltrace.checks.latency.flow import MessageFlow
 from rsltrace.checks.latency.instances import (
     ChainMessages,
     Durations,
-    Figures,
     HopMessages,
     HopTimes,
+    LatencyFigures,
     figures,
     instances,
     parts_of,
@@ -217,7 +217,7 @@ class ChainLatency:
         reactions)."""
         return self._measured(measure)[0]
 
-    def figures(self, measure: str) -> Figures | None:
+    def figures(self, measure: str) -> LatencyFigures | None:
         """Return the figures of one of ``MEASURES``; None if there is nothing to measure."""
         return figures(self.durations(measure))
 

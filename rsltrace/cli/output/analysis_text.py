@@ -7,14 +7,14 @@ from dataclasses import asdict
 from textwrap import fill
 from typing import Any
 
-from rsltrace.native.timing.analysis import Analysis, ChainResult, Seen
+from rsltrace.native.timing.analysis import ChainResult, TimingAnalysis, WorstResponse
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
 
 _NS_PER_MS = 1e6
 
 
-def picture_of(found: Analysis) -> Any:
+def picture_of(found: TimingAnalysis) -> Any:
     """Return a matplotlib figure of the chains: bound, observations and deadline of each."""
     from matplotlib.figure import Figure
 
@@ -50,7 +50,7 @@ _TIMES = {
 }
 
 
-def text(found: Analysis, times: str, native: Sequence[str]) -> list[str]:
+def text(found: TimingAnalysis, times: str, native: Sequence[str]) -> list[str]:
     """Return a table of chains, of executors, and how many chains meet their deadlines."""
     columns = ["native" if len(native) == 1 else f"native {n + 1}" for n in range(len(native))]
     rows = [("chain", "period", "bound", "simulated", *columns, "deadline", "", "by")]
@@ -91,7 +91,7 @@ def _why(one: ChainResult) -> str:
     return f"{one.name} may miss its deadline of {deadline}: it takes up to {bound}"
 
 
-def as_json(found: Analysis, times: str) -> dict[str, Any]:
+def as_json(found: TimingAnalysis, times: str) -> dict[str, Any]:
     """Return the analysis as JSON-compatible values; times in nanoseconds."""
     return {
         "times": times,
@@ -123,5 +123,5 @@ def _time(time_ns: int | None) -> str:
     return "-" if time_ns is None else format_duration(time_ns)
 
 
-def _seen(seen: Seen | None) -> str:
+def _seen(seen: WorstResponse | None) -> str:
     return "-" if seen is None else format_duration(seen.worst_ns)

@@ -8,10 +8,10 @@ from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
-    Event,
+    EventRecord,
     Output,
     OutputKind,
-    draw_text,
+    decision_text,
     is_switch,
 )
 from rsltrace.trace.model.texts import format_seconds
@@ -31,7 +31,7 @@ class EventJson:
         self._trace = trace
         self._payloads = payloads
 
-    def object(self, event: Event, outputs: list[Output]) -> dict[str, Any]:
+    def object(self, event: EventRecord, outputs: list[Output]) -> dict[str, Any]:
         """Return an event as JSON-compatible values. Hashes are 16 hex digits, since JSON readers
         lose digits of 64-bit numbers."""
         caused = event.cause_event != NO_EVENT
@@ -87,7 +87,7 @@ class EventJson:
         ):
             result["code"] = output_places(self._trace, output)
         if output.kind is OutputKind.DRAW:
-            result["text"] = draw_text(output.hash)
+            result["text"] = decision_text(output.hash)
         if output.kind is OutputKind.LOG and kept:
             record = log_record(self._trace, output)
             result["level"] = record.level_name if record else ""

@@ -9,8 +9,14 @@ from typing import Any
 import numpy as np
 
 from rsltrace.checks.latency.instances import Durations
-from rsltrace.native.fit.comparison import NEAR, Checked, CheckedChain, Compared, far
-from rsltrace.native.fit.models import Model, as_job_has_it
+from rsltrace.native.fit.comparison import (
+    NEAR,
+    ChainCheck,
+    LatencyCheck,
+    SampleComparison,
+    mismatched_percentiles,
+)
+from rsltrace.native.fit.models import DurationModel, as_job_has_it
 from rsltrace.native.fit.parts import Fit, time_text
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
@@ -47,7 +53,7 @@ def _row(durations: Durations) -> tuple[str, ...]:
     return str(len(durations)), *(format_duration(one, 4) for one in quantiles)
 
 
-def _written(model: Model) -> tuple[str, str]:
+def _written(model: DurationModel) -> tuple[str, str]:
     said = model.kind
     if model.kind == "empirical":
         said = f"table of {len(model.values['values'])}"
@@ -58,7 +64,7 @@ def _written(model: Model) -> tuple[str, str]:
     return said, f"{model.distance:.3f}"
 
 
-def checked_text(checked: Checked) -> list[str]:
+def checked_text(checked: LatencyCheck) -> list[str]:
     """Return the comparison of a simulation with a second native run as lines."""
     lines: list[str] = []
     for chain in checked.chains:
@@ -67,7 +73,7 @@ def checked_text(checked: Checked) -> list[str]:
     return lines
 
 
-def _chain(chain: CheckedChain) -> list[str]:
+def _chain(chain: ChainCheck) -> list[str]:
     if chain.simulated is None:
         return ["  the simulated run does not have this chain"]
     of = chain.simulated
@@ -100,13 +106,13 @@ def _chain(chain: CheckedChain) -> list[str]:
     return lines
 
 
-def _verdict(simulated: Compared, native: Compared | None) -> str:
+def _verdict(simulated: SampleComparison, native: SampleComparison | None) -> str:
     within = f"within {NEAR * 100:g} % of the second run"
-    if not far(simulated):
+    if not mismatched_percentiles(simulated):
         return f"the simulated run is {within}"
-    said = f"the simulated run is not {within}: {_named(far(simulated))}"
-    if native is not None and far(native):
-        said += f"; nor is the first run: {_named(far(native))}"
+    said = f"the simulated run is not {within}: {_named(mismatched_percentiles(simulated))}"
+    if native is not None and mismatched_percentiles(native):
+        said += f"; nor is the first run: {_named(mismatched_percentiles(native))}"
     return said
 
 
@@ -122,7 +128,7 @@ def _interval(low: float, high: float) -> str:
     return "-" if math.isnan(low) else f"{low:.3f} … {high:.3f}"
 
 
-def _tested(of: Compared) -> str:
+def _tested(of: SampleComparison) -> str:
     p_value = "p < 0.0001" if of.p_value < 1e-4 else f"p {of.p_value:.2g}"
     return (
         f"D {of.distance:.3f} ({p_value}; {of.count_b} and {of.count_a} latencies), "
@@ -130,7 +136,7 @@ def _tested(of: Compared) -> str:
     )
 
 
-def as_json(fit: Fit, notes: list[str], checked: Checked | None) -> dict[str, Any]:
+def as_json(fit: Fit, notes: list[str], checked: LatencyCheck | None) -> dict[str, Any]:
     """Return what was measured as JSON-compatible values; times in ns."""
     values: dict[str, Any] = {
         "delays": [
@@ -178,12 +184,12 @@ def _figures(durations: Durations) -> dict[str, int] | None:
     }
 
 
-def _model(model: Model) -> dict[str, Any]:
+def _model(model: DurationModel) -> dict[str, Any]:
     return {"distance": model.distance, "said": as_job_has_it(model, time_text)}
 
 
-def _checked(chain: CheckedChain) -> dict[str, Any]:
-    def plain(of: Compared | None) -> dict[str, Any] | None:
+def _checked(chain: ChainCheck) -> dict[str, Any]:
+    def plain(of: SampleComparison | None) -> dict[str, Any] | None:
         if of is None:
             return None
         values = asdict(of)
@@ -197,5 +203,7 @@ def _checked(chain: CheckedChain) -> dict[str, Any]:
         "simulated": plain(chain.simulated),
         "first_run": plain(chain.native),
         "simulated_to_first": plain(chain.own),
-        "far": [] if chain.simulated is None else [f"p{one:g}" for one in far(chain.simulated)],
+        "far": []
+        if chain.simulated is None
+        else [f"p{one:g}" for one in mismatched_percentiles(chain.simulated)],
     }

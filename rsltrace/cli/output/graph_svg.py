@@ -14,7 +14,7 @@ from typing import Literal
 from xml.sax.saxutils import escape
 
 from rsltrace.errors import SetupError
-from rsltrace.simulation.middleware.overview import End, Link, Overview
+from rsltrace.simulation.middleware.overview import GraphEnd, GraphLink, GraphOverview
 from rsltrace.trace.model.texts import printable
 
 _CHARACTER = 7.3
@@ -67,7 +67,7 @@ class _Edge:
     through: list[tuple[float, float]] = field(default_factory=list)
 
 
-def graph_svg(overview: Overview) -> str:
+def graph_svg(overview: GraphOverview) -> str:
     """Return the picture of a graph, the same for the same graph.
 
     :raises SetupError: if the library that lays it out is not installed.
@@ -79,7 +79,7 @@ def graph_svg(overview: Overview) -> str:
     return "\n".join(_svg(boxes, edges)) + "\n"
 
 
-def _boxes_and_edges(overview: Overview) -> tuple[list[_Box], list[_Edge]]:
+def _boxes_and_edges(overview: GraphOverview) -> tuple[list[_Box], list[_Edge]]:
     boxes = [_Box(node.name, "node", node.type) for node in overview.nodes]
     number = {node.name: index for index, node in enumerate(overview.nodes)}
     edges: list[_Edge] = []
@@ -98,7 +98,7 @@ def _boxes_and_edges(overview: Overview) -> tuple[list[_Box], list[_Edge]]:
     return boxes, edges
 
 
-def _numbers(ends: tuple[End, ...], number: dict[str, int], boxes: list[_Box]) -> list[int]:
+def _numbers(ends: tuple[GraphEnd, ...], number: dict[str, int], boxes: list[_Box]) -> list[int]:
     found: dict[int, None] = {}
     for end in ends:
         name = end.node
@@ -109,7 +109,7 @@ def _numbers(ends: tuple[End, ...], number: dict[str, int], boxes: list[_Box]) -
     return list(found)
 
 
-def _apart(link: Link, name: str, side: Literal[0, 1]) -> str:
+def _apart(link: GraphLink, name: str, side: Literal[0, 1]) -> str:
     """Return the policies by which a node connects with nobody at the other end."""
     apart = [pair for pair in link.apart if pair[side].node == name]
     others = {end.node for end in (link.senders if side else link.receivers)}

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
-from rsltrace.checks.latency.instances import Figures, HopMessages, HopTimes, figures
+from rsltrace.checks.latency.instances import HopMessages, HopTimes, LatencyFigures, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, Latencies
 from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME
@@ -51,7 +51,7 @@ def _head(one: ChainLatency) -> list[str]:
     return [one.name, f"  published by {nodes}; {one.inputs} inputs, {one.outputs} outputs"]
 
 
-def _row(measure: str, of: Figures | None) -> tuple[str, ...]:
+def _row(measure: str, of: LatencyFigures | None) -> tuple[str, ...]:
     if of is None:
         return (f"  {_WORDS[measure]}", "0", *("-" for _ in _QUANTILES))
     return (
@@ -61,7 +61,7 @@ def _row(measure: str, of: Figures | None) -> tuple[str, ...]:
     )
 
 
-def _value(of: Figures, quantile: str) -> int:
+def _value(of: LatencyFigures, quantile: str) -> int:
     value: int = getattr(of, f"{quantile}_ns")
     return value
 
@@ -109,7 +109,7 @@ def _measure(one: ChainLatency, measure: str) -> dict[str, Any] | None:
     return {**_figures(of), "worst": asdict(worst)}
 
 
-def _figures(of: Figures) -> dict[str, Any]:
+def _figures(of: LatencyFigures) -> dict[str, Any]:
     return {**asdict(of), "jitter_ns": of.jitter_ns}
 
 
@@ -166,7 +166,9 @@ def compared_text(a: Latencies, b: Latencies) -> list[str]:
     return lines
 
 
-def _compared_rows(measure: str, a: Figures | None, b: Figures | None) -> Iterator[tuple[str, ...]]:
+def _compared_rows(
+    measure: str, a: LatencyFigures | None, b: LatencyFigures | None
+) -> Iterator[tuple[str, ...]]:
     for name, of in (("a", a), ("b", b)):
         values = ["-" if of is None else format_duration(_value(of, one), 4) for one in _QUANTILES]
         yield f"  {_WORDS[measure]}" if name == "a" else "", name, *values

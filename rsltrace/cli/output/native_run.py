@@ -38,7 +38,7 @@ def run_native(
 ) -> NativeResult:
     """Run a job natively; ``shows``: with progress. ``begins`` is called first."""
     from rsltrace.native.session import run_natively
-    from rsltrace.run import Observer
+    from rsltrace.run import RunCallbacks
 
     shown = progress(quiet=not shows, what="observing", time="of real time")
     with interruptible() as on_interrupt, shown as on_progress:
@@ -56,7 +56,7 @@ def run_native(
             processes=processes,
             domain_id=domain,
             policy=policy,
-            observer=Observer(progress=on_progress, interrupt=interrupt, note=note),
+            observer=RunCallbacks(progress=on_progress, interrupt=interrupt, note=note),
         )
 
 

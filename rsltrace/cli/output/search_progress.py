@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.trace.model.texts import format_seconds, printable
 
 if TYPE_CHECKING:
-    from rsltrace.search.explore.search import Budget, Search
+    from rsltrace.search.explore.search import Explorer, SearchBudget
     from rsltrace.simulation.loop.stop import Stop
 
 
@@ -111,7 +111,7 @@ _LOOK_EVERY_S = 0.2
 
 
 @contextmanager
-def search_line(search: Search, budget: Budget) -> Iterator[Callable[[], None]]:
+def search_line(search: Explorer, budget: SearchBudget) -> Iterator[Callable[[], None]]:
     """Show the progress of a search on a terminal; yield a function that updates it."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield lambda: None
@@ -131,7 +131,7 @@ def search_line(search: Search, budget: Budget) -> Iterator[Callable[[], None]]:
         yield update
 
 
-def line_of(search: Search, budget: Budget, now_s: float) -> str:
+def line_of(search: Explorer, budget: SearchBudget, now_s: float) -> str:
     """Return the line: runs, rate, digests, failures, time left."""
     tally = search.tally
     passed_s = max(now_s - search.began_s, 1e-9)

@@ -11,19 +11,19 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.diff import diff_files
 from rsltrace.diff.report import render
-from rsltrace.search.explore.search import Search, Tally
+from rsltrace.search.explore.search import Explorer, SearchTally
 from rsltrace.search.explore.trial import JobSource, TrialResult, overrides_of
 
 if TYPE_CHECKING:
     from rsltrace.diff.result import Diff
-    from rsltrace.search.bisect.repository import Commit, Repository
-    from rsltrace.search.bisect.search import Found, Tried
+    from rsltrace.search.bisect.repository import Commit, GitRepository
+    from rsltrace.search.bisect.search import BisectResult, TestedRevision
 
 _FILES_MAX = 12
 Kept = tuple[Path, Path] | None
 
 
-def line_of(tried: Tried) -> str:
+def line_of(tried: TestedRevision) -> str:
     """Return the result of a revision in a line, and why it failed in another."""
     run = tried.run
     what = f"digest {run.digest}, {run.events} events" if run.digest else "no run"
@@ -32,7 +32,7 @@ def line_of(tried: Tried) -> str:
     return f"{tried.answer.value:<4}  {tried.commit.short}  {what}  {tried.commit.subject}{why}"
 
 
-def as_text(found: Found, repository: Repository, kept: Kept) -> str:
+def as_text(found: BisectResult, repository: GitRepository, kept: Kept) -> str:
     """Return the report; ``kept`` are the paths of the traces, None if they are deleted."""
     first = found.first
     if first is not None:
@@ -55,7 +55,7 @@ def as_text(found: Found, repository: Repository, kept: Kept) -> str:
     return "\n".join(lines)
 
 
-def as_values(found: Found, repository: Repository, kept: Kept) -> dict[str, Any]:
+def as_values(found: BisectResult, repository: GitRepository, kept: Kept) -> dict[str, Any]:
     """Return the result as JSON-compatible values."""
     first = found.first
     return {
@@ -77,7 +77,7 @@ def _files(names: Sequence[str]) -> list[str]:
     return [*shown, f"  and {more} more files"] if more else shown
 
 
-def _difference(found: Found, kept: Kept) -> Diff:
+def _difference(found: BisectResult, kept: Kept) -> Diff:
     before, after = found.before, found.after
     if kept is not None:
         return diff_files(*kept)
@@ -99,7 +99,7 @@ def _commit(commit: Commit) -> dict[str, Any]:
     }
 
 
-def _tried(tried: Tried) -> dict[str, Any]:
+def _tried(tried: TestedRevision) -> dict[str, Any]:
     run = tried.run
     return {
         **_commit(tried.commit),
@@ -117,7 +117,7 @@ _TEXT_MAX = 300
 
 
 def search_lines(
-    search: Search, source: JobSource, folder: Path, *, caution: str = ""
+    search: Explorer, source: JobSource, folder: Path, *, caution: str = ""
 ) -> Iterator[str]:
     """Yield the lines of the summary; ``caution`` says what was not checked."""
     tally = search.tally
@@ -145,7 +145,7 @@ def search_lines(
     yield f"results: {folder}; report: {folder / 'report.html'}"
 
 
-def _by_frequency(tally: Tally) -> list[str]:
+def _by_frequency(tally: SearchTally) -> list[str]:
     """Return the causes, the most frequent first."""
     return sorted(
         tally.failures, key=lambda key: (-tally.failures[key], tally.first[key].trial.number)

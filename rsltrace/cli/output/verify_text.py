@@ -11,8 +11,8 @@ from rsltrace.search.perturb import CORE_TYPE, KERNEL
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.search.perturb import Recorded
-    from rsltrace.search.verify import HiddenDifference, Verified
+    from rsltrace.search.perturb import PerturbedRun
+    from rsltrace.search.verify import HiddenDifference, VerifyResult
 
 _LINES_MAX = 40
 _UNKNOWN_SOURCE = (
@@ -25,7 +25,7 @@ _WAY_OUT = (
 )
 
 
-def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
+def as_text(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: bool) -> str:
     """Return the report; ``again`` are the commands that repeat the runs in question."""
     if result.trouble is not None:
         return _trouble(result, result.trouble, again[-1])
@@ -41,12 +41,12 @@ def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool)
     lines = [f"not deterministic: {tried}, {len(result.digests)} digests", perturbed, ""]
     for recorded, command in zip((first, other), again, strict=True):
         ended = f", exit status {recorded.exit_code}" if recorded.exit_code else ""
-        around = recorded.surroundings
+        around = recorded.perturbation
         lines.append(f"run {around.number}: digest {recorded.digest}{ended}: {around}")
         lines.append(f"  {command}")
     lines += ["", _provoked(result, again[-1])]
     if other.failure:
-        lines += [f"run {other.surroundings.number} failed: {other.failure}"]
+        lines += [f"run {other.perturbation.number} failed: {other.failure}"]
     report = _compared(result, first, other, folder)
     if not kept:  # what to do next with traces that are gone
         report = [line for line in report if not line.startswith("next: ")]
@@ -55,7 +55,7 @@ def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool)
     return "\n".join(lines)
 
 
-def as_values(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
+def as_values(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: bool) -> str:
     """Return the answer as JSON."""
     second = result.trouble or result.other
     difference = None
@@ -83,7 +83,7 @@ def as_values(result: Verified, folder: Path, again: Sequence[str], *, kept: boo
     )
 
 
-def _hidden(result: Verified, found: HiddenDifference, command: str, folder: Path) -> list[str]:
+def _hidden(result: VerifyResult, found: HiddenDifference, command: str, folder: Path) -> list[str]:
     """Return what to say of runs of equal events in which a node did not keep the same."""
     lines = [
         f"The events agree, but the state of {found.node} differs: its attribute "
@@ -96,7 +96,9 @@ def _hidden(result: Verified, found: HiddenDifference, command: str, folder: Pat
     return [*lines, "", *(line for line in report if not line.startswith("next: "))]
 
 
-def _compared(result: Verified, first: Recorded, other: Recorded, folder: Path) -> list[str]:
+def _compared(
+    result: VerifyResult, first: PerturbedRun, other: PerturbedRun, folder: Path
+) -> list[str]:
     """Return the lines of a comparison, and whether the guard knows what made the runs differ."""
     from rsltrace.diff import diff_files
     from rsltrace.diff.report import render
@@ -129,10 +131,10 @@ def _is_allowed(source: dict[str, Any]) -> bool:
     return source.get("mode") == "allow" or bool(source.get("allow"))
 
 
-def _run(recorded: Recorded) -> dict[str, object]:
+def _run(recorded: PerturbedRun) -> dict[str, object]:
     return {
-        "number": recorded.surroundings.number,
-        "surroundings": dict(recorded.surroundings.values),
+        "number": recorded.perturbation.number,
+        "surroundings": dict(recorded.perturbation.values),
         "digest": recorded.digest,
         "exit_code": recorded.exit_code,
         "errors": recorded.errors,
@@ -150,16 +152,16 @@ def _hidden_values(found: HiddenDifference | None) -> dict[str, object] | None:
     }
 
 
-def _place(recorded: Recorded, folder: Path) -> Path:
+def _place(recorded: PerturbedRun, folder: Path) -> Path:
     return folder / recorded.path.name
 
 
-def _tried(result: Verified) -> str:
+def _tried(result: VerifyResult) -> str:
     many = "s" * (len(result.kinds) != 1)
     return f"{result.runs} runs, {len(result.kinds)} perturbation{many}"
 
 
-def _provoked(result: Verified, command: str) -> str:
+def _provoked(result: VerifyResult, command: str) -> str:
     if result.by_itself:
         return "cause: not a perturbation, since a second unperturbed run differs, too"
     if not result.narrowed:
@@ -174,11 +176,11 @@ def _provoked(result: Verified, command: str) -> str:
     return "\n".join(lines + [_WAY_OUT] * (KERNEL in result.provoked_by))
 
 
-def _trouble(result: Verified, run: Recorded, command: str) -> str:
-    number = run.surroundings.number
+def _trouble(result: VerifyResult, run: PerturbedRun, command: str) -> str:
+    number = run.perturbation.number
     what = "the first run" if number == 0 else f"run {number} of {result.runs}"
     lines = [f"rsltrace: error: {what} cannot be compared: {run.failure}"]
     said = run.errors.strip().splitlines()[-_LINES_MAX:]
     lines += [f"  | {line}" for line in said]
-    lines.append(f"with {run.surroundings}; to repeat it:\n  {command}")
+    lines.append(f"with {run.perturbation}; to repeat it:\n  {command}")
     return "\n".join(lines)

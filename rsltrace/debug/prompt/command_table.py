@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rsltrace.debug.checkpoints import Stopped
+from rsltrace.debug.checkpoints import StopReport
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.commands import PromptCommands, PromptContext
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
@@ -384,7 +384,7 @@ def _edit(shell: PromptContext, rest: str) -> None:
     812: drop()                       the same at event 812, or at a time (2.5s: ...)
     """
     position = shell.session.edit(rest)
-    shell.stopped(Stopped("step", position))
+    shell.stopped(StopReport("step", position))
 
 
 @_add("keep", usage="FILE", topic="what if")

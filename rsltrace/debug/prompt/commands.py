@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rsltrace.errors import DebugError, nearest
 
 if TYPE_CHECKING:
-    from rsltrace.conditions.names import Names
-    from rsltrace.debug.checkpoints import Stopped
+    from rsltrace.conditions.names import RunNames
+    from rsltrace.debug.checkpoints import StopReport
     from rsltrace.debug.client import DebugSession
 
 
@@ -24,7 +24,7 @@ class PromptContext(Protocol):
     def show(self, lines: Iterable[str]) -> None:
         """Print lines."""
 
-    def stopped(self, stopped: Stopped) -> None:
+    def stopped(self, stopped: StopReport) -> None:
         """Print where and why the run has stopped."""
 
     def read(self, prompt: str) -> str | None:
@@ -33,7 +33,7 @@ class PromptContext(Protocol):
     def node_here(self) -> str | None:
         """Return the node whose event is about to run, or has just ended."""
 
-    def names(self) -> Names:
+    def names(self) -> RunNames:
         """Return the names there are, as far as they are known."""
 
 

@@ -11,17 +11,17 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.conditions.names import Names, short_name
+from rsltrace.conditions.names import RunNames, short_name
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
 from rsltrace.debug.prompt.commands import PromptContext
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.words.entities import LOG_LEVELS
 
 if TYPE_CHECKING:
-    from rsltrace.debug.checkpoints import Stopped
+    from rsltrace.debug.checkpoints import StopReport
     from rsltrace.debug.client import DebugSession
 
 Completer = Callable[[str], Sequence[str]]
@@ -120,7 +120,7 @@ def _arguments(command: str, before: list[str], shell: PromptContext) -> Iterabl
             "topic": names.topics,
             "entity": names.entities,
             "log": tuple(LOG_LEVELS),
-            "finding": tuple(source.value for source in Source),
+            "finding": tuple(source.value for source in NondeterminismSource),
         }
         return of.get(before[0], _nodes_as_names(shell))
     if command == "info":
@@ -152,11 +152,11 @@ PROMPT = "(rsltrace) "
 EXIT_DIVERGED = 1
 
 
-class Shell:
+class DebugPrompt:
     """The prompt of one session. ``diverged``: the run once differed from its trace."""
 
     def __init__(
-        self, session: DebugSession, first: Sequence[str] = (), names: Names | None = None
+        self, session: DebugSession, first: Sequence[str] = (), names: RunNames | None = None
     ) -> None:
         """``first`` are commands to run before those of stdin; ``names`` are the trace's."""
         self.session = session
@@ -210,7 +210,7 @@ class Shell:
         for line in lines:
             say(line)
 
-    def stopped(self, stopped: Stopped) -> None:
+    def stopped(self, stopped: StopReport) -> None:
         self.diverged = self.diverged or stopped.reason == "diverged"
         self.show(show.stopped_lines(stopped))
 
@@ -223,14 +223,14 @@ class Shell:
         name = (event or {}).get("node")
         return str(name) if name else None
 
-    def names(self) -> Names:
+    def names(self) -> RunNames:
         if self._names is not None:
             return self._names
         graph: dict[str, Any] = self.session.inspect("graph")
         links = graph.get("links", ())
         nodes = tuple(node["name"] for node in self.session.inspect("nodes"))
         topics = tuple(link["name"] for link in links if link["kind"] in ("topic", "service"))
-        return Names(nodes=nodes, topics=topics, entities=(*nodes, *topics))
+        return RunNames(nodes=nodes, topics=topics, entities=(*nodes, *topics))
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:

@@ -10,7 +10,7 @@ from rsltrace.trace.model.texts import format_duration, format_seconds, printabl
 from rsltrace.trace.words.kinds import flag_names
 
 if TYPE_CHECKING:
-    from rsltrace.debug.checkpoints import Breakpoint, RunPosition, Stopped
+    from rsltrace.debug.checkpoints import Breakpoint, RunPosition, StopReport
 
 _CELL_MAX = 60
 _DID_MAX = 160
@@ -24,7 +24,7 @@ _WHY = {
 }
 
 
-def stopped_lines(stopped: Stopped) -> Iterator[str]:
+def stopped_lines(stopped: StopReport) -> Iterator[str]:
     if stopped.breakpoint is not None:
         number, text = stopped.breakpoint.number, stopped.breakpoint.text
         more = f": {stopped.text}" if stopped.text and stopped.text != text else ""

@@ -21,14 +21,14 @@ import numpy.typing as npt
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EqualBlock, EventPair
 from rsltrace.diff.alignment.rows import longest_increasing
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 
 Ints = npt.NDArray[np.int64]
 _NONE = -1
 _COLUMN_MIN = 1024
 
 
-_SIGNS = tuple(Sign)
+_SIGNS = tuple(RowSign)
 _MATCH, _DIFFERS, _ONLY_A, _ONLY_B, _MOVED = range(5)
 _SIGN_BITS = 7
 _SAME_TIME = 8
@@ -44,7 +44,7 @@ class AlignedRow:
 
     a: int | None
     b: int | None
-    sign: Sign
+    sign: RowSign
     elsewhere: int | None = None
 
     @property
@@ -149,11 +149,11 @@ class AlignedRows:
     def row(self, place: int) -> AlignedRow:
         """Return a row, which must exist."""
         if place < self.agreeing:
-            return AlignedRow(place, place, Sign.MATCH)
+            return AlignedRow(place, place, RowSign.MATCH)
         offset = place - self.agreeing
         if offset >= self.matched:
             a, b = self._unaligned(offset - self.matched)
-            return AlignedRow(a, b, Sign.UNKNOWN)
+            return AlignedRow(a, b, RowSign.UNKNOWN)
         a, b = (_index(side.rows.at(offset)) for side in (self._a, self._b))
         elsewhere = None
         if a is None or b is None:

@@ -18,8 +18,8 @@ from rsltrace.diff.alignment.align import EarlierPairs, EventPairs, align
 from rsltrace.diff.alignment.rows import (
     CONSTRUCT,
     SHUTDOWN,
+    ComparedTrace,
     EventColumns,
-    Run,
     load_rows,
     longest_increasing,
 )
@@ -102,8 +102,8 @@ class AlignedBlocks:
     events between blocks come as an EqualBlock, which takes a fraction of the time.
     """
 
-    run_a: Run
-    run_b: Run
+    run_a: ComparedTrace
+    run_b: ComparedTrace
     start: int
     events: int
     skip_equal: bool = False
@@ -159,7 +159,9 @@ class AlignedBlocks:
         return block, pairs
 
 
-def equal_block(run_a: Run, run_b: Run, first_a: int, first_b: int) -> EqualBlock | None:
+def equal_block(
+    run_a: ComparedTrace, run_b: ComparedTrace, first_a: int, first_b: int
+) -> EqualBlock | None:
     """Return the events from here on that are equal in a row, if there are many of them."""
     if not run_a.matching.same_ids:
         return None  # the trace's own output hashes say nothing then

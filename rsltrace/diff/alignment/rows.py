@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import Draw, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.event import EventKind, OutputKind, RandomDecision, encode_decision
 from rsltrace.trace.reader import Trace
 
 # Where two runs diverge: a binary search over chain hashes, which cover all events before.
@@ -126,7 +126,7 @@ ACTION = int(EventKind.ACTION)
 SHUTDOWN = int(EventKind.SHUTDOWN)
 _ENTITY = int(OutputKind.ENTITY)
 _DRAW = int(OutputKind.DRAW)
-_ZERO_DELAY = encode_draw(Draw.DELAY, 0)
+_ZERO_DELAY = encode_decision(RandomDecision.DELAY, 0)
 
 OutputRow = tuple[int, int, int, int]
 """(kind, number of the entity, content hash, payload sequence) of an output. The content hash of a
@@ -134,7 +134,7 @@ new entity is 0: its number says what it is, in both runs."""
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class ComparedTrace:
     """One of the two runs. ``of_b`` says which."""
 
     trace: Trace
@@ -157,7 +157,7 @@ class EventColumns:
     that nothing follows. Constructing a node counts as an event of that node.
     """
 
-    run: Run
+    run: ComparedTrace
     first: int
     at_end: bool
     number: list[int]
@@ -211,7 +211,7 @@ class EventColumns:
         return output_rows(self.run, self.first, self.end)
 
 
-def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
+def output_rows(run: ComparedTrace, first: int, last: int) -> list[OutputRow]:
     """Return the outputs of the events ``first <= index < last``, in order."""
     rows: list[OutputRow] = []
     for part in run.trace.outputs(first, last):
@@ -224,7 +224,7 @@ def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
     return rows
 
 
-def load_rows(run: Run, first: int, last: int) -> EventColumns:
+def load_rows(run: ComparedTrace, first: int, last: int) -> EventColumns:
     """Read the events ``first <= index < last`` (as far as there are such) of a run."""
     columns: dict[str, list[int]] = {name: [] for name in _COLUMNS}
     numbers: list[int] = []
@@ -279,11 +279,11 @@ def _constructed(rows: EventColumns, place: int) -> int:
     return 0
 
 
-def counts(run: Run, output: OutputRow) -> bool:
+def counts(run: ComparedTrace, output: OutputRow) -> bool:
     """Whether an output is compared."""
     return not (run.without_zero_delays and output[0] == _DRAW and output[2] == _ZERO_DELAY)
 
 
-def outputs_of(run: Run, index: int) -> list[OutputRow]:
+def outputs_of(run: ComparedTrace, index: int) -> list[OutputRow]:
     """Return the outputs of any event, in order."""
     return output_rows(run, index, index + 1)

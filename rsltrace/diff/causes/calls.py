@@ -14,19 +14,19 @@ from itertools import zip_longest
 from operator import itemgetter
 from typing import Any
 
-from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.facts.causes import UnrecordedAnswer
-from rsltrace.diff.facts.evidence import CallDifference, EventView
+from rsltrace.diff.facts.evidence import CallDifference, EventSummary
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.finding import Finding, Mode, Source
-from rsltrace.trace.model.texts import printable, shortened, told_apart
+from rsltrace.trace.model.finding import Finding, GuardMode, NondeterminismSource
+from rsltrace.trace.model.texts import contrasting_texts, printable, shortened
 
 CALLS_MAX = 20
 EARLIER_MAX = 3
 _CALL_MAX = 60
-_ANSWERED = (Source.SOCKET, Source.PROCESS)
+_ANSWERED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS)
 _FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
 """The folder of an absolute path between quotes."""
 
@@ -43,7 +43,11 @@ _Numbered = tuple[int, int, Finding]
 
 
 def call_differences(
-    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None, node: str = ""
+    run_a: ComparedTrace,
+    run_b: ComparedTrace,
+    a: EventSummary | None,
+    b: EventSummary | None,
+    node: str = "",
 ) -> tuple[CallDifference, ...]:
     """Return the calls made inside two events, those with different answers first.
 
@@ -67,11 +71,11 @@ def call_differences(
     return (*earlier, *programs, *inside)[:CALLS_MAX]
 
 
-def unrecorded_answer(run: Run, view: EventView) -> UnrecordedAnswer | None:
+def unrecorded_answer(run: ComparedTrace, view: EventSummary) -> UnrecordedAnswer | None:
     """Return the last unrecorded answer of a socket or a program: in an event, else the
     last one before it in its node; None if there was none."""
     found = [*_before(run, view), *_inside(run, view)]
-    kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
+    kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is GuardMode.WARN)
     one = next(kept, None)
     if one is None:
         return None
@@ -80,11 +84,11 @@ def unrecorded_answer(run: Run, view: EventView) -> UnrecordedAnswer | None:
     return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
 
 
-def _inside(run: Run, view: EventView | None) -> list[Finding]:
+def _inside(run: ComparedTrace, view: EventSummary | None) -> list[Finding]:
     return run.trace.answers.get(view.index, []) if view is not None else []
 
 
-def _before(run: Run, view: EventView | None, other: str = "") -> list[Finding]:
+def _before(run: ComparedTrace, view: EventSummary | None, other: str = "") -> list[Finding]:
     """Return what a node called before an event: the event's own, or its main if it is of none, or
     another one."""
     if view is None:
@@ -100,7 +104,7 @@ def _before(run: Run, view: EventView | None, other: str = "") -> list[Finding]:
     ]
 
 
-def _is_of(run: Run, finding: Finding, node: str, view: EventView) -> bool:
+def _is_of(run: ComparedTrace, finding: Finding, node: str, view: EventSummary) -> bool:
     if finding.node or node:
         return finding.node == node
     entity = run.trace.entities.get(finding.entity)
@@ -113,7 +117,7 @@ def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
     return not finding.node and function == "<module>" and place.rpartition(":")[0] in files
 
 
-def _files_of(run: Run, view: EventView, node: str) -> frozenset[str]:
+def _files_of(run: ComparedTrace, view: EventSummary, node: str) -> frozenset[str]:
     """Return the files of the modules that a node or main uses, as places in code name them."""
     entities = run.trace.entities.values()
     if node:
@@ -182,9 +186,9 @@ def call_difference(
 def subject_of_call(source: str, call: str) -> str:
     """Return what a call asks for: ``MOTOR_SEED``, ``gains.yaml``; else the call."""
     found = None
-    if source == Source.ENVIRONMENT.value:
+    if source == NondeterminismSource.ENVIRONMENT.value:
         found = _VARIABLE.match(call)
-    elif source in (Source.FILE.value, Source.DIRECTORY.value):
+    elif source in (NondeterminismSource.FILE.value, NondeterminismSource.DIRECTORY.value):
         found = _FILE.match(call)
     return found[2] if found else call
 
@@ -196,9 +200,9 @@ def _short(source: str, a: str, b: str) -> tuple[str, str]:
     sizes = _CHANGED.fullmatch(a), _CHANGED.fullmatch(b)
     if sizes[0] and sizes[1] and sizes[0][1] != sizes[1][1]:
         a, b = sizes[0][1], sizes[1][1]
-    if source == Source.ENVIRONMENT.value:
+    if source == NondeterminismSource.ENVIRONMENT.value:
         a, b = unquoted(a), unquoted(b)
-    return told_apart(a, b, _ANSWER_MAX)
+    return contrasting_texts(a, b, _ANSWER_MAX)
 
 
 def unquoted(text: str, quote: str = "'") -> str:
@@ -212,7 +216,7 @@ def answer_text(finding: Finding) -> str:
     """Return ``b'1.5\\n'`` of an answer that is kept as JSON, ``exit status 4`` of how a program
     ended; of a program that was started no more than that, as its number is another one each
     time. Other answers are returned as they are."""
-    if finding.mode is not Mode.RECORD:
+    if finding.mode is not GuardMode.RECORD:
         return finding.value
     if finding.call.startswith(STARTED_BY) and finding.value.isdecimal():
         return _STARTED

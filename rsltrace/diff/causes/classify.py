@@ -37,7 +37,7 @@ from rsltrace.diff.facts.causes import (
 )
 from rsltrace.diff.facts.evidence import (
     EntityChanges,
-    EventView,
+    EventSummary,
     MessageDifference,
     ParameterChanges,
     ParameterValues,
@@ -64,12 +64,12 @@ class DivergenceCase:
     ``cause_a`` and ``cause_b`` are the events that caused them. ``why`` is None for a root.
     """
 
-    a: EventView | None
-    b: EventView | None
-    other_a: EventView | None
-    other_b: EventView | None
-    cause_a: EventView | None
-    cause_b: EventView | None
+    a: EventSummary | None
+    b: EventSummary | None
+    other_a: EventSummary | None
+    other_b: EventSummary | None
+    cause_a: EventSummary | None
+    cause_b: EventSummary | None
     inverted: bool
     cause_only: bool
     why: str | None
@@ -96,7 +96,7 @@ class DivergenceCase:
     """The settings that ``blame`` found."""
 
     @property
-    def one(self) -> EventView:
+    def one(self) -> EventSummary:
         """The event, of whichever run has it."""
         view = self.a or self.b
         assert view is not None
@@ -127,7 +127,7 @@ class DivergenceCase:
         root: Root,
         what: DivergenceFact,
         why: CauseFact | None,
-        events: tuple[EventView | None, EventView | None] | None = None,
+        events: tuple[EventSummary | None, EventSummary | None] | None = None,
     ) -> Judgement:
         """Return a verdict, on the two events or on others."""
         a, b = (self.a, self.b) if events is None else events
@@ -260,7 +260,7 @@ _FROM_OUTSIDE = {
 }
 
 
-def _exception(case: DivergenceCase, a: EventView) -> Judgement:
+def _exception(case: DivergenceCase, a: EventSummary) -> Judgement:
     error = next((m.preview for m in case.messages if m.kind is OutputKind.EXCEPTION), "")
     where = Presence.ONLY_A if a.raised else Presence.ONLY_B
     after_shutdown = any(
@@ -270,7 +270,7 @@ def _exception(case: DivergenceCase, a: EventView) -> Judgement:
     return case.judgement(Verdict.EXCEPTION, Root.EXCEPTION, what, why)
 
 
-def _timing(case: DivergenceCase, a: EventView) -> Judgement:
+def _timing(case: DivergenceCase, a: EventSummary) -> Judgement:
     if a.kind is EventKind.BAG:  # a bag decides on the time of its messages, and nothing else does
         case.blame()
         what = (
@@ -284,7 +284,7 @@ def _timing(case: DivergenceCase, a: EventView) -> Judgement:
     return case.judgement(Verdict.TIMING, Root.TIMING, moved, _hidden(case, "time"))
 
 
-def _different_input(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
+def _different_input(case: DivergenceCase, a: EventSummary, b: EventSummary) -> Judgement:
     what: DivergenceFact
     why: CauseFact
     root = Root.EXTERNAL_INPUT
@@ -305,7 +305,7 @@ def _different_input(case: DivergenceCase, a: EventView, b: EventView) -> Judgem
     return case.judgement(Verdict.DIFFERENT_INPUT, root, what, why)
 
 
-def _another_cause(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
+def _another_cause(case: DivergenceCase, a: EventSummary, b: EventSummary) -> Judgement:
     if a.cause_event == b.cause_event and a.output_hash != b.output_hash:
         case.blame(drawn=True)
         what, reason = DivergenceKind.ONLY_ZERO_DELAYS, CauseKind.DELAY_IN_ONE
@@ -314,7 +314,7 @@ def _another_cause(case: DivergenceCase, a: EventView, b: EventView) -> Judgemen
     return case.judgement(Verdict.SCHEDULE, Root.SCHEDULE, what, reason)
 
 
-def _draw(case: DivergenceCase, a: EventView, draws: Sequence[MessageDifference]) -> Judgement:
+def _draw(case: DivergenceCase, a: EventSummary, draws: Sequence[MessageDifference]) -> Judgement:
     first = draws[0]
     case.blame(drawn=True)
     is_clock = _is_of_clock(first)
@@ -330,7 +330,7 @@ def _draw(case: DivergenceCase, a: EventView, draws: Sequence[MessageDifference]
     return case.judgement(Verdict.DRAW, Root.DRAW, what, why)
 
 
-def _same_input(case: DivergenceCase, a: EventView, b: EventView) -> Judgement:
+def _same_input(case: DivergenceCase, a: EventSummary, b: EventSummary) -> Judgement:
     if a.kind is EventKind.OUTSIDE:
         done, driven = DivergenceKind.OTHER_DONE_OUTSIDE, CauseKind.DRIVEN_DIFFERENTLY
         return case.judgement(Verdict.DIFFERENT_INPUT, Root.EXTERNAL_INPUT, done, driven)
@@ -364,7 +364,7 @@ def _hidden(
     return NoEarlierDifference(doubt, state_unknown, case.relevance.guard_is_off)
 
 
-def _doubt(view: EventView) -> str:
+def _doubt(view: EventSummary) -> str:
     return view.entity.kind if view.entity.kind in NO_CALLBACKS else "callback"
 
 

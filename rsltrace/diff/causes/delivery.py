@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.alignment.rows import BAG, Run, load_rows
+from rsltrace.diff.alignment.rows import BAG, ComparedTrace, load_rows
 from rsltrace.diff.facts.causes import (
     Loss,
     NoMoreMessages,
@@ -20,12 +20,12 @@ from rsltrace.diff.facts.evidence import (
     EntityChange,
     EntityChanges,
     EntityProperty,
-    EventView,
+    EventSummary,
     MessageDifference,
 )
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.trace.model.finding import EndlessWait, waits_of
+from rsltrace.trace.model.finding import EndlessWait, decode_waits
 
 _LOOKED_AT_MAX = 1000
 _QOS_EVENT = EntityKind.QOS_EVENT.label
@@ -36,7 +36,9 @@ _OF_QOS = (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT, EventKin
 # -- messages that both runs sent and only one received ------------------------------------------
 
 
-def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Loss | None:
+def lost_message(
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
+) -> Loss | None:
     """Say that a queue overflowed, that a subscription is gone or has another QoS; None where that
     is not so.
 
@@ -64,7 +66,7 @@ def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | Non
 
 
 def _received_after(
-    run: Run, number: int, cause_event: int, cause_output: int
+    run: ComparedTrace, number: int, cause_event: int, cause_output: int
 ) -> tuple[int, int, int] | None:
     """Return the next event of a subscription after a message was sent that is of a later one:
     its index, and which output of which event it received."""
@@ -78,7 +80,7 @@ def _received_after(
     return None
 
 
-def _sent_between(run: Run, view: EventView, later: tuple[int, int, int]) -> int:
+def _sent_between(run: ComparedTrace, view: EventSummary, later: tuple[int, int, int]) -> int:
     """Return how many messages of the topic were sent after one, until the next was received."""
     index, cause_event, _ = later
     last = max(cause_event, min(index, cause_event + _LOOKED_AT_MAX))
@@ -93,17 +95,17 @@ def _sent_between(run: Run, view: EventView, later: tuple[int, int, int]) -> int
     return count
 
 
-def _depth(run: Run, number: int) -> int | None:
+def _depth(run: ComparedTrace, number: int) -> int | None:
     depth = _qos(run, number).get("depth")
     return depth if isinstance(depth, int) else None
 
 
-def _qos(run: Run, number: int) -> dict[str, object]:
+def _qos(run: ComparedTrace, number: int) -> dict[str, object]:
     qos = _detail(run, number).get("qos")
     return qos if isinstance(qos, dict) else {}
 
 
-def _detail(run: Run, number: int) -> dict[str, object]:
+def _detail(run: ComparedTrace, number: int) -> dict[str, object]:
     """Return what the trace says of an entity, nothing if the run has it not."""
     table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
     ids = (table == number).nonzero()[0]
@@ -113,7 +115,7 @@ def _detail(run: Run, number: int) -> dict[str, object]:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-def topics_of(view: EventView, messages: Sequence[MessageDifference]) -> frozenset[str]:
+def topics_of(view: EventSummary, messages: Sequence[MessageDifference]) -> frozenset[str]:
     """Return the topics and services whose QoS an event, or what differs in it, can depend on."""
     met = [view.entity] if view.kind in _OF_QOS else []
     met += [m.entity for m in messages if m.kind in (OutputKind.ENTITY, OutputKind.DRAW)]
@@ -124,7 +126,10 @@ def topics_of(view: EventView, messages: Sequence[MessageDifference]) -> frozens
 
 
 def entity_changes(
-    run_a: Run, run_b: Run, topics: frozenset[str], nodes: frozenset[str] = frozenset()
+    run_a: ComparedTrace,
+    run_b: ComparedTrace,
+    topics: frozenset[str],
+    nodes: frozenset[str] = frozenset(),
 ) -> EntityChanges | None:
     """Return which entities of both runs have another QoS, of some topics and services, or are in
     another callback group, of some nodes; None if there are none.
@@ -155,7 +160,9 @@ def _policies(a: object, b: object) -> tuple[tuple[str, str | int | None, str | 
 # -- calls that waited, callbacks that slept -----------------------------------------------------
 
 
-def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> Loss | None:
+def still_waits(
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
+) -> Loss | None:
     """Say which call waited to the end of a run and kept an event from happening there that the
     other has; None if there is no such call."""
     view = a or b
@@ -172,11 +179,13 @@ def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
     return None
 
 
-def _waits(run: Run) -> list[EndlessWait]:
-    return waits_of(run.trace.result) if run.trace.complete else []
+def _waits(run: ComparedTrace) -> list[EndlessWait]:
+    return decode_waits(run.trace.result) if run.trace.complete else []
 
 
-def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> SleepTimes | None:
+def slept(
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
+) -> SleepTimes | None:
     """Return how long two events of one callback slept, or the callback before them; None if it was
     as long in both, or if they did not."""
     if a is None or b is None or a.kind is not b.kind:
@@ -185,7 +194,7 @@ def slept(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> S
     return None if in_a == in_b else SleepTimes(in_a, in_b)
 
 
-def _slept_ns(run: Run, view: EventView) -> int | None:
+def _slept_ns(run: ComparedTrace, view: EventSummary) -> int | None:
     """Return how long a callback slept after an event, or before one that resumed it."""
     number = run.matching.by_key[view.entity]
     if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
@@ -209,7 +218,7 @@ def _slept_ns(run: Run, view: EventView) -> int | None:
 
 
 def periods(
-    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
 ) -> tuple[int, int] | None:
     """Return the periods of a timer in both runs (ns), if they differ."""
     view = a or b
@@ -222,7 +231,9 @@ def periods(
     return None
 
 
-def are_swapped(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> bool:
+def are_swapped(
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
+) -> bool:
     """Whether b plays what a plays at the time of ``a``, and at that time what a plays then."""
     if a is None or b is None or a.kind is not EventKind.BAG or a.stamp_ns == b.stamp_ns:
         return False

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
-from rsltrace.diff.facts.evidence import EventView
+from rsltrace.diff.alignment.rows import CONSTRUCT, ComparedTrace, OutputRow, outputs_of
+from rsltrace.diff.facts.evidence import EventSummary
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.words.code import code_places, place_here, places_text
+from rsltrace.trace.words.code import code_places, places_text, relative_place
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
 
@@ -27,16 +27,16 @@ _SEGMENTS_BACK = 2
 class EventViews:
     """Makes the views of one run's events."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: ComparedTrace) -> None:
         self._run = run
 
-    def view(self, index: int) -> EventView:
+    def view(self, index: int) -> EventSummary:
         """Return event ``index``, which must exist."""
         run = self._run
         event = run.trace.event(index)
         outputs = outputs_of(run, index)
         number = self._number(event.entity, event.kind, outputs)
-        return EventView(
+        return EventSummary(
             index=index,
             stamp_ns=event.stamp_ns,
             entity=run.matching.keys[number],
@@ -50,15 +50,17 @@ class EventViews:
             outputs=event.outputs,
             position=self._position(index, event.entity) if event.entity else 0,
             summary=self.summary(outputs),
-            code=places_text([place_here(run.trace, one) for one in code_places(run.trace, event)]),
+            code=places_text(
+                [relative_place(run.trace, one) for one in code_places(run.trace, event)]
+            ),
         )
 
-    def before(self, index: int, count: int) -> tuple[EventView, ...]:
+    def before(self, index: int, count: int) -> tuple[EventSummary, ...]:
         """Return the last ``count`` events before ``index``, in order."""
         end = min(index, self._run.trace.event_count)
         return tuple(self.view(i) for i in range(max(end - count, 0), end))
 
-    def before_in_node(self, index: int, count: int, node: int) -> tuple[EventView, ...]:
+    def before_in_node(self, index: int, count: int, node: int) -> tuple[EventSummary, ...]:
         """Return the last ``count`` events of a node before ``index``, in order.
 
         Two segments are looked at: what lies further back is no context any more.
@@ -125,7 +127,7 @@ def drawn_for(key: EntityKey) -> str:
     return f"{key.kind} {key.name} of {key.node}"
 
 
-def subject_of(view: EventView) -> str:
+def subject_of(view: EventSummary) -> str:
     """Return the node an event is of, ``main package:main`` for a main without one, or ""."""
     is_main = view.entity.kind == EntityKind.MAIN.label
     return view.node or (f"main {view.entity.name}" if is_main else "")

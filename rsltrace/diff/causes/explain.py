@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 from rsltrace.diff.alignment.blocks import EventPair
-from rsltrace.diff.alignment.rows import Run, outputs_of
+from rsltrace.diff.alignment.rows import ComparedTrace, outputs_of
 from rsltrace.diff.causes.calls import call_differences
 from rsltrace.diff.causes.classify import ROOT_OF, DivergenceCase, judge
 from rsltrace.diff.causes.delivery import (
@@ -40,10 +40,10 @@ from rsltrace.diff.facts.causes import Consequence, Judgement, Root, SameCause, 
 from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CauseLink,
+    CauseLinkKind,
     CauseStep,
     EntityChanges,
-    EventView,
-    LinkKind,
+    EventSummary,
     MessageDifference,
     Setting,
     SettingKind,
@@ -66,8 +66,8 @@ STEPS_MAX = 16
 class Explainer:
     """Puts divergences in words. ``found`` are all roots so far, by number."""
 
-    run_a: Run
-    run_b: Run
+    run_a: ComparedTrace
+    run_b: ComparedTrace
     options: DiffOptions
     settings: Sequence[Setting]
     found: Sequence[FoundDivergence]
@@ -129,7 +129,7 @@ class Explainer:
         found = FoundDivergence(origin, view.stamp_ns, item.a, item.b)
         return self._judge(found, *self._differing(found))
 
-    def view(self, index: int, *, of_b: bool) -> EventView | None:
+    def view(self, index: int, *, of_b: bool) -> EventSummary | None:
         """Return an event of one of the runs, or None if it has none of that index."""
         run, viewer = (self.run_b, self._viewer_b) if of_b else (self.run_a, self._viewer_a)
         return viewer.view(index) if 0 <= index < run.trace.event_count else None
@@ -138,7 +138,7 @@ class Explainer:
 
     def _differing(
         self, found: FoundDivergence
-    ) -> tuple[EventView | None, EventView | None, tuple[MessageDifference, ...]]:
+    ) -> tuple[EventSummary | None, EventSummary | None, tuple[MessageDifference, ...]]:
         item = found.origin.item
         a, b = self.view(item.a, of_b=False), self.view(item.b, of_b=True)
         other_a, other_b = (
@@ -152,8 +152,8 @@ class Explainer:
     def _judge(
         self,
         found: FoundDivergence,
-        a: EventView | None,
-        b: EventView | None,
+        a: EventSummary | None,
+        b: EventSummary | None,
         messages: tuple[MessageDifference, ...],
     ) -> Judgement:
         return judge(
@@ -181,7 +181,7 @@ class Explainer:
         )
 
     def _changed(
-        self, view: EventView | None, messages: Sequence[MessageDifference]
+        self, view: EventSummary | None, messages: Sequence[MessageDifference]
     ) -> EntityChanges | None:
         """Return the entities whose QoS shows in an event."""
         if view is None or not (topics := topics_of(view, messages)):
@@ -218,7 +218,7 @@ class Explainer:
             if following is not None and following.why == NODE:
                 item = following.item
                 view = self.view(item.a, of_b=False) or self.view(item.b, of_b=True)
-                link = CauseLink(LinkKind.CHANGED_STATE, view.entity.node) if view else link
+                link = CauseLink(CauseLinkKind.CHANGED_STATE, view.entity.node) if view else link
             elif following is not None and following.why in _SHARED:
                 link = CauseLink(_SHARED[following.why])
             elif following is not None:
@@ -229,7 +229,7 @@ class Explainer:
         if len(steps) > STEPS_MAX:
             left_out = len(steps) - STEPS_MAX
             steps[1 : 1 + left_out] = []
-            steps[0] = replace(steps[0], link=CauseLink(LinkKind.MORE_STEPS, steps=left_out))
+            steps[0] = replace(steps[0], link=CauseLink(CauseLinkKind.MORE_STEPS, steps=left_out))
         return (*self._ancestors(origins[0]), *steps)
 
     def _ancestors(self, root: DivergenceOrigin) -> list[CauseStep]:
@@ -259,12 +259,12 @@ class Explainer:
                     return self._link(run, event.cause_event, event.cause_output)
         return CauseLink()
 
-    def _link(self, run: Run, cause: int, nth: int) -> CauseLink:
+    def _link(self, run: ComparedTrace, cause: int, nth: int) -> CauseLink:
         outputs = outputs_of(run, cause)
         if nth >= len(outputs):
-            return CauseLink(LinkKind.CAUSED)
+            return CauseLink(CauseLinkKind.CAUSED)
         kind, number, _, _ = outputs[nth]
-        return CauseLink(_LINKS.get(kind, LinkKind.CAUSED), run.matching.keys[number].name)
+        return CauseLink(_LINKS.get(kind, CauseLinkKind.CAUSED), run.matching.keys[number].name)
 
     # -- the rest --------------------------------------------------------------------------------
 
@@ -360,7 +360,7 @@ def _told_to_differ(settings: Sequence[Setting]) -> bool:
     return any(setting.kind is not SettingKind.ENVIRONMENT for setting in settings)
 
 
-def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
+def _is_renamed(explainer: Explainer, a: EventSummary, b: EventSummary) -> bool:
     """Whether two constructors make the same node under different names."""
     if not a.kind is b.kind is EventKind.CONSTRUCT or a.entity.type != b.entity.type:
         return False
@@ -370,22 +370,22 @@ def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
 
 
 _SHARED = {
-    DRAWN: LinkKind.DRAWN_AGAIN,
-    MADE: LinkKind.MADE_RECEIVER,
-    BUSY: LinkKind.KEEPS_WAITING,
-    STUCK: LinkKind.ENDED_BEFORE,
+    DRAWN: CauseLinkKind.DRAWN_AGAIN,
+    MADE: CauseLinkKind.MADE_RECEIVER,
+    BUSY: CauseLinkKind.KEEPS_WAITING,
+    STUCK: CauseLinkKind.ENDED_BEFORE,
 }
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
 """Verdicts where recording the job again helps: it shows which run is the usual one."""
 
-_LINKS: dict[int, LinkKind] = {
-    OutputKind.MESSAGE: LinkKind.PUBLISHED,
-    OutputKind.REQUEST: LinkKind.CALLED,
-    OutputKind.RESPONSE: LinkKind.ANSWERED,
-    OutputKind.LOG: LinkKind.LOGGED,
-    OutputKind.GUARD: LinkKind.TRIGGERED,
-    OutputKind.TASK: LinkKind.MADE_TASK,
+_LINKS: dict[int, CauseLinkKind] = {
+    OutputKind.MESSAGE: CauseLinkKind.PUBLISHED,
+    OutputKind.REQUEST: CauseLinkKind.CALLED,
+    OutputKind.RESPONSE: CauseLinkKind.ANSWERED,
+    OutputKind.LOG: CauseLinkKind.LOGGED,
+    OutputKind.GUARD: CauseLinkKind.TRIGGERED,
+    OutputKind.TASK: CauseLinkKind.MADE_TASK,
 }
 
 
@@ -394,6 +394,6 @@ def _divergence_of(judgement: Judgement, **more: Any) -> Divergence:
     return Divergence(**own, **more)
 
 
-def _cause(view: EventView | None) -> int:
+def _cause(view: EventSummary | None) -> int:
     """Return the index of an event's cause, -1 if it has none."""
     return -1 if view is None or view.cause_event == NO_EVENT else view.cause_event

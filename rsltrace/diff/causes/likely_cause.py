@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.causes.calls import (
     STARTED_BY,
     subject_of_call,
@@ -26,10 +26,15 @@ from rsltrace.diff.facts.causes import (
     SetOrder,
     Verdict,
 )
-from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, OutputOrder
+from rsltrace.diff.facts.evidence import (
+    CallDifference,
+    EventSummary,
+    MessageDifference,
+    OutputOrder,
+)
 from rsltrace.errors import JobError
 from rsltrace.trace.format import METADATA_SOURCES
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.words.code import code_file, code_place
 
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
@@ -47,7 +52,7 @@ _OF_ORDER = (Verdict.SCHEDULE, Verdict.TIMING, Verdict.MISSING, Verdict.EXTRA)
 
 def likely_cause(
     judgement: Judgement,
-    runs: tuple[Run, Run],
+    runs: tuple[ComparedTrace, ComparedTrace],
     calls: Sequence[CallDifference],
     relevance: Relevance,
 ) -> LikelyCause | None:
@@ -103,8 +108,8 @@ def _shown(messages: Sequence[MessageDifference]) -> set[str]:
 
 
 def _set_behind(
-    run: Run,
-    view: EventView,
+    run: ComparedTrace,
+    view: EventSummary,
     messages: Sequence[MessageDifference],
     calls: Sequence[CallDifference],
     relevance: Relevance,
@@ -114,7 +119,7 @@ def _set_behind(
     if not any(map(_is_reordered, messages)):
         return None
     for call in calls:
-        if call.source == Source.ORDER.value:
+        if call.source == NondeterminismSource.ORDER.value:
             return SetOrder(call.call, call.where.partition(" in ")[0])
     if relevance.sets_are_in_order:
         return None
@@ -133,7 +138,7 @@ def _is_reordered(message: MessageDifference) -> bool:
     return isinstance(message.fate, OutputOrder) or any(one.is_reordered for one in message.fields)
 
 
-def _is_as_recorded(run: Run, file: Path) -> bool:
+def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
     try:
         present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
     except OSError:
@@ -146,7 +151,11 @@ def _lines_with_sets(file: Path, line: int) -> list[tuple[int, str]]:
     from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
-        found = [(o.line, o.call) for o in audit_path(file).found if o.kind == Source.ORDER.value]
+        found = [
+            (o.line, o.call)
+            for o in audit_path(file).found
+            if o.kind == NondeterminismSource.ORDER.value
+        ]
         tree = ast.parse(file.read_bytes())
     except (JobError, OSError, SyntaxError, ValueError):
         return []

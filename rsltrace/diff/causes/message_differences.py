@@ -12,9 +12,9 @@ from itertools import islice, pairwise
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import (
     TIMER,
+    ComparedTrace,
     EventColumns,
     OutputRow,
-    Run,
     counts,
     load_rows,
     outputs_of,
@@ -22,7 +22,7 @@ from rsltrace.diff.alignment.rows import (
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
 from rsltrace.diff.facts.evidence import (
-    EventView,
+    EventSummary,
     FieldDifference,
     MessageDifference,
     NoFieldsReason,
@@ -48,11 +48,11 @@ from rsltrace.trace.model.event import (
     EventKind,
     Output,
     OutputKind,
-    draw_text,
+    decision_text,
 )
 from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
 from rsltrace.trace.model.texts import printable, shortened
-from rsltrace.trace.words.code import output_places, place_here
+from rsltrace.trace.words.code import output_places, relative_place
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
 from rsltrace.trace.words.logs import LogRecord
@@ -70,7 +70,11 @@ _WITHOUT_INPUT = frozenset((EventKind.TIMER, EventKind.CONSTRUCT, EventKind.SHUT
 
 
 def message_differences(
-    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None, options: DiffOptions
+    run_a: ComparedTrace,
+    run_b: ComparedTrace,
+    a: EventSummary | None,
+    b: EventSummary | None,
+    options: DiffOptions,
 ) -> tuple[MessageDifference, ...]:
     """Return the input and the outputs in which two events differ, the input first.
 
@@ -98,12 +102,14 @@ _CANCEL_HASH = hash64(pack_operation(TIMER_CANCEL, 0))
 
 
 class _MessageComparison:
-    def __init__(self, run_a: Run, run_b: Run, options: DiffOptions) -> None:
+    def __init__(self, run_a: ComparedTrace, run_b: ComparedTrace, options: DiffOptions) -> None:
         self._run_a = run_a
         self._run_b = run_b
         self._options = options
 
-    def differences(self, a: EventView | None, b: EventView | None) -> Iterator[MessageDifference]:
+    def differences(
+        self, a: EventSummary | None, b: EventSummary | None
+    ) -> Iterator[MessageDifference]:
         """Yield what differs between two events, of which one may be missing."""
         input_a, input_b = self._input(self._run_a, a), self._input(self._run_b, b)
         hash_a = a.input_hash if a is not None else None
@@ -129,16 +135,18 @@ class _MessageComparison:
                 found = replace(found, fate=fate or found.fate)
             yield found
 
-    def _places(self, run: Run, row: OutputRow | None, view: EventView | None) -> list[str]:
+    def _places(
+        self, run: ComparedTrace, row: OutputRow | None, view: EventSummary | None
+    ) -> list[str]:
         """Return the lines from which an output may have come."""
         if row is None or view is None:
             return []
         if row[0] not in _WITH_PAYLOAD and row[0] != OutputKind.DRAW:
             return []
         output = Output(view.index, _entity_id(run, row[1]), OutputKind(row[0]), row[2], row[3])
-        return [place_here(run.trace, place) for place in output_places(run.trace, output)]
+        return [relative_place(run.trace, place) for place in output_places(run.trace, output)]
 
-    def _input(self, run: Run, view: EventView | None) -> OutputRow | None:
+    def _input(self, run: ComparedTrace, view: EventSummary | None) -> OutputRow | None:
         """Return the output that was an event's input; for a bag message, its own publication."""
         if view is None or view.kind in _WITHOUT_INPUT:
             return None
@@ -184,7 +192,7 @@ class _MessageComparison:
         if moved or kind == OutputKind.ENTITY:
             return base
         if kind == OutputKind.DRAW:
-            text_a, text_b = (draw_text(output[2]) if output else "none" for output in (a, b))
+            text_a, text_b = (decision_text(output[2]) if output else "none" for output in (a, b))
             return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
         values: list[object] = []
         for run, output in ((self._run_a, a), (self._run_b, b)):
@@ -219,7 +227,7 @@ class _MessageComparison:
         fate = ParameterChanges(changed) if changed else None
         return replace(base, fields=fields, more_fields=more, no_fields=no_fields, fate=fate)
 
-    def _decoded(self, run: Run, row: OutputRow) -> object | None:
+    def _decoded(self, run: ComparedTrace, row: OutputRow) -> object | None:
         """Return the decoded payload of an output (a text for a detail), None if not recorded."""
         kind, number, content, sequence = row
         if sequence == NO_SEQUENCE:
@@ -262,14 +270,14 @@ def _topic(kind: int, key: EntityKey) -> str:
     return drawn_for(key) if kind == OutputKind.DRAW else output_text(kind, key.name, key.kind)
 
 
-def _is_published_input(view: EventView) -> bool:
+def _is_published_input(view: EventSummary) -> bool:
     """Return whether an event publishes what it got from outside: a bag's message, a driver's."""
     if view.kind is EventKind.OUTSIDE:
         return view.entity.kind == EntityKind.PUBLISHER.label
     return view.kind is EventKind.BAG
 
 
-def _entity_id(run: Run, number: int) -> int:
+def _entity_id(run: ComparedTrace, number: int) -> int:
     table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
     return int((table == number).nonzero()[0][0])
 
@@ -280,7 +288,13 @@ def _entity_id(run: Run, number: int) -> int:
 class _OutputChanges:
     """What became of the outputs of one pair of events."""
 
-    def __init__(self, run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> None:
+    def __init__(
+        self,
+        run_a: ComparedTrace,
+        run_b: ComparedTrace,
+        a: EventSummary | None,
+        b: EventSummary | None,
+    ) -> None:
         self._runs = (run_a, run_b)
         self._views = (a, b)
 

@@ -13,11 +13,11 @@ from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
-from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.alignment.rows import ComparedTrace
 from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 
@@ -51,8 +51,8 @@ class DivergenceSite:
 class Relevance:
     """Judges settings for the two runs."""
 
-    run_a: Run
-    run_b: Run
+    run_a: ComparedTrace
+    run_b: ComparedTrace
     _used: dict[str, set[str]] = field(default_factory=dict)
 
     def of(self, settings: Sequence[Setting], place: DivergenceSite) -> tuple[Setting, ...]:
@@ -93,7 +93,8 @@ class Relevance:
         if any(job.get("clocks") for job in self._jobs) or not all(map(_is_guarded, self._jobs)):
             return True
         return any(
-            count.source is Source.RANDOM and (not place.nodes or count.node in place.nodes)
+            count.source is NondeterminismSource.RANDOM
+            and (not place.nodes or count.node in place.nodes)
             for trace in self._traces
             for count in trace.guarded
         )
@@ -139,7 +140,7 @@ class Relevance:
         """Whether both runs went through sets in an order that does not change."""
         return all(
             _is_guarded(job)
-            and _value(job, "guard", "order", "mode") in (None, Mode.VIRTUAL.value)
+            and _value(job, "guard", "order", "mode") in (None, GuardMode.VIRTUAL.value)
             and not any(_value(node, "guard") for node in job.get("nodes") or [])
             for job in self._jobs
         )

@@ -6,15 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.diff.alignment.rows import Run
-from rsltrace.diff.facts.evidence import EventView, StateDifference
-from rsltrace.trace.states import Leaf, state_after
+from rsltrace.diff.alignment.rows import ComparedTrace
+from rsltrace.diff.facts.evidence import EventSummary, StateDifference
+from rsltrace.trace.states import StateValue, state_after
 
 DIFFERENCES_MAX = 20
 
 
 def state_differences(
-    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
+    run_a: ComparedTrace, run_b: ComparedTrace, a: EventSummary | None, b: EventSummary | None
 ) -> tuple[StateDifference, ...]:
     """Return the values in which a node's states differ, by path; none if they are not recorded."""
     if a is None or b is None or a.state_hash == b.state_hash:
@@ -34,12 +34,12 @@ def state_differences(
     return tuple(found[:DIFFERENCES_MAX])
 
 
-def _node_of(run: Run, view: EventView) -> int:
+def _node_of(run: ComparedTrace, view: EventSummary) -> int:
     names = (e.id for e in run.trace.entities.values() if e.name == view.entity.node and e.id)
     return next(names, 0)
 
 
-def _differences(path: str, a: Leaf | None, b: Leaf | None) -> list[StateDifference]:
+def _differences(path: str, a: StateValue | None, b: StateValue | None) -> list[StateDifference]:
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         if a.shape == b.shape and a.dtype == b.dtype:
             return _elements(path, a, b)
@@ -59,7 +59,7 @@ def _elements(path: str, a: Any, b: Any) -> list[StateDifference]:
     ]
 
 
-def _shown(leaf: Leaf | None) -> str | None:
+def _shown(leaf: StateValue | None) -> str | None:
     if isinstance(leaf, np.ndarray):
         return f"array of {leaf.dtype}, shape {leaf.shape}"
     return leaf

@@ -14,7 +14,7 @@ from rsltrace.diff.facts.evidence import FieldDifference, NoFieldsReason, Presen
 from rsltrace.diff.facts.remarks import Remark
 
 if TYPE_CHECKING:
-    from rsltrace.trace.native import Spread
+    from rsltrace.trace.native import DurationStatistics
     from rsltrace.trace.words.entities import EntityKey
 
 
@@ -197,8 +197,8 @@ class CallbackTimes:
     events_a: int
     events_b: int
     measure: str
-    a: Spread | None
-    b: Spread | None
+    a: DurationStatistics | None
+    b: DurationStatistics | None
 
 
 @dataclass(frozen=True, slots=True)

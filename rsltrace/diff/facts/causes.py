@@ -12,7 +12,7 @@ from enum import Enum
 from rsltrace.diff.facts.evidence import (
     CallDifference,
     EntityChanges,
-    EventView,
+    EventSummary,
     Fact,
     MessageDifference,
     Setting,
@@ -133,14 +133,14 @@ class DivergenceKind(Enum):
 class DifferentOrder(Fact):
     """The same events ran in another order. ``event`` is one that moved."""
 
-    event: EventView
+    event: EventSummary
 
 
 @dataclass(frozen=True, slots=True)
 class EventInOneRun(Fact):
     """An event that only one run has; ``instead`` is what the other continued with."""
 
-    instead: EventView | None = None
+    instead: EventSummary | None = None
     loss: Loss | None = None
     periods_ns: tuple[int, int] | None = None
 
@@ -266,14 +266,14 @@ class ParameterFiles(Fact):
 class WaitInOneRun(Fact):
     """A callback that waited, in one run only, for what ``cause`` sent."""
 
-    cause: EventView
+    cause: EventSummary
 
 
 @dataclass(frozen=True, slots=True)
 class NotDelivered(Fact):
     """``cause`` sent it in both runs; it arrived only in one."""
 
-    cause: EventView
+    cause: EventSummary
     loss: Loss | None
 
 
@@ -281,8 +281,8 @@ class NotDelivered(Fact):
 class DifferentSenders(Fact):
     """The inputs came from other events."""
 
-    a: EventView
-    b: EventView
+    a: EventSummary
+    b: EventSummary
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,8 +379,8 @@ class Judgement:
     root: Root
     what: DivergenceFact
     why: CauseFact | None
-    a: EventView | None
-    b: EventView | None
+    a: EventSummary | None
+    b: EventSummary | None
     messages: tuple[MessageDifference, ...] = ()
     state: tuple[StateDifference, ...] = ()
     settings: tuple[Setting, ...] = ()
@@ -389,7 +389,7 @@ class Judgement:
     node_diverged: bool = False
 
     @property
-    def one(self) -> EventView | None:
+    def one(self) -> EventSummary | None:
         """The event, of whichever run has it."""
         return self.a or self.b
 

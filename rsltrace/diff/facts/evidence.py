@@ -77,7 +77,7 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
-class EventView:
+class EventSummary:
     """One event of one run, with names in place of numbers.
 
     ``position`` counts the events of this entity before it; -1 far into a long run, where counting
@@ -393,7 +393,7 @@ class StateDifference:
 # -- the way from the root, and on -------------------------------------------------------------
 
 
-class LinkKind(Enum):
+class CauseLinkKind(Enum):
     """How an event led to the next one of a chain."""
 
     NOTHING = ""
@@ -416,7 +416,7 @@ class LinkKind(Enum):
 class CauseLink:
     """How an event led to the next: over which topic, node, …, or over how many ``steps``."""
 
-    kind: LinkKind = LinkKind.NOTHING
+    kind: CauseLinkKind = CauseLinkKind.NOTHING
     name: str = ""
     steps: int = 0
 
@@ -429,8 +429,8 @@ class CauseStep:
     it; they agree in both runs (``a`` and ``b`` are equal).
     """
 
-    a: EventView | None
-    b: EventView | None
+    a: EventSummary | None
+    b: EventSummary | None
     link: CauseLink = CauseLink()
 
 

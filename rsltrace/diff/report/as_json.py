@@ -19,7 +19,7 @@ from rsltrace.diff.facts.bags import MessageDivergence
 from rsltrace.diff.facts.causes import Judgement, SameCause
 from rsltrace.diff.facts.evidence import (
     CauseStep,
-    EventView,
+    EventSummary,
     Fact,
     FieldDifference,
     MessageDifference,
@@ -137,7 +137,7 @@ def _step(step: CauseStep) -> dict[str, Any]:
     return {**_fields(step), "relation": link_text(step.link)}
 
 
-def _event(event: EventView) -> dict[str, Any]:
+def _event(event: EventSummary) -> dict[str, Any]:
     result = _fields(event)
     result["entity"] = _entity(event.entity)
     result["time"] = format_seconds(event.stamp_ns)
@@ -155,7 +155,7 @@ def _sides(pair: tuple[int, int] | None) -> dict[str, int] | None:
 
 
 _FORMS: dict[type, Callable[[Any], Any]] = {
-    EventView: _event,
+    EventSummary: _event,
     Divergence: _divergence,
     Judgement: _judgement,
     SameCause: lambda why: {"fact": "same_cause", "first": _judgement(why.first)},

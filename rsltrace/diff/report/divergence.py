@@ -5,7 +5,7 @@ from __future__ import annotations
 from difflib import SequenceMatcher
 from itertools import zip_longest
 
-from rsltrace.diff.facts.evidence import CauseStep, EventView, MessageDifference, Presence
+from rsltrace.diff.facts.evidence import CauseStep, EventSummary, MessageDifference, Presence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
 from rsltrace.diff.report.line import (
@@ -79,7 +79,7 @@ def _event(found: Divergence, width: int) -> Section:
     )
 
 
-def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
+def _did(sides: list[tuple[str, str, EventSummary]], width: int) -> list[Line]:
     """Return when an event was and what it did, for one that is in both runs."""
     rows = []
     for name, style, event in sides:
@@ -88,7 +88,7 @@ def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
     return [cut(row, width) for row in in_columns(rows)]
 
 
-def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> list[Line]:
+def _events_of(sides: list[tuple[str, str, EventSummary | None]], width: int) -> list[Line]:
     rows = []
     for name, style, event in sides:
         cells = event_cells(event) if event is not None else [("no such event", Style.FAINT)]
@@ -211,8 +211,8 @@ def _before(found: Divergence, width: int, options: DiffOptions) -> list[Section
 
 def _listed(
     title: str,
-    a: tuple[EventView, ...],
-    b: tuple[EventView, ...],
+    a: tuple[EventSummary, ...],
+    b: tuple[EventSummary, ...],
     width: int,
     keep: int,
     least: int,
@@ -233,20 +233,22 @@ def _listed(
 
 
 def _beside(
-    a: tuple[EventView, ...], b: tuple[EventView, ...]
-) -> list[tuple[EventView | None, EventView | None]]:
+    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...]
+) -> list[tuple[EventSummary | None, EventSummary | None]]:
     """Return two lists of events as pairs, with the same events beside each other."""
     keys_a, keys_b = ([event_key(event) for event in side] for side in (a, b))
     found = SequenceMatcher(None, keys_a, keys_b, autojunk=False).get_opcodes()
     if len(found) > 1 and found[0][0] in ("delete", "insert"):
         found = found[1:]  # what the other list, which is as long, does not reach back to
-    pairs: list[tuple[EventView | None, EventView | None]] = []
+    pairs: list[tuple[EventSummary | None, EventSummary | None]] = []
     for _, i, i_end, j, j_end in found:
         pairs += zip_longest(a[i:i_end], b[j:j_end])
     return pairs
 
 
-def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
+def _side_by_side(
+    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...], width: int
+) -> list[Line]:
     """Return two lists of events as two columns."""
     half = (width - 5) // 2
     rows = []
@@ -260,7 +262,9 @@ def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int
     return rows
 
 
-def _below_each_other(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
+def _below_each_other(
+    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...], width: int
+) -> list[Line]:
     """Return two lists of events as one, for a narrow screen: ``=`` what is in both."""
     rows: list[list[Piece]] = []
     for left, right in _beside(a, b):
@@ -273,7 +277,7 @@ def _below_each_other(a: tuple[EventView, ...], b: tuple[EventView, ...], width:
     return [cut(row, width) for row in in_columns(rows, widest=52)]
 
 
-def _brief(event: EventView | None, width: int) -> str:
+def _brief(event: EventSummary | None, width: int) -> str:
     if event is None:
         return ""
     done = f" -> {printable(event.summary)}" if event.summary else ""
@@ -306,12 +310,12 @@ def _reaches(found: Divergence, width: int) -> Section:
 # -- events as rows ------------------------------------------------------------------------------
 
 
-def event_text(event: EventView) -> str:
+def event_text(event: EventSummary) -> str:
     """Return ``/filter: subscription /scan``, or what else ran."""
     return event_title(event.kind, event.entity)
 
 
-def event_cells(event: EventView) -> list[Piece]:
+def event_cells(event: EventSummary) -> list[Piece]:
     """Return an event as cells of a table: index, time, what ran, what it did."""
     flags = (f"[{name}]" for name in flag_names(event.flags))
     done = ", ".join(filter(None, [printable(event.summary), *flags]))
@@ -323,7 +327,7 @@ def event_cells(event: EventView) -> list[Piece]:
     ]
 
 
-def event_key(event: EventView) -> tuple[object, ...]:
+def event_key(event: EventSummary) -> tuple[object, ...]:
     """Return what is equal for events that are the same except for their place in the run."""
     return (
         event.entity,

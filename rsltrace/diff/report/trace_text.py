@@ -27,7 +27,7 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result import ComparedRun, Diff
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
-from rsltrace.trace.model.texts import format_seconds, printable, told_apart
+from rsltrace.trace.model.texts import contrasting_texts, format_seconds, printable
 from rsltrace.trace.words.phrases import as_sentence, seconds_text
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def _settings(diff: Diff, width: int) -> Section:
 def _values(setting: Setting, room: int) -> tuple[str, str]:
     """Return both values in ``room`` characters each: of long ones, what differs."""
     a, b = ("-" if v is None else v.strip() for v in (setting.a, setting.b))
-    return told_apart(a, b, room, before=_ALIKE_SHOWN)
+    return contrasting_texts(a, b, room, before=_ALIKE_SHOWN)
 
 
 def _next(found: Divergence, others: int, width: int, *, hidden: bool = False) -> Section:

@@ -39,7 +39,7 @@ from rsltrace.diff.facts.evidence import (
     CallDifference,
     EntityChange,
     EntityChanges,
-    EventView,
+    EventSummary,
     MessageDifference,
     Presence,
     Setting,
@@ -62,16 +62,16 @@ from rsltrace.diff.sentences.values import (
 )
 from rsltrace.trace.model.event import (
     NO_EVENT,
-    Draw,
     EventKind,
     OutputKind,
-    draw_text,
-    duration_of,
+    RandomDecision,
+    decision_duration,
+    decision_kind,
+    decision_text,
     is_switch,
-    kind_of,
 )
-from rsltrace.trace.model.finding import Source
-from rsltrace.trace.model.texts import durations_apart, format_duration, printable, shortened
+from rsltrace.trace.model.finding import NondeterminismSource
+from rsltrace.trace.model.texts import contrasting_durations, format_duration, printable, shortened
 from rsltrace.trace.words.phrases import at_time, event_phrase, seconds_text
 
 PARAMETER_EVENTS = "/parameter_events"
@@ -80,22 +80,22 @@ _WAITS_MAX = 160
 _PARAMETERS = ".parameters."
 
 
-def phrase(view: EventView) -> str:
+def phrase(view: EventSummary) -> str:
     """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
     return event_phrase(view.kind, view.entity)
 
 
-def _at(view: EventView) -> str:
+def _at(view: EventSummary) -> str:
     return f"{phrase(view)} {at_time(view.stamp_ns)}"
 
 
-def _both(of: Judgement) -> tuple[EventView, EventView]:
+def _both(of: Judgement) -> tuple[EventSummary, EventSummary]:
     assert of.a is not None
     assert of.b is not None
     return of.a, of.b
 
 
-def _one(of: Judgement) -> EventView:
+def _one(of: Judgement) -> EventSummary:
     assert of.one is not None
     return of.one
 
@@ -197,7 +197,7 @@ def _(what: DifferentTime, of: Judgement) -> str:
     return f"{text}: it {slept_text(what.slept)}" if what.slept is not None else text
 
 
-def _times(a: EventView, b: EventView) -> str:
+def _times(a: EventSummary, b: EventSummary) -> str:
     late_ns = b.stamp_ns - a.stamp_ns
     late = "later" if late_ns > 0 else "earlier"
     times = f"{at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b"
@@ -207,7 +207,7 @@ def _times(a: EventView, b: EventView) -> str:
 def slept_text(slept: SleepTimes) -> str:
     """Return ``slept 7 ms in b and not in a``."""
     if slept.a is not None and slept.b is not None:
-        in_a, in_b = durations_apart(slept.a, slept.b)
+        in_a, in_b = contrasting_durations(slept.a, slept.b)
         return f"slept {in_a} in a and {in_b} in b"
     if slept.a is not None:
         return f"slept {format_duration(slept.a)} in a but not in b"
@@ -253,12 +253,12 @@ def _event(index: int) -> str:
     return "no event" if index == NO_EVENT else f"event {index}"
 
 
-_DRAWS: dict[Draw | None, str] = {
-    Draw.DELAY: "delay",
-    Draw.DUPLICATE: "second copy",
-    Draw.EXECUTION: "execution time",
-    Draw.CLOCK_AHEAD: "change",
-    Draw.CLOCK_BACK: "change",
+_DRAWS: dict[RandomDecision | None, str] = {
+    RandomDecision.DELAY: "delay",
+    RandomDecision.DUPLICATE: "second copy",
+    RandomDecision.EXECUTION: "execution time",
+    RandomDecision.CLOCK_AHEAD: "change",
+    RandomDecision.CLOCK_BACK: "change",
 }
 
 
@@ -282,21 +282,21 @@ def _(what: DifferentDraw, of: Judgement) -> str:
 def _drawn(number: int | None, other: int | None) -> str:
     """Return a decision in words, in which it differs from the other."""
     if number is None:
-        return f"no {_DRAWS.get(kind_of(other or 0), 'loss')}"
-    text = draw_text(number)
-    if other is not None and text == draw_text(other):
-        return draw_text(number, 17)
+        return f"no {_DRAWS.get(decision_kind(other or 0), 'loss')}"
+    text = decision_text(number)
+    if other is not None and text == decision_text(other):
+        return decision_text(number, 17)
     return text
 
 
 def _took(number: int | None, other: int | None) -> str:
     if number is None:
         return "no time"
-    took_ns = duration_of(number, Draw.EXECUTION)
+    took_ns = decision_duration(number, RandomDecision.EXECUTION)
     if took_ns is None:
         return _drawn(number, other)
-    other_ns = duration_of(other, Draw.EXECUTION) if other is not None else None
-    return durations_apart(took_ns, took_ns if other_ns is None else other_ns)[0]
+    other_ns = decision_duration(other, RandomDecision.EXECUTION) if other is not None else None
+    return contrasting_durations(took_ns, took_ns if other_ns is None else other_ns)[0]
 
 
 @says(DivergenceKind.THREAD_SWITCHED)
@@ -328,7 +328,7 @@ def _(what: DivergenceKind, of: Judgement) -> str:
     return f"{_received(_one(of), 'and')} {left}{state_text(of.state)}"
 
 
-def _received(one: EventView, joint: str = "but") -> str:
+def _received(one: EventSummary, joint: str = "but") -> str:
     """Return ``/filter: the callback for /scan at 2.1 s received the same input in both runs but``,
     as far as it received something."""
     who = _at(one)
@@ -565,13 +565,13 @@ def _(why: CauseKind, of: Judgement) -> str:
 # -- what is likely behind it ----------------------------------------------------------------------
 
 _CALLED = {
-    Source.ENVIRONMENT: "read",
-    Source.PID: "read",
-    Source.FILE: "read",
-    Source.DIRECTORY: "listed",
-    Source.CLOCK: "read",
-    Source.RANDOM: "drew",
-    Source.SOCKET: "called",
+    NondeterminismSource.ENVIRONMENT: "read",
+    NondeterminismSource.PID: "read",
+    NondeterminismSource.FILE: "read",
+    NondeterminismSource.DIRECTORY: "listed",
+    NondeterminismSource.CLOCK: "read",
+    NondeterminismSource.RANDOM: "drew",
+    NondeterminismSource.SOCKET: "called",
 }
 
 
@@ -586,7 +586,7 @@ def _(cause: ExternalAnswers, of: object) -> str:
 
 def call_text(call: CallDifference) -> str:
     """Return ``read MOTOR_SEED (6 in a, 4 in b) at picker.py:24``."""
-    done = f"{_CALLED.get(Source(call.source), 'called')} {printable(call.subject)}"
+    done = f"{_CALLED.get(NondeterminismSource(call.source), 'called')} {printable(call.subject)}"
     place = call.where.partition(" in ")[0]
     if call.a is None or call.b is None:
         return f"{done} only in {'b' if call.a is None else 'a'} at {place}"

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from rsltrace.diff.facts.bags import MessageDivergence
 from rsltrace.diff.facts.evidence import (
     CauseLink,
+    CauseLinkKind,
     FieldDifference,
     FieldNote,
     FieldNoteKind,
-    LinkKind,
     MessageDifference,
     NoFieldsReason,
     OutputOrder,
@@ -29,11 +29,11 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import (
-    durations_apart,
+    contrasting_durations,
+    contrasting_texts,
     format_duration,
     printable,
     shortened,
-    told_apart,
 )
 
 NAMED_MAX = 3
@@ -60,18 +60,18 @@ _NOTES = {
     FieldNoteKind.SIGN_OF_ZERO: "sign of zero",
 }
 _LINKS = {
-    LinkKind.PUBLISHED: "published",
-    LinkKind.CALLED: "called",
-    LinkKind.ANSWERED: "answered",
-    LinkKind.LOGGED: "logged to",
-    LinkKind.TRIGGERED: "triggered",
-    LinkKind.MADE_TASK: "created or resumed a task of",
-    LinkKind.CAUSED: "caused",
-    LinkKind.CHANGED_STATE: "may have changed the state of",
-    LinkKind.DRAWN_AGAIN: "draws a different value in",
-    LinkKind.MADE_RECEIVER: "created a receiver of",
-    LinkKind.KEEPS_WAITING: "keeps waiting",
-    LinkKind.ENDED_BEFORE: "ended before",
+    CauseLinkKind.PUBLISHED: "published",
+    CauseLinkKind.CALLED: "called",
+    CauseLinkKind.ANSWERED: "answered",
+    CauseLinkKind.LOGGED: "logged to",
+    CauseLinkKind.TRIGGERED: "triggered",
+    CauseLinkKind.MADE_TASK: "created or resumed a task of",
+    CauseLinkKind.CAUSED: "caused",
+    CauseLinkKind.CHANGED_STATE: "may have changed the state of",
+    CauseLinkKind.DRAWN_AGAIN: "draws a different value in",
+    CauseLinkKind.MADE_RECEIVER: "created a receiver of",
+    CauseLinkKind.KEEPS_WAITING: "keeps waiting",
+    CauseLinkKind.ENDED_BEFORE: "ended before",
 }
 
 
@@ -80,14 +80,14 @@ _LINKS = {
 
 def durations(a_ns: int, b_ns: int) -> str:
     """Return two durations, with one unit where that is the same: ``20 → 26 ms``."""
-    a, b = durations_apart(a_ns, b_ns)
+    a, b = contrasting_durations(a_ns, b_ns)
     (number, unit), (_, other_unit) = a.split(), b.split()
     return f"{number} → {b}" if unit == other_unit else f"{a} → {b}"
 
 
 def pair_text(a: str | None, b: str | None, nothing: str = "nothing") -> str:
     """Return ``old → new``, in which one sees what differs."""
-    one, other = told_apart(nothing if a is None else a, nothing if b is None else b)
+    one, other = contrasting_texts(nothing if a is None else a, nothing if b is None else b)
     return f"{one} → {other}"
 
 
@@ -164,7 +164,7 @@ def _setting_text(setting: Setting) -> str:
     name = setting_name(setting)
     values = [value for value in (setting.a, setting.b) if value is not None]
     if setting.kind is SettingKind.ENVIRONMENT and setting.a is not None and setting.b is not None:
-        shown = told_apart(setting.a, setting.b, _SETTING_MAX)
+        shown = contrasting_texts(setting.a, setting.b, _SETTING_MAX)
         return f"environment.{printable(setting.name)} ({', '.join(shown)})"
     if not setting.key or any(len(value) > _SETTING_MAX or "\n" in value for value in values):
         return name
@@ -262,7 +262,7 @@ def _(why: NoFieldsReason, of: MessageDifference | MessageDivergence) -> str:
 
 def link_text(link: CauseLink) -> str:
     """Return how an event led to the next one: ``published /odom``."""
-    if link.kind is LinkKind.MORE_STEPS:
+    if link.kind is CauseLinkKind.MORE_STEPS:
         return f"led, in {link.steps} more steps, to"
     return f"{_LINKS.get(link.kind, '')} {link.name}".strip()
 

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from rsltrace.diff.alignment.aligned_rows import AlignedRows
 from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EqualBlock
 from rsltrace.diff.alignment.entity_matching import match_entities
-from rsltrace.diff.alignment.rows import Run, first_difference
+from rsltrace.diff.alignment.rows import ComparedTrace, first_difference
 from rsltrace.diff.causes.effects import first_effect, is_setup
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.message_differences import message_differences
-from rsltrace.diff.facts.evidence import EventView, MessageDifference
+from rsltrace.diff.facts.evidence import EventSummary, MessageDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.traces.comparison import first_item
 from rsltrace.trace.reader import Trace
@@ -36,7 +36,10 @@ class AlignedRuns:
         self.first_place: int | None = first
         """The row of the first difference that is an effect; None if nothing differs."""
         self.matching = match_entities(a, b)
-        self.run_a, self.run_b = Run(a, self.matching, False), Run(b, self.matching, True)
+        self.run_a, self.run_b = (
+            ComparedTrace(a, self.matching, False),
+            ComparedTrace(b, self.matching, True),
+        )
         self._views = EventViews(self.run_a), EventViews(self.run_b)
         self._blocks: Iterator[Block] = iter(())
         if first is None:
@@ -73,7 +76,7 @@ class AlignedRuns:
         """The part of both runs that is aligned, 0 to 1."""
         return 1.0 if self.done else self.rows.progress
 
-    def view(self, index: int, *, of_b: bool) -> EventView:
+    def view(self, index: int, *, of_b: bool) -> EventSummary:
         """Return an event of a (``of_b``: of b) as reports tell it. Raises TraceError."""
         return self._views[of_b].view(index)
 

@@ -16,7 +16,7 @@ from rsltrace.diff.alignment.blocks import (
 )
 from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entities
 from rsltrace.diff.alignment.outputs import different_outputs
-from rsltrace.diff.alignment.rows import SHUTDOWN, Run, load_rows
+from rsltrace.diff.alignment.rows import SHUTDOWN, ComparedTrace, load_rows
 from rsltrace.diff.causes.effects import EffectSearch
 from rsltrace.diff.causes.environment import entity_settings, environment_settings
 from rsltrace.diff.causes.explain import Explainer
@@ -106,8 +106,8 @@ class _TraceComparison:
         self._matching: EntityMatching = match_entities(a, b)
         self._job = job_settings(a, b)
         delays = any(setting.part == "delay" for setting in self._job)
-        self._run_a = Run(a, self._matching, of_b=False, without_zero_delays=delays)
-        self._run_b = Run(b, self._matching, of_b=True, without_zero_delays=delays)
+        self._run_a = ComparedTrace(a, self._matching, of_b=False, without_zero_delays=delays)
+        self._run_b = ComparedTrace(b, self._matching, of_b=True, without_zero_delays=delays)
         self._environment = environment_settings(a, b)
         self._remarks = list(interruptions(a, b))
         self._only_names = False
@@ -379,7 +379,7 @@ def _column(item: EventPair) -> int:
 # -- runs whose programs have other names, two builds of one ---------------------------------------
 
 
-def first_real_difference(run_a: Run, run_b: Run, start: int) -> int | None:
+def first_real_difference(run_a: ComparedTrace, run_b: ComparedTrace, start: int) -> int | None:
     """Return the index of the first event from ``start`` on that differs in more than names: they
     are in the trace's own hashes of what a main's construction has made, and so in all chain hashes
     after it.

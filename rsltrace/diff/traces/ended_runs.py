@@ -17,13 +17,13 @@ from rsltrace.diff.facts.causes import (
     RunEnd,
     Verdict,
 )
-from rsltrace.diff.facts.evidence import EventView, Setting
+from rsltrace.diff.facts.evidence import EventSummary, Setting
 from rsltrace.diff.facts.remarks import DifferentJobs, EndedByException, EqualUntilTruncated, Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.tolerance import interruptions, side, stop_reason
 from rsltrace.trace.format import REPLAY_DIVERGED
-from rsltrace.trace.model.event import Event, EventFlag, EventKind
+from rsltrace.trace.model.event import EventFlag, EventKind, EventRecord
 from rsltrace.trace.model.texts import printable, shortened
 from rsltrace.trace.reader import Trace
 
@@ -168,7 +168,7 @@ def _end_of(name: str, trace: Trace) -> RunEnd:
     )
 
 
-def _failed(trace: Trace) -> Event | None:
+def _failed(trace: Trace) -> EventRecord | None:
     """Return the event whose exception ended a run: what follows it are the ends of its nodes."""
     if not trace.complete or trace.result.get("exit_code", "0") == "0":
         return None
@@ -199,7 +199,7 @@ def judge_end(
     a: Trace,
     b: Trace,
     over: Trace,
-    view_a: EventView | None,
+    view_a: EventSummary | None,
     job: Sequence[Setting],
     alone: Judgement | None = None,
 ) -> Judgement:

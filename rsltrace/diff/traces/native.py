@@ -32,7 +32,7 @@ from rsltrace.diff.traces.tolerance import interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind
-from rsltrace.trace.native import Spread, event_columns, is_native, spread
+from rsltrace.trace.native import DurationStatistics, duration_statistics, event_columns, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityKey
 
@@ -160,14 +160,16 @@ class _Callbacks:
             if entity in keys:
                 self.places[keys[entity]].append(place)
 
-    def times(self, key: EntityKey) -> Spread | None:
+    def times(self, key: EntityKey) -> DurationStatistics | None:
         """Return the periods of a timer, or the latencies of what was caused."""
         places = np.array(self.places.get(key, ()), dtype=np.int64)
         if key.kind == EntityKind.TIMER.label:
-            return spread(np.diff(self._stamps[places]))
+            return duration_statistics(np.diff(self._stamps[places]))
         causes: npt.NDArray[np.uint64] = self._causes[places]
         known = causes != NO_EVENT
-        return spread(self._stamps[places[known]] - self._stamps[causes[known].astype(np.int64)])
+        return duration_statistics(
+            self._stamps[places[known]] - self._stamps[causes[known].astype(np.int64)]
+        )
 
 
 def _keys(trace: Trace) -> dict[int, EntityKey]:

@@ -1,4 +1,4 @@
-"""Audit a path or a job: from files to findings."""
+"""AuditReport a path or a job: from files to findings."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pathlib import Path
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.calls import CallSite, find_calls
 from rsltrace.guard.audit.names import NameResolver
-from rsltrace.guard.audit.rules import Audit, Found
+from rsltrace.guard.audit.rules import AuditFinding, AuditReport
 from rsltrace.guard.audit.scopes import ModuleSource, NameScope, parse_scopes
 from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 from rsltrace.trace.model.module_search import find_module
 from rsltrace.trace.model.regular_file import read_regular
 
@@ -207,7 +207,7 @@ _LEAST_SAFE_FIRST = (
 class _NodeGroup:
     """Nodes with equal policies, with their targets (``module:Class`` or scripts) and files."""
 
-    policy: Policy
+    policy: GuardPolicy
     whose: str
     targets: list[str | Path]
     files: frozenset[Path] = frozenset()
@@ -216,7 +216,7 @@ class _NodeGroup:
 class GuardTreatment:
     """Returns what the guard does about a call site. ``policy`` is the job's; None: no guard."""
 
-    def __init__(self, policy: Policy | None, groups: Sequence[_NodeGroup] = ()) -> None:
+    def __init__(self, policy: GuardPolicy | None, groups: Sequence[_NodeGroup] = ()) -> None:
         self._policy = policy
         self._groups = groups
 
@@ -279,7 +279,7 @@ def module_of(target: str) -> str:
 
 
 def _treatment(
-    source: SourceFile, place: CallSite, policy: Policy | None, whose: str
+    source: SourceFile, place: CallSite, policy: GuardPolicy | None, whose: str
 ) -> tuple[Treatment, str]:
     rule = place.rule
     globs = policy.allowed.get(rule.source, ()) if policy and rule.source else ()
@@ -293,8 +293,8 @@ Executables = Callable[[str, str], "str | Path"]
 ModuleFolders = Callable[[Iterable[Path]], list[Path]]
 
 
-def audit_path(path: Path) -> Audit:
-    """Audit a Python file, or all files below a folder, with the guard's defaults.
+def audit_path(path: Path) -> AuditReport:
+    """AuditReport a Python file, or all files below a folder, with the guard's defaults.
 
     :raises JobError: if there is nothing to audit.
     """
@@ -303,13 +303,13 @@ def audit_path(path: Path) -> Audit:
     found = collect_path(path)
     if not found.files and not found.troubles:
         raise JobError(f"{path}: there is no Python file in this folder")
-    return _audit(found, GuardTreatment(Policy()))
+    return _audit(found, GuardTreatment(GuardPolicy()))
 
 
 def audit_job(
     job: Job, executable: Executables, module_folders: ModuleFolders | None = None
-) -> Audit:
-    """Audit the modules of a job's nodes, and their imports below its search path.
+) -> AuditReport:
+    """AuditReport the modules of a job's nodes, and their imports below its search path.
 
     ``module_folders`` returns the folders of the modules of packages' executables.
 
@@ -353,7 +353,7 @@ def audit_job(
     return _audit(collection, GuardTreatment.of_job(job, targets, folders))
 
 
-def _audit(collection: SourceCollection, guard: GuardTreatment) -> Audit:
+def _audit(collection: SourceCollection, guard: GuardTreatment) -> AuditReport:
     sources = list(collection.files.values())
     names = NameResolver({source.module.name: source.module for source in sources})
     called: set[ast.AST] = set()
@@ -372,7 +372,7 @@ def _audit(collection: SourceCollection, guard: GuardTreatment) -> Audit:
             silenced += 1
             continue
         found.add(_finding(source, place, guard))
-    return Audit(
+    return AuditReport(
         tuple(sorted(found)),
         len(sources),
         tuple(collection.troubles),
@@ -391,10 +391,10 @@ def _is_silenced(source: SourceFile, place: CallSite) -> bool:
     return False
 
 
-def _finding(source: SourceFile, place: CallSite, guard: GuardTreatment) -> Found:
+def _finding(source: SourceFile, place: CallSite, guard: GuardTreatment) -> AuditFinding:
     treatment, does = guard.of(source, place)
     node = place.node
-    return Found(
+    return AuditFinding(
         source.path,
         node.lineno,
         node.col_offset + 1,

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from rsltrace.guard.rules import Treatment
 
-IS_SAFE = frozenset({Treatment.VIRTUAL, Treatment.PINNED})
+SAFE_TREATMENTS = frozenset({Treatment.VIRTUAL, Treatment.PINNED})
 """With these, a second run does the same."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class Found:
+class AuditFinding:
     """One call in a source file; lines and columns count from 1, as in editors."""
 
     path: Path
@@ -26,11 +26,11 @@ class Found:
 
 
 @dataclass(frozen=True, slots=True)
-class Audit:
+class AuditReport:
     """The result of an audit. ``troubles`` names files that are not readable as Python, ``allowed``
     counts findings that a comment silences."""
 
-    found: tuple[Found, ...]
+    found: tuple[AuditFinding, ...]
     files: int
     troubles: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

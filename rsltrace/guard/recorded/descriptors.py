@@ -22,9 +22,9 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.process_ids import real_path
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-_RECORD = Mode.RECORD
+_RECORD = GuardMode.RECORD
 _MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)
 _PLAIN = (
     *("write", "writev", "pread", "fsync", "fdatasync", "ftruncate", "lseek", "isatty"),
@@ -39,7 +39,7 @@ _isatty = copy_of(os.isatty)  # type: ignore[arg-type]
 _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
-def recording_guard(source: Source, frame: FrameType) -> Guard | None:
+def recording_guard(source: NondeterminismSource, frame: FrameType) -> Guard | None:
     """Return the guard if user code calls and the job records this source."""
     guard = engaged()
     if guard is None or guard.mode(source, frame) is not _RECORD:
@@ -47,7 +47,7 @@ def recording_guard(source: Source, frame: FrameType) -> Guard | None:
     return guard if guard.is_user_call(frame) else None
 
 
-def recording_call(source: Source, call: str, real: Callable[..., Any]) -> Any:
+def recording_call(source: NondeterminismSource, call: str, real: Callable[..., Any]) -> Any:
     """Return the replacement of a function whose answers are recorded as they are."""
 
     def function(*arguments: Any, **options: Any) -> Any:
@@ -80,7 +80,7 @@ def _opening(real: Callable[..., int]) -> Any:
         path = real_path(path)
         frame = sys._getframe(1)
         wanted = not flags & _MAKES_FILES and flags & os.O_ACCMODE != os.O_WRONLY
-        guard = recording_guard(Source.FILE, frame) if wanted else None
+        guard = recording_guard(NondeterminismSource.FILE, frame) if wanted else None
         if guard is None:
             return real(path, flags, *more, **options)
         open_raw: list[int] = []
@@ -90,13 +90,13 @@ def _opening(real: Callable[..., int]) -> Any:
             return stat.S_ISDIR(os.fstat(open_raw[0]).st_mode)
 
         call = f"os.open({os.fsdecode(path)!r})"
-        folder = bool(guard.record(Source.FILE, call, is_folder, frame))
+        folder = bool(guard.record(NondeterminismSource.FILE, call, is_folder, frame))
         if not open_raw:  # a folder is the run's own, or its listing is not recorded anyway
             open_raw.append(
                 real(path, flags, *more, **options) if folder else unconnected_descriptor(flags)
             )
         guard.descriptors.drop(open_raw[0])
-        guard.descriptors.add(open_raw[0], Source.FILE, is_folder=folder)
+        guard.descriptors.add(open_raw[0], NondeterminismSource.FILE, is_folder=folder)
         return open_raw[0]
 
     return open_
@@ -137,7 +137,7 @@ def _recording_fstat(real: Callable[..., Any]) -> Any:
 
 def recorded_stat(
     guard: Guard,
-    source: Source,
+    source: NondeterminismSource,
     call: str,
     real: Callable[[], Any],
     frame: FrameType,

@@ -30,10 +30,10 @@ from rsltrace.guard.recorded.descriptors import (
     unconnected_descriptor,
 )
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-_FILE = Source.FILE
-_RECORD, _ALLOW = Mode.RECORD, Mode.ALLOW
+_FILE = NondeterminismSource.FILE
+_RECORD, _ALLOW = GuardMode.RECORD, GuardMode.ALLOW
 BYTES_MAX = 64 << 20
 
 
@@ -65,14 +65,14 @@ def _opening(real: Callable[..., Any]) -> Any:
         text = (buffering, encoding, errors, newline)
         if isinstance(file, int):
             if frame.f_globals.get("__name__") == "subprocess":  # a pipe to a program to be started
-                by_program = recording_guard(Source.PROCESS, frame)
+                by_program = recording_guard(NondeterminismSource.PROCESS, frame)
                 if by_program is not None:
-                    by_program.descriptors.add(file, Source.PROCESS)
+                    by_program.descriptors.add(file, NondeterminismSource.PROCESS)
             if recorded_descriptor(file) is not None:
                 raw = RawDescriptor(file, mode, name=file, closes=closefd)
                 return open_raw(raw, mode, *text)
         elif opener is None and isinstance(mode, str) and not set(mode) & set("wax"):
-            guard = recording_guard(Source.FILE, frame)
+            guard = recording_guard(NondeterminismSource.FILE, frame)
             if guard is not None and ("+" not in mode or _is_device(file)):
                 return _recorded(guard, file, mode, text, real)
         return real(file, mode, *text, closefd, opener)
@@ -104,14 +104,14 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
             raise OSError(27, f"{name} is too large to be recorded")
         return data
 
-    data = guard.record(Source.FILE, f"open({name!r})", content, _getframe(2))
+    data = guard.record(NondeterminismSource.FILE, f"open({name!r})", content, _getframe(2))
     if data is not None:
         held = _Content(data, name)
         _, encoding, errors, newline = text
         return held if "b" in mode else io.TextIOWrapper(held, encoding, errors, newline)
     number = fd[0] if fd else unconnected_descriptor()
     guard.descriptors.drop(number)
-    guard.descriptors.add(number, Source.FILE)
+    guard.descriptors.add(number, NondeterminismSource.FILE)
     return open_raw(RawDescriptor(number, mode, name=file), mode, *text)
 
 

@@ -20,14 +20,14 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.recorded.descriptors import recording_guard
 from rsltrace.guard.redirect import redirect, replace_attribute
 from rsltrace.guard.waiting import NOT_YET, wait_recorded, wait_unrecorded, waiting_guard
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 
-_RECORDED = (Source.SOCKET, Source.PROCESS, Source.FILE)
+_RECORDED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS, NondeterminismSource.FILE)
 _ALL_EVENTS = select.POLLIN | select.POLLPRI | select.POLLOUT
 _real_epoll = select.epoll
 
 
-def _recording(frame: FrameType) -> tuple[Guard, Source] | None:
+def _recording(frame: FrameType) -> tuple[Guard, NondeterminismSource] | None:
     for source in _RECORDED:
         guard = recording_guard(source, frame)
         if guard is not None:
@@ -37,7 +37,7 @@ def _recording(frame: FrameType) -> tuple[Guard, Source] | None:
 
 def _answer(
     guard: Guard,
-    source: Source,
+    source: NondeterminismSource,
     call: str,
     real: Callable[[float | None], list[Any]],
     frame: FrameType,
@@ -63,7 +63,9 @@ def _answer(
 class RecordedPoll:
     """A ``select.poll`` or ``select.epoll`` object whose answers are recorded."""
 
-    def __init__(self, real: Any, source: Source | None, *, seconds: bool, mask: int) -> None:
+    def __init__(
+        self, real: Any, source: NondeterminismSource | None, *, seconds: bool, mask: int
+    ) -> None:
         self._real = real
         self._source = source
         self._seconds = seconds

@@ -17,7 +17,7 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.frames import exchange
+from rsltrace.guard.frames import replace_member
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.recorded.descriptors import recording_guard, unconnected_descriptor
 from rsltrace.guard.redirect import redirect, replace_attribute
@@ -29,7 +29,7 @@ from rsltrace.guard.waiting import (
     wait_unrecorded,
     waiting_guard,
 )
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 
 _KEPT_OPEN = 3
 _LOOKED = "_rsltrace_looked"
@@ -43,7 +43,7 @@ def _starting(real: Callable[..., int]) -> Any:
         frame = sys._getframe(1)
         # multiprocessing shares memory and locks with its processes, which cannot be recorded
         by_subprocess = frame.f_globals.get("__name__") == "subprocess"
-        guard = recording_guard(Source.PROCESS, frame) if by_subprocess else None
+        guard = recording_guard(NondeterminismSource.PROCESS, frame) if by_subprocess else None
         if guard is None:
             return real(*arguments)
         words = [os.fsdecode(word) for word in arguments[0]]
@@ -52,8 +52,10 @@ def _starting(real: Callable[..., int]) -> Any:
         for fd in (*(arguments[place] for place in _CHILDS_ENDS), *arguments[_KEPT_OPEN]):
             far = descriptors.far_end(fd)
             if far is not None:
-                descriptors.add(far, Source.PROCESS)
-        process: int = guard.record(Source.PROCESS, call, lambda: real(*arguments), frame)
+                descriptors.add(far, NondeterminismSource.PROCESS)
+        process: int = guard.record(
+            NondeterminismSource.PROCESS, call, lambda: real(*arguments), frame
+        )
         descriptors.processes.add(process)
         return process
 
@@ -80,12 +82,14 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
                 found = poll_until(ended)(_first_wait_s(frame))
                 return (0, 0) if found is NOT_YET else found
 
-            return guard.record(Source.PROCESS, call, now_or_soon, frame, process)
+            return guard.record(NondeterminismSource.PROCESS, call, now_or_soon, frame, process)
         if not guard.context.is_aside():
             return guard.record(
-                Source.PROCESS, call, lambda: real(process, options), frame, process
+                NondeterminismSource.PROCESS, call, lambda: real(process, options), frame, process
             )
-        return wait_recorded(guard, Source.PROCESS, call, poll_until(ended), frame, number=process)
+        return wait_recorded(
+            guard, NondeterminismSource.PROCESS, call, poll_until(ended), frame, number=process
+        )
 
     return waitpid
 
@@ -117,12 +121,12 @@ def _of_process(name: str, real: Callable[..., Any]) -> Any:
                 return None
             return value
 
-        value = guard.record(Source.PROCESS, f"os.{name}()", call, frame, process)
+        value = guard.record(NondeterminismSource.PROCESS, f"os.{name}()", call, frame, process)
         if name != "pidfd_open":
             return value
         fd = opened[0] if opened else unconnected_descriptor()
         guard.descriptors.drop(fd)
-        guard.descriptors.add(fd, Source.PROCESS)
+        guard.descriptors.add(fd, NondeterminismSource.PROCESS)
         return fd
 
     return function
@@ -131,25 +135,33 @@ def _of_process(name: str, real: Callable[..., Any]) -> Any:
 def _running(real: Callable[..., int]) -> Any:
     def system(command: Any) -> Any:
         frame = sys._getframe(1)
-        guard = recording_guard(Source.PROCESS, frame)
+        guard = recording_guard(NondeterminismSource.PROCESS, frame)
         if guard is None:
             return real(command)
         call = f"os.system({os.fsdecode(command)[:100]!r})"
-        return guard.record(Source.PROCESS, call, lambda: real(command), frame)
+        return guard.record(NondeterminismSource.PROCESS, call, lambda: real(command), frame)
 
     return system
 
 
 def sleep_for_process(seconds: float, real: Callable[[float], None], frame: FrameType) -> None:
     """Let ``subprocess`` sleep in real time until it looks again for a program's end."""
-    guard = recording_guard(Source.PROCESS, frame)
+    guard = recording_guard(NondeterminismSource.PROCESS, frame)
     if guard is None:
         real(seconds)
     elif guard.context.is_aside():
         call = "time.sleep() of subprocess"
         # The rest of a timeout may be less than its clock can show, but time must go on.
         timeout_s = max(seconds, 1e-6)
-        wait_recorded(guard, Source.PROCESS, call, _no_answer, frame, number=0, timeout_s=timeout_s)
+        wait_recorded(
+            guard,
+            NondeterminismSource.PROCESS,
+            call,
+            _no_answer,
+            frame,
+            number=0,
+            timeout_s=timeout_s,
+        )
     elif not guard.answers.replays:
         real(seconds)
 
@@ -180,8 +192,10 @@ def recorded_processes() -> Iterator[None]:
         for name in ("kill", "pidfd_open"):
             redirect(stack, getattr(os, name), partial(_of_process, name))
         acquire: Any = _multiprocessing.SemLock.acquire
-        exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
-        exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
+        replace_member(stack, _multiprocessing.SemLock, "acquire", _acquiring)
+        replace_member(
+            stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire)
+        )
         # posix_spawn is not recorded.
         replace_attribute(stack, subprocess, "_USE_POSIX_SPAWN", False)
         yield

@@ -15,12 +15,12 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.frames import exchange
+from rsltrace.guard.frames import replace_member
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded.descriptors import connected_ends, recording_call, recording_guard
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.waiting import wait_readable, wait_recorded, wait_unrecorded, waiting_guard
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 
 _RECEIVING = ("recv", "recvfrom", "recvmsg")
 _RECEIVING_INTO = ("recv_into", "recvfrom_into")
@@ -41,7 +41,7 @@ _BUFFERED = ("read", "write")
 
 def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
     """Return the guard if a socket's answers are recorded: it leads outside of the run."""
-    guard = recording_guard(Source.SOCKET, frame)
+    guard = recording_guard(NondeterminismSource.SOCKET, frame)
     if guard is None or guard.descriptors.far_end(sock.fileno()) is not None:
         return None
     return guard
@@ -52,12 +52,12 @@ def _answer(
 ) -> Any:
     number = guard.descriptors.number(sock)
     if not waits or not guard.context.is_aside() or sock.gettimeout() == 0:
-        return guard.record(Source.SOCKET, call, real, frame, number)
+        return guard.record(NondeterminismSource.SOCKET, call, real, frame, number)
     timeout_s = sock.gettimeout()
     look = wait_readable(sock.fileno(), lambda: [real()])
     found = wait_recorded(
         guard,
-        Source.SOCKET,
+        NondeterminismSource.SOCKET,
         call,
         look,
         frame,
@@ -147,7 +147,7 @@ def _accepting(real: Callable[[Any], Any]) -> Any:
 def _reading(real: Callable[..., Any]) -> Any:
     def read(self: Any, size: int, buffer: Any = None, /) -> Any:
         frame = sys._getframe(1)
-        guard = recording_guard(Source.SOCKET, frame)
+        guard = recording_guard(NondeterminismSource.SOCKET, frame)
         if guard is None:
             return real(self, size) if buffer is None else real(self, size, buffer)
 
@@ -160,7 +160,7 @@ def _reading(real: Callable[..., Any]) -> Any:
         if isinstance(owner, socket.socket):
             data = _answer_tls(guard, self, owner, call, receive, frame)
         else:
-            data = guard.record(Source.SOCKET, call, receive, frame)
+            data = guard.record(NondeterminismSource.SOCKET, call, receive, frame)
         if buffer is None:
             return data
         memoryview(buffer).cast("B")[: len(data)] = data
@@ -181,14 +181,14 @@ def _answer_tls(
     number = guard.descriptors.number(sock)
     timeout_s = sock.gettimeout()
     if timeout_s == 0 or not guard.context.is_aside():
-        return guard.record(Source.SOCKET, call, receive, frame, number)
+        return guard.record(NondeterminismSource.SOCKET, call, receive, frame, number)
     wire = wait_readable(sock.fileno(), lambda: [receive()])
 
     def look(seconds: float) -> Any:
         return [receive()] if tls.pending() else wire(seconds)
 
     found = wait_recorded(
-        guard, Source.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
+        guard, NondeterminismSource.SOCKET, call, look, frame, number=number, timeout_s=timeout_s
     )
     if found is None:
         raise TimeoutError("The read operation timed out")
@@ -197,11 +197,14 @@ def _answer_tls(
 
 def _pending(real: Any) -> property:
     def pending(self: Any) -> Any:
-        guard = recording_guard(Source.SOCKET, sys._getframe(1))
+        guard = recording_guard(NondeterminismSource.SOCKET, sys._getframe(1))
         if guard is None:
             return real.__get__(self)
         return guard.record(
-            Source.SOCKET, "MemoryBIO.pending", lambda: real.__get__(self), sys._getframe(1)
+            NondeterminismSource.SOCKET,
+            "MemoryBIO.pending",
+            lambda: real.__get__(self),
+            sys._getframe(1),
         )
 
     return property(pending)
@@ -215,7 +218,7 @@ def recorded_sockets() -> Iterator[None]:
             redirect(
                 stack,
                 getattr(_socket, name),
-                partial(recording_call, Source.SOCKET, f"socket.{name}()"),
+                partial(recording_call, NondeterminismSource.SOCKET, f"socket.{name}()"),
             )
         redirect(stack, _socket.socketpair, connected_ends)
         kind: Any = socket.socket
@@ -232,11 +235,19 @@ def recorded_sockets() -> Iterator[None]:
         tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
         memory = ssl.MemoryBIO
         for name in _TLS:
-            exchange(stack, tls, name, partial(recording_call, Source.SOCKET, f"TLS.{name}()"))
-        exchange(stack, tls, "read", _reading)
-        for name in _BUFFERED:
-            exchange(
-                stack, memory, name, partial(recording_call, Source.SOCKET, f"MemoryBIO.{name}()")
+            replace_member(
+                stack,
+                tls,
+                name,
+                partial(recording_call, NondeterminismSource.SOCKET, f"TLS.{name}()"),
             )
-        exchange(stack, memory, "pending", _pending)
+        replace_member(stack, tls, "read", _reading)
+        for name in _BUFFERED:
+            replace_member(
+                stack,
+                memory,
+                name,
+                partial(recording_call, NondeterminismSource.SOCKET, f"MemoryBIO.{name}()"),
+            )
+        replace_member(stack, memory, "pending", _pending)
         yield

@@ -18,14 +18,14 @@ from types import BuiltinFunctionType, FrameType
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.callers import KINDS, OURS
+from rsltrace.guard.callers import FILE_OWNERS, OURS
 from rsltrace.guard.frames import caller, code_of, set_member
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_reader
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _NS = 1_000_000_000
-_CLOCK, _VIRTUAL = Source.CLOCK, Mode.VIRTUAL
+_CLOCK, _VIRTUAL = NondeterminismSource.CLOCK, GuardMode.VIRTUAL
 
 REAL_TIME_MODULES = {
     "hypothesis.internal.conjecture.junkdrawer",  # times the garbage collector, whenever it runs
@@ -62,23 +62,30 @@ def clock_call(
     """Answer a read of a clock as the job says; ``real_ns`` is read if it is recorded."""
     module = frame.f_globals.get("__name__")
     if module in REAL_TIME_MODULES:
-        if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
+        if (
+            module != "subprocess"
+            or guard.mode(NondeterminismSource.PROCESS, frame) is not GuardMode.RECORD
+        ):
             return real()
         if guard.context.is_aside():
             return virtual(guard.context.now_ns())
-        return virtual(guard.record(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame))
+        return virtual(
+            guard.record(
+                NondeterminismSource.PROCESS, f"{call} of subprocess", _monotonic_ns, frame
+            )
+        )
     mode = guard.mode(_CLOCK, frame)
     if mode is _VIRTUAL:
-        kind = KINDS[code_of(frame).co_filename]
+        kind = FILE_OWNERS[code_of(frame).co_filename]
         return virtual(guard.clock_ns(call, kind, frame.f_globals, frame))
-    if mode is Mode.ALLOW:
+    if mode is GuardMode.ALLOW:
         return real()
-    if mode is Mode.RECORD:
+    if mode is GuardMode.RECORD:
         if real_ns is None:
             real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
-        return virtual(guard.record(Source.CLOCK, call, real_ns, frame))
+        return virtual(guard.record(NondeterminismSource.CLOCK, call, real_ns, frame))
     value = real()
-    guard.report(Source.CLOCK, mode, call, value, frame)
+    guard.report(NondeterminismSource.CLOCK, mode, call, value, frame)
     return value
 
 

@@ -13,7 +13,7 @@ from types import CodeType, FunctionType
 from typing import Any
 
 from rsltrace.guard.guard import engage, engaged
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _sources: dict[str, bytes] = {}
 """The compiled sources by file: a file may change during a run."""
@@ -74,10 +74,10 @@ def _report_sets(code: CodeType) -> None:
     if guard is None:
         return
     frame: Any = sys._getframe(1)
-    if guard.mode(Source.ORDER, frame) is not Mode.ALLOW:
+    if guard.mode(NondeterminismSource.ORDER, frame) is not GuardMode.ALLOW:
         call = f"order of sets in {code.co_name}, which numba compiles"
         line = f"{code.co_filename.rpartition('/')[2]}:{code.co_firstlineno}"
-        guard.report(Source.ORDER, Mode.WARN, call, line, frame)
+        guard.report(NondeterminismSource.ORDER, GuardMode.WARN, call, line, frame)
 
 
 def _makes_set(code: CodeType) -> bool:
@@ -115,12 +115,12 @@ _READERS: dict[str, Callable[[str, ExitStack], None]] = {
     "cloudpickle.cloudpickle": _for_cloudpickle,
     "joblib.externals.cloudpickle.cloudpickle": _for_cloudpickle,
 }
-READERS = tuple(_READERS)
+CODE_READERS = tuple(_READERS)
 """Modules that read code, to be prepared when they are loaded."""
 
 
 def show_original(name: str, stack: ExitStack) -> None:
-    """Let one of the ``READERS``, which is loaded, see original code until ``stack`` ends."""
+    """Let one of the ``CODE_READERS``, which is loaded, see original code until ``stack`` ends."""
     try:
         _READERS[name](name, stack)
     except (AttributeError, KeyError):

@@ -16,10 +16,10 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.process_ids import meant_id
+from rsltrace.guard.process_ids import real_id
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.rules import PROCESSOR_NAMES, PROCESSORS
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _getpid = copy_of(os.getpid)  # type: ignore[arg-type]
 _affinities: WeakKeyDictionary[Guard, frozenset[int]] = WeakKeyDictionary()
@@ -31,9 +31,9 @@ def _answering_guard(call: str, frame: FrameType) -> Guard | None:
     guard = engaged()
     if guard is None or not guard.is_user_call(frame):
         return None
-    if guard.mode(Source.ENVIRONMENT, frame) is Mode.ALLOW:
+    if guard.mode(NondeterminismSource.ENVIRONMENT, frame) is GuardMode.ALLOW:
         return None
-    guard.count_call(Source.ENVIRONMENT, call, frame)
+    guard.count_call(NondeterminismSource.ENVIRONMENT, call, frame)
     return guard
 
 
@@ -51,7 +51,7 @@ def _configured(real: Callable[[Any], int]) -> Callable[[Any], int]:
 
 
 def _is_own(pid: Any) -> bool:
-    return pid == 0 or bool(meant_id(pid) == _getpid())
+    return pid == 0 or bool(real_id(pid) == _getpid())
 
 
 def _affinity(real: Callable[[Any], set[int]]) -> Callable[[Any], set[int]]:
@@ -60,7 +60,7 @@ def _affinity(real: Callable[[Any], set[int]]) -> Callable[[Any], set[int]]:
             _answering_guard("os.sched_getaffinity()", sys._getframe(1)) if _is_own(pid) else None
         )
         if guard is None:
-            return real(meant_id(pid))
+            return real(real_id(pid))
         return set(_affinities.get(guard, range(PROCESSORS)))
 
     return sched_getaffinity
@@ -72,7 +72,7 @@ def _setting(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
             _answering_guard("os.sched_setaffinity()", sys._getframe(1)) if _is_own(pid) else None
         )
         if guard is None:
-            real(meant_id(pid), mask)
+            real(real_id(pid), mask)
             return
         chosen = frozenset(mask).intersection(range(PROCESSORS))
         if not chosen:

@@ -20,7 +20,7 @@ from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.callers import KINDS, OURS
+from rsltrace.guard.callers import FILE_OWNERS, OURS
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import (
@@ -32,9 +32,9 @@ from rsltrace.guard.redirect import (
     redirect,
     replace_attribute,
 )
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-_RANDOM = Source.RANDOM
+_RANDOM = NondeterminismSource.RANDOM
 _NODE_ID = 0x02_00_00_00_00_01
 """A locally administered MAC address, for ``uuid1`` and ``getnode``."""
 
@@ -62,7 +62,7 @@ def _drawing(
         except frames.INTERRUPTED:
             frame = frames.lost_caller()
         if guard.answers_random:
-            kind = KINDS[code_of(frame).co_filename]
+            kind = FILE_OWNERS[code_of(frame).co_filename]
             drawing = guard.known_random_function(call, kind) if kind <= OURS else None
             return (drawing or guard.random_function(call, virtual, frame))(*arguments, **options)
         return _answer(guard, frame, call, virtual, partial(real, *arguments, **options))
@@ -98,9 +98,9 @@ def _answer(
 ) -> Any:
     """Draw as the job says."""
     mode = guard.mode(_RANDOM, frame)
-    if mode is Mode.VIRTUAL:
+    if mode is GuardMode.VIRTUAL:
         return guard.random_function(call, virtual, frame)(*real.args, **real.keywords)
-    if mode is Mode.RECORD:
+    if mode is GuardMode.RECORD:
         stream = guard.stream(frame)
         guard.streams.begin(
             stream,
@@ -108,7 +108,7 @@ def _answer(
         )
         return virtual(guard, stream)(*real.args, **real.keywords)
     value = real()
-    if mode is not Mode.ALLOW:
+    if mode is not GuardMode.ALLOW:
         guard.report(_RANDOM, mode, call, value, frame, _shown)
     return value
 
@@ -273,14 +273,17 @@ def _zeroing(real: Callable[..., Any]) -> Any:
         guard = engaged()
         if guard is not None and not made.dtype.hasobject:
             frame = caller()
-            if guard.is_user(frame) and guard.mode(Source.RANDOM, frame) is not Mode.ALLOW:
+            if (
+                guard.is_user(frame)
+                and guard.mode(NondeterminismSource.RANDOM, frame) is not GuardMode.ALLOW
+            ):
                 made.fill(0)
         return made
 
     return empty
 
 
-def begin_shared(seed: int) -> None:
+def seed_shared_generator(seed: int) -> None:
     """Seed numpy's shared generator, which cannot be divided into streams."""
     if "numpy" in sys.modules:
         import numpy as np

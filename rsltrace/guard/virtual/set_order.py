@@ -26,13 +26,13 @@ from typing import Any
 
 from rsltrace.guard import frames
 from rsltrace.guard.addresses import has_address_hash
-from rsltrace.guard.callers import KINDS, OURS
-from rsltrace.guard.frames import caller, code_of, exchange, replace_special_method
+from rsltrace.guard.callers import FILE_OWNERS, OURS
+from rsltrace.guard.frames import caller, code_of, replace_member, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.trace.model.finding import Mode, Source
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-_ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
+_ORDER, _ALLOW, _VIRTUAL = NondeterminismSource.ORDER, GuardMode.ALLOW, GuardMode.VIRTUAL
 _TYPES: tuple[type, ...] = (set, frozenset)
 _NUMBERS = frozenset((int, float, bool))
 """Their positions in a set are the same in every process."""
@@ -82,7 +82,7 @@ def _order(guard: Guard, obj: Any, frame: FrameType | None) -> list[Any] | None:
     """Return the elements in order if user code, or what it calls at ``frame``, iterates."""
     if (
         frame is None
-        or KINDS[code_of(frame).co_filename] == OURS
+        or FILE_OWNERS[code_of(frame).co_filename] == OURS
         or guard.user_frame_of(frame) is None
     ):
         return None
@@ -233,8 +233,8 @@ def ordered_sets() -> Iterator[None]:
     with ExitStack() as stack:
         for kind in _TYPES:
             replace_special_method(stack, kind, "__iter__", _iterating)
-        exchange(stack, set, "pop", _popping)
-        exchange(stack, dict, "fromkeys", _from_keys)
+        replace_member(stack, set, "pop", _popping)
+        replace_member(stack, dict, "fromkeys", _from_keys)
         redirect(stack, pickle.dumps, _dumping)
         redirect(stack, pickle.dump, _dumping_into)
         if LISTS_READ_SETS:
@@ -242,8 +242,8 @@ def ordered_sets() -> Iterator[None]:
                 redirect(stack, function, _making)
             replace_special_method(stack, list, "__init__", _making)
             for name in ("extend", "__iadd__"):
-                exchange(stack, list, name, _making)
+                replace_member(stack, list, name, _making)
             for kind in _TYPES:
                 replace_special_method(stack, kind, "__repr__", _showing)
-                exchange(stack, kind, "__reduce__", _reducing)
+                replace_member(stack, kind, "__reduce__", _reducing)
         yield

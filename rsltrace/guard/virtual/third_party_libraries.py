@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.callers import is_user_file
-from rsltrace.guard.frames import caller, exchange
+from rsltrace.guard.frames import caller, replace_member
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
@@ -77,14 +77,14 @@ def torch_streams(stack: ExitStack, guard: Guard) -> TorchStreams:
     torch: Any = sys.modules["torch"]
     generator = torch.default_generator
     stack.callback(generator.set_state, generator.get_state())
-    exchange(stack, torch._C.Generator, "seed", _seeding)
+    replace_member(stack, torch._C.Generator, "seed", _seeding)
     return TorchStreams(generator, guard.streams.seed)
 
 
 # ``torch.compile`` reads the running code, and would follow the guard's calls and fail at sets of
 # strings. In a graph, sets are in Python's order, which is the same in all pinned processes.
 
-COMPILES = "torch._dynamo"
+TORCH_COMPILER = "torch._dynamo"
 """The module of torch that reads code."""
 
 
@@ -110,7 +110,7 @@ _known: list[object] = []
 
 def plain_in_graphs() -> None:
     """Let torch's compiler, which is loaded, see plain Python where modules call the guard."""
-    substitute = getattr(sys.modules[COMPILES], "substitute_in_graph", None)
+    substitute = getattr(sys.modules[TORCH_COMPILER], "substitute_in_graph", None)
     if substitute is None or substitute in _known:
         return  # another version of torch, or done already
     _known.append(substitute)
@@ -122,13 +122,13 @@ def plain_in_graphs() -> None:
 # run that cache is neither read nor written, so that plain pytest does not find the guard's calls
 # in it.
 
-REWRITES = "_pytest.assertion.rewrite"
+PYTEST_REWRITER = "_pytest.assertion.rewrite"
 """The module of pytest that compiles test modules."""
 
 
-def rewritten_in_pytest(stack: ExitStack) -> None:
+def rewrite_in_pytest(stack: ExitStack) -> None:
     """Put the guard's calls into what pytest compiles from now on, until ``stack`` ends."""
-    module: Any = sys.modules[REWRITES]
+    module: Any = sys.modules[PYTEST_REWRITER]
     names = ("rewrite_asserts", "_read_pyc", "_write_pyc")
     if not all(hasattr(module, name) for name in names):
         return  # another version of pytest

@@ -18,7 +18,7 @@ from typing import Any
 
 from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
-from rsltrace.guard.callers import is_installed, is_own, is_user_file
+from rsltrace.guard.callers import is_installed, is_rsltrace_module, is_user_file
 from rsltrace.guard.libraries import importing, is_library
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.original_code import keep_source
@@ -158,7 +158,7 @@ class _ModuleFinder:
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         """Return a module's spec, with its own loader unless it is one of Python's or ROS's."""
-        if name in sys.builtin_module_names or is_own(name):
+        if name in sys.builtin_module_names or is_rsltrace_module(name):
             return None
         spec = self._found_otherwise(name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:

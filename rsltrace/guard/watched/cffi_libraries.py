@@ -11,7 +11,7 @@ from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.rules import C_FUNCTIONS
 
-LOADS_LIBRARIES = "cffi.api"
+CFFI_LOADER = "cffi.api"
 """The module of cffi that opens libraries (``ffi.dlopen``)."""
 
 
@@ -33,9 +33,9 @@ class _Library:
         return self._real.load_function(kind, name)
 
 
-def watched_libraries(stack: ExitStack) -> None:
+def report_cffi_functions(stack: ExitStack) -> None:
     """Report functions of libraries that nodes open from now on, until ``stack`` ends."""
-    module = sys.modules[LOADS_LIBRARIES]
+    module = sys.modules[CFFI_LOADER]
     real = getattr(module, "_load_backend_lib", None)
     if real is not None:
         replace_attribute(stack, module, "_load_backend_lib", lambda *given: _Library(real(*given)))

@@ -10,7 +10,13 @@ from pydantic import BeforeValidator, Field
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.values.checks import attach, check, flag, items, text
 from rsltrace.job.values.problem import JobProblem, as_flag, describe
-from rsltrace.trace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
+from rsltrace.trace.model.finding import (
+    DEFAULT_MODES,
+    MODES,
+    GuardMode,
+    GuardPolicy,
+    NondeterminismSource,
+)
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
 
@@ -40,7 +46,7 @@ class SourceSpec(JobPart):
         def __init__(self, *, mode: ModeName | None = None, allow: Sequence[str] = ()) -> None: ...
 
 
-def _source(source: Source) -> BeforeValidator:
+def _source(source: NondeterminismSource) -> BeforeValidator:
     """Prepare one source: its mode as plain text, or a mapping with its mode and exemptions."""
     valid = [mode.value for mode in MODES[source]]
 
@@ -48,9 +54,9 @@ def _source(source: Source) -> BeforeValidator:
         given = value.get("mode") if isinstance(value, dict) else getattr(value, "mode", value)
         if given is not None and given not in valid:
             hint = ""
-            if given in list(Mode):
+            if given in list(GuardMode):
                 hint = f"; the answers of this source cannot be made {given!r}"
-                if given == Mode.RECORD:
+                if given == GuardMode.RECORD:
                     hint = "; what this source answers cannot be recorded"
             place = ("mode",) if isinstance(value, dict) else ()
             raise JobProblem(
@@ -69,7 +75,7 @@ def _source(source: Source) -> BeforeValidator:
     return check(mode_alone, optional=True)
 
 
-def _about(source: Source, what: str) -> Any:
+def _about(source: NondeterminismSource, what: str) -> Any:
     default = DEFAULT_MODES[source].value
     return Field(
         default=None,
@@ -112,36 +118,40 @@ class GuardSpec(JobPart):
         "attributes.",
         examples=[True, "record"],
     )
-    clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = _about(
-        Source.CLOCK, "Wall clocks: `time.time`, `datetime.now` and the like."
+    clock: Annotated[SourceSpec | None, _source(NondeterminismSource.CLOCK)] = _about(
+        NondeterminismSource.CLOCK, "Wall clocks: `time.time`, `datetime.now` and the like."
     )
-    random: Annotated[SourceSpec | None, _source(Source.RANDOM)] = _about(
-        Source.RANDOM, "Random numbers: `random`, `numpy.random`, `os.urandom`, `uuid4`, `secrets`."
+    random: Annotated[SourceSpec | None, _source(NondeterminismSource.RANDOM)] = _about(
+        NondeterminismSource.RANDOM,
+        "Random numbers: `random`, `numpy.random`, `os.urandom`, `uuid4`, `secrets`.",
     )
-    directory: Annotated[SourceSpec | None, _source(Source.DIRECTORY)] = _about(
-        Source.DIRECTORY, "The order of directory listings."
+    directory: Annotated[SourceSpec | None, _source(NondeterminismSource.DIRECTORY)] = _about(
+        NondeterminismSource.DIRECTORY, "The order of directory listings."
     )
-    file: Annotated[SourceSpec | None, _source(Source.FILE)] = _about(
-        Source.FILE, "What files hold."
+    file: Annotated[SourceSpec | None, _source(NondeterminismSource.FILE)] = _about(
+        NondeterminismSource.FILE, "What files hold."
     )
-    environment: Annotated[SourceSpec | None, _source(Source.ENVIRONMENT)] = _about(
-        Source.ENVIRONMENT, "Environment variables."
+    environment: Annotated[SourceSpec | None, _source(NondeterminismSource.ENVIRONMENT)] = _about(
+        NondeterminismSource.ENVIRONMENT, "Environment variables."
     )
-    pid: Annotated[SourceSpec | None, _source(Source.PID)] = _about(
-        Source.PID, "The process id (`os.getpid`): by default each main has a number of its own."
+    pid: Annotated[SourceSpec | None, _source(NondeterminismSource.PID)] = _about(
+        NondeterminismSource.PID,
+        "The process id (`os.getpid`): by default each main has a number of its own.",
     )
-    thread: Annotated[SourceSpec | None, _source(Source.THREAD)] = _about(
-        Source.THREAD, "Threads that are started."
+    thread: Annotated[SourceSpec | None, _source(NondeterminismSource.THREAD)] = _about(
+        NondeterminismSource.THREAD, "Threads that are started."
     )
-    process: Annotated[SourceSpec | None, _source(Source.PROCESS)] = _about(
-        Source.PROCESS, "Processes that are started."
+    process: Annotated[SourceSpec | None, _source(NondeterminismSource.PROCESS)] = _about(
+        NondeterminismSource.PROCESS, "Processes that are started."
     )
-    socket: Annotated[SourceSpec | None, _source(Source.SOCKET)] = _about(Source.SOCKET, "Sockets.")
-    address: Annotated[SourceSpec | None, _source(Source.ADDRESS)] = _about(
-        Source.ADDRESS, "Addresses of objects: `id`, the default `hash` and `repr`."
+    socket: Annotated[SourceSpec | None, _source(NondeterminismSource.SOCKET)] = _about(
+        NondeterminismSource.SOCKET, "Sockets."
     )
-    order: Annotated[SourceSpec | None, _source(Source.ORDER)] = _about(
-        Source.ORDER, "The order of sets, which depends on hash seeds."
+    address: Annotated[SourceSpec | None, _source(NondeterminismSource.ADDRESS)] = _about(
+        NondeterminismSource.ADDRESS, "Addresses of objects: `id`, the default `hash` and `repr`."
+    )
+    order: Annotated[SourceSpec | None, _source(NondeterminismSource.ORDER)] = _about(
+        NondeterminismSource.ORDER, "The order of sets, which depends on hash seeds."
     )
 
     if TYPE_CHECKING:
@@ -197,20 +207,20 @@ def resolved_guard(*guards: GuardSpec) -> dict[str, Any]:
     }
 
 
-def policy_of(*guards: GuardSpec) -> Policy:
+def policy_of(*guards: GuardSpec) -> GuardPolicy:
     """Return what is done in the end, where a later ``guard:`` overrides an earlier one."""
     modes = dict(DEFAULT_MODES)
-    allowed: dict[Source, tuple[str, ...]] = {}
+    allowed: dict[NondeterminismSource, tuple[str, ...]] = {}
     state = ""
     for guard in guards:
         if not guard.enabled:
-            modes = dict.fromkeys(Source, Mode.ALLOW)
+            modes = dict.fromkeys(NondeterminismSource, GuardMode.ALLOW)
         if guard.state is not None:
             state = "record" if guard.state == "record" else "true" if guard.state else ""
-        for source in Source:
+        for source in NondeterminismSource:
             spec: SourceSpec | None = getattr(guard, source.value)
             if spec is not None:
                 if spec.mode is not None:
-                    modes[source] = Mode(spec.mode)
+                    modes[source] = GuardMode(spec.mode)
                 allowed[source] = allowed.get(source, ()) + spec.allow
-    return Policy(modes, allowed, state)
+    return GuardPolicy(modes, allowed, state)

@@ -21,7 +21,7 @@ from rsltrace.job.parts.keys import shorthand_at, without_alternatives
 from rsltrace.job.parts.part import JobPart
 from rsltrace.job.reading.override import apply_override
 from rsltrace.job.reading.substitute import JobSubstitution
-from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource
+from rsltrace.job.reading.yaml_source import SourcePlace, TextPosition, YamlSource, YamlValue
 from rsltrace.job.values.checks import attach, check, check_names, is_plain, items, text
 from rsltrace.job.values.mappings import check_path, near_path
 from rsltrace.job.values.names import check_variable
@@ -92,7 +92,7 @@ class CompositionKeys(JobPart):
 class ComposedJob:
     """A job put together: its values, its own file, and from what else it was made."""
 
-    root: Item
+    root: YamlValue
     source: YamlSource
     others: list[str] = field(default_factory=list)
     overrides: list[str] = field(default_factory=list)
@@ -134,7 +134,7 @@ def compose(
     return composed
 
 
-def _root(source: YamlSource, name: str) -> Item:
+def _root(source: YamlSource, name: str) -> YamlValue:
     root = source.root
     if root is None or root.value is None:
         raise JobError("the job file is empty: it needs at least 'nodes:' or 'bags:'", where=name)
@@ -144,13 +144,13 @@ def _root(source: YamlSource, name: str) -> Item:
 
 
 def _with_others(
-    root: Item,
+    root: YamlValue,
     name: str,
     read: Callable[[str], YamlSource],
     early: JobSubstitution,
     outer: list[str],
     composed: ComposedJob,
-) -> Item:
+) -> YamlValue:
     """Return the values of a file with those of its base and included files below them."""
     outer = [*outer, os.path.realpath(name)]
     values = dict(root.value)
@@ -173,15 +173,15 @@ def _with_others(
 
 
 def _other(
-    root: Item,
+    root: YamlValue,
     name: str,
     read: Callable[[str], YamlSource],
     early: JobSubstitution,
     outer: list[str],
     composed: ComposedJob,
-    item: Item,
+    item: YamlValue,
     role: str,
-) -> Item:
+) -> YamlValue:
     """Return the values of a file that ``item`` of the file ``name`` refers to."""
     if not isinstance(item.value, str):
         raise item.place.error(f"{role}: expected a path, got {describe(item.value)}")
@@ -211,11 +211,11 @@ def _other(
     return _with_search_path(_with_others(other, shown, read, early, outer, composed))
 
 
-def _search_path(root: Item, substitution: JobSubstitution) -> list[Path]:
+def _search_path(root: YamlValue, substitution: JobSubstitution) -> list[Path]:
     """Return the folders of a job's ``search_path``, or the folder of its file."""
     listed = root.value.get("search_path")
     items = listed.value if listed is not None and isinstance(listed.value, list) else [listed]
-    written = [item if item is not None else Item(".", root.place) for item in items]
+    written = [item if item is not None else YamlValue(".", root.place) for item in items]
     found = [substitution.tree(item) for item in written]
     return [
         Path(item.place.source.folder or os.getcwd(), item.value)
@@ -224,17 +224,19 @@ def _search_path(root: Item, substitution: JobSubstitution) -> list[Path]:
     ]
 
 
-def _with_search_path(root: Item) -> Item:
+def _with_search_path(root: YamlValue) -> YamlValue:
     """Give a file without ``search_path`` its own folder, where its modules are."""
     if "search_path" in root.value:
         return root
-    place = Place(root.place.source, Mark(1, 1))
-    return replace(root, value={**root.value, "search_path": Item([Item(".", place)], place)})
+    place = SourcePlace(root.place.source, TextPosition(1, 1))
+    return replace(
+        root, value={**root.value, "search_path": YamlValue([YamlValue(".", place)], place)}
+    )
 
 
 def merge(
-    under: Item, over: Item, *, add_up: bool = False, strict: bool = True, loc: Loc = ()
-) -> Item:
+    under: YamlValue, over: YamlValue, *, add_up: bool = False, strict: bool = True, loc: Loc = ()
+) -> YamlValue:
     """Return ``under`` with ``over`` laid over it.
 
     Mappings are merged by key, and null takes a key away. Of keys that exclude each other (the
@@ -272,7 +274,9 @@ def merge(
     return over
 
 
-def _merged_nodes(under: list[Item], over: list[Item], *, add_up: bool, strict: bool) -> list[Item]:
+def _merged_nodes(
+    under: list[YamlValue], over: list[YamlValue], *, add_up: bool, strict: bool
+) -> list[YamlValue]:
     nodes = list(under)
     for item in over:
         name, space = _scalar_at(item, "name"), _scalar_at(item, "namespace")
@@ -300,9 +304,9 @@ def _merged_nodes(under: list[Item], over: list[Item], *, add_up: bool, strict: 
     return nodes
 
 
-def _flat(values: dict[Any, Item], prefix: str = "") -> dict[Any, Item]:
+def _flat(values: dict[Any, YamlValue], prefix: str = "") -> dict[Any, YamlValue]:
     """Return parameters under dotted names, so that both ways of writing them meet."""
-    flat: dict[Any, Item] = {}
+    flat: dict[Any, YamlValue] = {}
     for key, item in values.items():
         if not isinstance(key, str):
             flat[key] = item
@@ -313,10 +317,10 @@ def _flat(values: dict[Any, Item], prefix: str = "") -> dict[Any, Item]:
     return flat
 
 
-def _scalar_at(item: Item, key: str) -> object:
+def _scalar_at(item: YamlValue, key: str) -> object:
     inner = item.value.get(key) if _is_mapping(item) else None
     return None if inner is None or isinstance(inner.value, (dict, list)) else inner.value
 
 
-def _is_mapping(item: Item | None) -> bool:
+def _is_mapping(item: YamlValue | None) -> bool:
     return item is not None and isinstance(item.value, dict)

@@ -14,7 +14,7 @@ from typing import TypeVar
 from rsltrace.errors import JobError
 from rsltrace.job.parts.delay import DelaySpec
 from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec, check_series, check_short
-from rsltrace.job.reading.yaml_source import Mark, YamlSource
+from rsltrace.job.reading.yaml_source import TextPosition, YamlSource
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_measured
 from rsltrace.simulation.chance.distribution import LONGEST_NS
@@ -157,7 +157,7 @@ def _rows(
             if not is_header:
                 yield number, row(bare)
         except (ValueError, JobError) as error:
-            raise source.error(str(error), Mark(number, line.index(bare[0]) + 1)) from None
+            raise source.error(str(error), TextPosition(number, line.index(bare[0]) + 1)) from None
 
 
 def _text(path: Path, name: str) -> str:

@@ -16,7 +16,13 @@ from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import file_fields, keys_with
 from rsltrace.job.parts.part import worded_problems
 from rsltrace.job.reading.compose import CompositionKeys, compose
-from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
+from rsltrace.job.reading.yaml_source import (
+    SourcePlace,
+    TextPosition,
+    YamlSource,
+    YamlValue,
+    parse_yaml,
+)
 from rsltrace.job.values.checks import FROM_FILE
 from rsltrace.job.values.mappings import TextWithFolder
 from rsltrace.job.values.problem import JobProblem, Loc, format_loc, unknown_key
@@ -28,7 +34,7 @@ from rsltrace.trace.model.regular_file import read_regular
 # with the result must be shown where it was written.
 
 
-def item_at(root: Item, loc: Loc) -> tuple[Item, int]:
+def item_at(root: YamlValue, loc: Loc) -> tuple[YamlValue, int]:
     """Return the item at ``loc`` or the nearest one around it, and how many steps it is away."""
     item = root
     for depth, part in enumerate(loc):
@@ -39,7 +45,7 @@ def item_at(root: Item, loc: Loc) -> tuple[Item, int]:
     return item, 0
 
 
-def place_at(root: Item, loc: Loc, *, at_key: bool = False) -> Place:
+def place_at(root: YamlValue, loc: Loc, *, at_key: bool = False) -> SourcePlace:
     """Return where the value (or the key) at ``loc`` stands, or the nearest value around it."""
     item, missing = item_at(root, loc)
     if at_key and not missing and item.key_place is not None:
@@ -47,7 +53,7 @@ def place_at(root: Item, loc: Loc, *, at_key: bool = False) -> Place:
     return item.place
 
 
-def plain(item: Item, base_dir: str) -> object:
+def plain(item: YamlValue, base_dir: str) -> object:
     """Return the values alone; text from other folders than ``base_dir`` remembers its own."""
     value = item.value
     if isinstance(value, dict):
@@ -61,7 +67,7 @@ def plain(item: Item, base_dir: str) -> object:
     return value
 
 
-def _child(item: Item, part: str | int) -> Item | None:
+def _child(item: YamlValue, part: str | int) -> YamlValue | None:
     value = item.value
     if isinstance(value, list):
         found = value[part : part + 1] if isinstance(part, int) and part >= 0 else []
@@ -216,20 +222,20 @@ def _read(path: Path) -> str:
         if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             raise JobError("this is UTF-16; save the file as UTF-8 text", where=name) from None
         good = data[: error.start].decode("utf-8-sig", "replace")
-        mark = Mark(good.count("\n") + 1, len(good) - good.rfind("\n"))
+        mark = TextPosition(good.count("\n") + 1, len(good) - good.rfind("\n"))
         raise YamlSource(name, data.decode("utf-8-sig", "replace")).error(
             f"not UTF-8: byte 0x{data[error.start]:02x}; save the file as UTF-8 text", mark
         ) from None
 
 
-def _job_error(root: Item, problems: list[JobProblem]) -> JobError:
+def _job_error(root: YamlValue, problems: list[JobProblem]) -> JobError:
     """Return one error that tells all problems: the first file's first, each in its order."""
     found = [(place_at(root, p.loc, at_key=p.at_key), p.message) for p in problems]
     names = list(
         dict.fromkeys([root.place.source.name, *(place.source.name for place, _ in found)])
     )
 
-    def order(entry: tuple[Place, str]) -> tuple[int, int, int]:
+    def order(entry: tuple[SourcePlace, str]) -> tuple[int, int, int]:
         place = entry[0]
         return names.index(place.source.name), place.mark.line, place.mark.column
 
@@ -267,7 +273,7 @@ def showing_line(job: Job, loc: tuple[str | int, ...]) -> Iterator[None]:
         raise place.error(message) from error.__cause__
 
 
-def _place(job: Job, loc: tuple[str | int, ...]) -> Place | None:
+def _place(job: Job, loc: tuple[str | int, ...]) -> SourcePlace | None:
     if job.composed is not None:
         return place_at(job.composed.root, loc)
     if job.given_text is None:
@@ -276,7 +282,7 @@ def _place(job: Job, loc: tuple[str | int, ...]) -> Place | None:
 
 
 @lru_cache(maxsize=1)
-def _root_of(text: str, name: str) -> Item:
+def _root_of(text: str, name: str) -> YamlValue:
     """Return the values of a job's text; every entry of a job asks for its place in it."""
     root = parse_yaml(text, name).root
     assert root is not None, "the text has been a job"

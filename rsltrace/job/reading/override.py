@@ -13,7 +13,13 @@ from typing import Any
 from rsltrace.errors import did_you_mean
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import is_list_at, shorthand_at, without_alternatives
-from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
+from rsltrace.job.reading.yaml_source import (
+    SourcePlace,
+    TextPosition,
+    YamlSource,
+    YamlValue,
+    parse_yaml,
+)
 from rsltrace.job.values.checks import is_plain
 from rsltrace.job.values.problem import Loc, describe
 
@@ -26,11 +32,11 @@ class _PathStep:
     """One part of a path, where it stands, and how it was written."""
 
     text: str
-    place: Place
+    place: SourcePlace
     quoted: bool
 
 
-def apply_override(root: Item, label: str, override: str, *, folder: str) -> Item:
+def apply_override(root: YamlValue, label: str, override: str, *, folder: str) -> YamlValue:
     """Return the job with ``override`` (``path=value``) applied; ``label`` names it in messages.
 
     The value is YAML; null takes the key away. List entries are given by index, by
@@ -44,11 +50,13 @@ def apply_override(root: Item, label: str, override: str, *, folder: str) -> Ite
         )
     if not override[at:].strip():
         # A shell variable without a value must not take a stop condition away.
-        raise shown.error("there is no value after '=': null takes the key away", Mark(1, at))
+        raise shown.error(
+            "there is no value after '=': null takes the key away", TextPosition(1, at)
+        )
     source = parse_yaml(override[at:], label, folder=folder, option=override)
-    value = source.root or Item(None, steps[-1].place)
+    value = source.root or YamlValue(None, steps[-1].place)
     if value.value is None:
-        value = Item(None, steps[-1].place)
+        value = YamlValue(None, steps[-1].place)
     return _set(root, steps, value, ())
 
 
@@ -90,15 +98,15 @@ def _steps(source: YamlSource) -> tuple[list[_PathStep], int]:
             break
     if not steps or text[at : at + 1] != "=" or text[at - 1 : at] == ".":
         example = "--set stop.duration=10s, --set nodes.0.parameters.rate=20.0"
-        raise source.error(f"expected key=value, as in {example}", Mark(1, at + 1))
+        raise source.error(f"expected key=value, as in {example}", TextPosition(1, at + 1))
     return steps, at + 1
 
 
-def _place(source: YamlSource, at: int) -> Place:
-    return Place(source, Mark(1, at + 1))
+def _place(source: YamlSource, at: int) -> SourcePlace:
+    return SourcePlace(source, TextPosition(1, at + 1))
 
 
-def _set(item: Item | None, steps: list[_PathStep], value: Item, loc: Loc) -> Item:
+def _set(item: YamlValue | None, steps: list[_PathStep], value: YamlValue, loc: Loc) -> YamlValue:
     """Return ``item`` with the value at the end of the path replaced."""
     if not steps:
         return value
@@ -108,7 +116,7 @@ def _set(item: Item | None, steps: list[_PathStep], value: Item, loc: Loc) -> It
         if not step.quoted and step.text.isdecimal() and is_list_at(Job, loc):
             name = ".".join(map(str, loc))
             raise step.place.error(f"{name} has no entries yet: write {name}.+ for a new one")
-        item = Item([] if starts_list else {}, step.place, step.place)
+        item = YamlValue([] if starts_list else {}, step.place, step.place)
     inner: Any = item.value
     if is_plain(inner) and (key := shorthand_at(Job, loc)) is not None:
         inner = {key: replace(item, key_place=item.place)}
@@ -132,7 +140,7 @@ def _set(item: Item | None, steps: list[_PathStep], value: Item, loc: Loc) -> It
     return replace(item, value=values)
 
 
-def _key(values: dict[Any, Item], steps: list[_PathStep]) -> tuple[str, int]:
+def _key(values: dict[Any, YamlValue], steps: list[_PathStep]) -> tuple[str, int]:
     """Return the key that a path goes on with: parameters may have dots in their names."""
     for used in range(len(steps), 1, -1):
         name = ".".join(step.text for step in steps[:used])
@@ -141,7 +149,9 @@ def _key(values: dict[Any, Item], steps: list[_PathStep]) -> tuple[str, int]:
     return steps[0].text, 1
 
 
-def _set_in_list(items: list[Item], steps: list[_PathStep], value: Item, loc: Loc) -> list[Item]:
+def _set_in_list(
+    items: list[YamlValue], steps: list[_PathStep], value: YamlValue, loc: Loc
+) -> list[YamlValue]:
     step, name = steps[0], ".".join(map(str, loc))
     if step.text == _APPEND and not step.quoted:
         return [*items, _set(None, steps[1:], value, (*loc, len(items)))]
@@ -152,7 +162,7 @@ def _set_in_list(items: list[Item], steps: list[_PathStep], value: Item, loc: Lo
     return [*items[:index], new, *items[index + 1 :]]
 
 
-def _index(items: list[Item], step: _PathStep, name: str) -> int:
+def _index(items: list[YamlValue], step: _PathStep, name: str) -> int:
     if step.text.isdecimal() and not step.quoted:
         if int(step.text) < len(items):
             return int(step.text)
@@ -173,7 +183,7 @@ def _index(items: list[Item], step: _PathStep, name: str) -> int:
     raise step.place.error(f"{name} has no entry {step.text!r}: {hint}")
 
 
-def _names(item: Item) -> list[str]:
+def _names(item: YamlValue) -> list[str]:
     """Return what an entry may be called: its name, else its class, or the end of its path."""
     if isinstance(item.value, str):
         return [item.value.rstrip("/").rpartition("/")[2]]

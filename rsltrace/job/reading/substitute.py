@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean, nearest
-from rsltrace.job.reading.yaml_source import Item, Mark, Place, bare_value
+from rsltrace.job.reading.yaml_source import SourcePlace, TextPosition, YamlValue, bare_value
 
 SUBSTITUTIONS = {
     "env": "env NAME [default]",
@@ -40,7 +40,7 @@ class JobSubstitution:
 
     def __init__(
         self,
-        variables: Mapping[object, Item] | None,
+        variables: Mapping[object, YamlValue] | None,
         folders: Callable[[], Iterable[Path]] = lambda: (),
     ) -> None:
         self._variables = variables
@@ -48,7 +48,7 @@ class JobSubstitution:
         self._open: list[str] = []
         self.used = False
 
-    def tree(self, item: Item) -> Item:
+    def tree(self, item: YamlValue) -> YamlValue:
         """Return ``item`` with every text in it replaced. Raises ``JobError`` at the place."""
         value = item.value
         if isinstance(value, dict):
@@ -61,7 +61,7 @@ class JobSubstitution:
         text = self._text(value, item)
         return replace(item, value=bare_value(text) if item.is_bare else text)
 
-    def _text(self, text: str, item: Item) -> str:
+    def _text(self, text: str, item: YamlValue) -> str:
         done, at = "", 0
         while (start := text.find("$(", at)) >= 0:
             if start and text[start - 1] == "\\":
@@ -79,7 +79,7 @@ class JobSubstitution:
             at = end + 1
         return done + text[at:]
 
-    def _one(self, written: str, inner: str, item: Item) -> str:
+    def _one(self, written: str, inner: str, item: YamlValue) -> str:
         try:
             name, *arguments = shlex.split(inner) or [""]
         except ValueError:
@@ -99,7 +99,7 @@ class JobSubstitution:
             return self._var(written, item, arguments[0])
         return self._of_package(written, item, arguments[0], shared=name == "find-pkg-share")
 
-    def _of_package(self, written: str, item: Item, package: str, *, shared: bool) -> str:
+    def _of_package(self, written: str, item: YamlValue, package: str, *, shared: bool) -> str:
         """Return the share of a package (of one that is not built: its folder), or its prefix."""
         prefix = package_prefix(package)
         if prefix is not None:
@@ -125,7 +125,7 @@ class JobSubstitution:
             )
         return str(sources[package].folder)
 
-    def _env(self, written: str, item: Item, name: str, default: str | None = None) -> str:
+    def _env(self, written: str, item: YamlValue, name: str, default: str | None = None) -> str:
         value = os.environ.get(name, default)
         if value is None:
             close = difflib.get_close_matches(name, sorted(os.environ), n=1, cutoff=0.8)
@@ -138,7 +138,7 @@ class JobSubstitution:
             )
         return value
 
-    def _var(self, written: str, item: Item, name: str) -> str:
+    def _var(self, written: str, item: YamlValue, name: str) -> str:
         if self._variables is None:
             raise _error(item, written, "'base:' and 'include:' come before 'vars:'; use $(env …)")
         found = self._variables.get(name)
@@ -188,7 +188,7 @@ def _many(arguments: list[str]) -> str:
     return ": quote a default with blanks in it" if len(arguments) > 2 else ""
 
 
-def _error(item: Item, written: str, message: str) -> JobError:
+def _error(item: YamlValue, written: str, message: str) -> JobError:
     """Return an error at ``written`` within the text of ``item``, if it is found there."""
     place = item.place
     lines = place.source.text.splitlines()
@@ -196,7 +196,7 @@ def _error(item: Item, written: str, message: str) -> JobError:
     if mark.line <= len(lines):
         column = lines[mark.line - 1].find(written, mark.column - 1)
         if column >= 0:
-            place = Place(place.source, Mark(mark.line, column + 1))
+            place = SourcePlace(place.source, TextPosition(mark.line, column + 1))
     return place.error(message)
 
 

@@ -34,7 +34,7 @@ _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 
 
 @dataclass(frozen=True)
-class Mark:
+class TextPosition:
     """A place in the file; line and column count from 1."""
 
     line: int
@@ -52,18 +52,18 @@ class YamlSource:
     text: str
     folder: str | None = None
     is_option: bool = False
-    root: Item | None = None
+    root: YamlValue | None = None
 
     @property
     def value(self) -> object:
         """All values, without their places."""
         return None if self.root is None else self.root.plain()
 
-    def where(self, mark: Mark) -> str:
+    def where(self, mark: TextPosition) -> str:
         """Return ``file:line:column``; an option is short enough to do without."""
         return self.name if self.is_option else f"{self.name}:{mark.line}:{mark.column}"
 
-    def excerpt(self, mark: Mark) -> str:
+    def excerpt(self, mark: TextPosition) -> str:
         """Return the line of ``mark`` with a caret below the column, or nothing past the end."""
         lines = _LINE_BREAK.split(self.text)
         line = lines[mark.line - 1] if mark.line <= len(lines) else ""
@@ -78,17 +78,17 @@ class YamlSource:
         gutter = "      | " if self.is_option else f"{mark.line:>5} | "
         return f"\n{gutter}{shown.rstrip()}\n{' ' * (len(gutter) - 2)}| {before}^"
 
-    def error(self, message: str, mark: Mark) -> JobError:
+    def error(self, message: str, mark: TextPosition) -> JobError:
         """Return the error that ``message`` is wrong at ``mark``."""
         return JobError(f"{message}{self.excerpt(mark)}", where=self.where(mark))
 
 
 @dataclass(frozen=True)
-class Place:
+class SourcePlace:
     """A mark in one of the files a job is made of."""
 
     source: YamlSource
-    mark: Mark
+    mark: TextPosition
 
     def error(self, message: str) -> JobError:
         """Return the error that ``message`` is wrong here."""
@@ -96,7 +96,7 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Item:
+class YamlValue:
     """A value with its place: a scalar, or a list or mapping of items.
 
     ``key_place`` is where its key stands, if it has one. ``is_bare`` tells text without quotes,
@@ -104,8 +104,8 @@ class Item:
     """
 
     value: Any
-    place: Place
-    key_place: Place | None = None
+    place: SourcePlace
+    key_place: SourcePlace | None = None
     is_bare: bool = False
 
     def plain(self) -> object:
@@ -173,9 +173,9 @@ class _YamlValueBuilder:
         self.repeated = 0
         self.seen: set[int] = set()
 
-    def build(self, node: Node, key: Node | None = None) -> Item:
-        place = Place(self.source, _mark(node))
-        key_place = None if key is None else Place(self.source, _mark(key))
+    def build(self, node: Node, key: Node | None = None) -> YamlValue:
+        place = SourcePlace(self.source, _mark(node))
+        key_place = None if key is None else SourcePlace(self.source, _mark(key))
         self.count += 1
         if self.count > VALUES_MAX:
             raise place.error(f"more than {VALUES_MAX} values")
@@ -187,7 +187,7 @@ class _YamlValueBuilder:
                 # The mark of a value that is not there lies wherever the next token begins.
                 place = key_place
             value = self._scalar(node)
-            return Item(value, place, key_place, is_bare=node.style is None)
+            return YamlValue(value, place, key_place, is_bare=node.style is None)
         if id(node) in self.open:
             raise place.error("an alias refers to a value that contains it")
         self.open.add(id(node))
@@ -200,7 +200,7 @@ class _YamlValueBuilder:
         else:
             raise self._unknown_tag(node)
         self.open.discard(id(node))
-        return Item(inner, place, key_place)
+        return YamlValue(inner, place, key_place)
 
     def _repeat(self, node: Node) -> None:
         self.repeated += 1
@@ -278,13 +278,13 @@ def _is_written(node: ScalarNode) -> bool:
     return bool(node.value) or node.style is not None
 
 
-def _mark(node: Any) -> Mark:
-    return Mark(node.start_mark.line + 1, node.start_mark.column + 1)
+def _mark(node: Any) -> TextPosition:
+    return TextPosition(node.start_mark.line + 1, node.start_mark.column + 1)
 
 
-def _mark_at(text: str, position: int) -> Mark:
+def _mark_at(text: str, position: int) -> TextPosition:
     lines = _LINE_BREAK.split(text[:position])
-    return Mark(len(lines), len(lines[-1]) + 1)
+    return TextPosition(len(lines), len(lines[-1]) + 1)
 
 
 _ADVICE = {
@@ -309,7 +309,7 @@ _WHERE_IT_BEGAN = ("expected ',' or", "could not find expected ':'")
 
 def _syntax_error(source: YamlSource, error: Any) -> JobError:
     began, place = error.context_mark, error.problem_mark or error.context_mark
-    mark = Mark(place.line + 1, place.column + 1) if place else Mark(1, 1)
+    mark = TextPosition(place.line + 1, place.column + 1) if place else TextPosition(1, 1)
     problem = str(error.problem or error.context)
     glued = _glued_dash(source, began.line, mark.line) if began else None
     if glued is not None and problem.startswith("expected <block end>"):
@@ -317,7 +317,7 @@ def _syntax_error(source: YamlSource, error: Any) -> JobError:
     advice = next((text for start, text in _ADVICE.items() if problem.startswith(start)), None)
     message = problem
     if error.context and began and began.line + 1 < mark.line:
-        first = Mark(began.line + 1, began.column + 1)
+        first = TextPosition(began.line + 1, began.column + 1)
         if problem.startswith(_WHERE_IT_BEGAN):
             message += f" in line {mark.line}, {error.context} that begins here"
             mark = first
@@ -332,12 +332,12 @@ def _syntax_error(source: YamlSource, error: Any) -> JobError:
     )
 
 
-def _glued_dash(source: YamlSource, first: int, last: int) -> Mark | None:
+def _glued_dash(source: YamlSource, first: int, last: int) -> TextPosition | None:
     """Return the place of a list entry without the blank: ``-node: x`` (lines count from 0)."""
     for number, line in enumerate(_LINE_BREAK.split(source.text)[first:last], first + 1):
         found = re.match(r"\s*-[^\s-]+:", line)
         if found:
-            return Mark(number, line.index("-") + 1)
+            return TextPosition(number, line.index("-") + 1)
     return None
 
 

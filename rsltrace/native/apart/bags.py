@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 from rsltrace.job import Job
 from rsltrace.native.apart.plans import THE_BAGS
@@ -21,7 +21,7 @@ from rsltrace.run.plans.bags import (
     open_bag_of,
     qos_override,
     qos_values,
-    start_ns_of,
+    run_start_ns,
     with_progress,
 )
 from rsltrace.trace.recordings.playback import Playback
@@ -33,14 +33,14 @@ _SETTLED_WITHIN_S = 5.0
 _Played = Iterator[tuple[int, Any, bytes]]
 
 
-def player(job: Job, stack: ExitStack) -> Entry:
+def player(job: Job, stack: ExitStack) -> JobEntry:
     """Return the main that plays the bags of a job, which are open as long as ``stack`` is.
 
     :raises BagError: a bag cannot be read, or a type of it is not installed.
     """
     bags = [stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))]
     check_bag_types(job, bags)
-    return Entry(THE_BAGS, partial(_play, job, bags), [], argv=[PLAYER])
+    return JobEntry(THE_BAGS, partial(_play, job, bags), [], argv=[PLAYER])
 
 
 def _play(job: Job, bags: list[BagInput]) -> None:
@@ -68,7 +68,7 @@ def _play(job: Job, bags: list[BagInput]) -> None:
         publishers[job.progress, ""] = told
         merged = with_progress(merged, told, bags)
     _wait_for_listeners(list(publishers.values()))
-    _publish(merged, start_ns_of(job, bags))
+    _publish(merged, run_start_ns(job, bags))
     node.destroy_node()
     rclpy.try_shutdown()
 

@@ -22,10 +22,10 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.callback_errors import exit_status
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.errors import JobError, RsltraceError
 from rsltrace.native.apart.observers import ProcessObservers, SpanSender
-from rsltrace.native.apart.wire import Link, LinkError, Order
+from rsltrace.native.apart.wire import EntryOrder, Link, LinkError
 from rsltrace.native.callback_observer import failure_of
 from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.native.priorities import Priorities
@@ -35,7 +35,7 @@ from rsltrace.native.span_recorder import RunningCallback
 from rsltrace.run.plans.entries import node_entries
 from rsltrace.run.process import search_path
 from rsltrace.run.provenance import source_files
-from rsltrace.simulation.middleware.events.failure import text_of, user_traceback
+from rsltrace.simulation.middleware.events.failure import exception_text, user_traceback
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
@@ -45,7 +45,7 @@ from rsltrace.trace.model.event import EventKind
 class RunningMain:
     """Runs the main of an entry. What it does between its callbacks is its own events."""
 
-    def __init__(self, entry: Entry, observers: ProcessObservers, *, echo: bool) -> None:
+    def __init__(self, entry: JobEntry, observers: ProcessObservers, *, echo: bool) -> None:
         self._entry = entry
         self._observers = observers
         self._words = [word for part in entry.arguments[:1] for word in part.arguments]
@@ -136,7 +136,7 @@ def main(number: int) -> None:
         os._exit(2)
     if frame is None:
         os._exit(1)
-    order: Order = frame[0]
+    order: EntryOrder = frame[0]
     sys.path += [path for path in order.module_path if path not in sys.path]
     if order.command:
         _become(order, link)
@@ -146,7 +146,7 @@ def main(number: int) -> None:
     sys.exit(status)
 
 
-def _become(order: Order, link: Link) -> None:
+def _become(order: EntryOrder, link: Link) -> None:
     """Become another program; the kernel still ends it with the run."""
     link.send("ready", {})
     if link.receive() is None:
@@ -163,7 +163,7 @@ def _become(order: Order, link: Link) -> None:
 class _EntryProcess:
     """One entry. The main thread runs it, another one listens to the run."""
 
-    def __init__(self, order: Order, link: Link) -> None:
+    def __init__(self, order: EntryOrder, link: Link) -> None:
         self._order = order
         self._link = link
         self._observers = ProcessObservers(boundary().real)
@@ -194,7 +194,7 @@ class _EntryProcess:
         self._observers.watch()
         return self._run_node(entry) if entry.argv is None else self._run_main(entry)
 
-    def _find(self, stack: ExitStack) -> Entry:
+    def _find(self, stack: ExitStack) -> JobEntry:
         if self._order.plays_bags:
             from rsltrace.native.apart.bags import player
 
@@ -207,7 +207,7 @@ class _EntryProcess:
         self._sender.start()
         threading.Thread(target=self._listen, name="rsltrace listener", daemon=True).start()
 
-    def _run_node(self, entry: Entry) -> int:
+    def _run_node(self, entry: JobEntry) -> int:
         observers, at_once = self._observers, threading.Event()
         at_once.set()
         self._entry = running = RunningEntry(
@@ -239,16 +239,16 @@ class _EntryProcess:
 
     def _raised(self, what: str, node: str, error: BaseException) -> None:
         kind = type(error).__qualname__
-        self._link.send("raised", what, node, kind, text_of(error), user_traceback(error))
+        self._link.send("raised", what, node, kind, exception_text(error), user_traceback(error))
 
-    def _run_main(self, entry: Entry) -> int:
+    def _run_main(self, entry: JobEntry) -> int:
         running = RunningMain(entry, self._observers, echo=self._order.echo)
         self._begin(running.is_constructed)
         try:
             running.run()
         except SystemExit as error:
             if error.code is not None and not isinstance(error.code, int):
-                self._link.send("exit", text_of(error))
+                self._link.send("exit", exception_text(error))
             return exit_status(error)
         except KeyboardInterrupt:
             return 128 + signal.SIGINT

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from rsltrace.child_processes import kill_group, start_connected
 from rsltrace.errors import JobError
-from rsltrace.native.apart.wire import Frame, Link, Order
+from rsltrace.native.apart.wire import EntryOrder, Frame, Link
 
 _MAIN = "rsltrace.native.apart.child"
 _LOOK_S = 0.2
@@ -21,7 +21,7 @@ _REAPED_WITHIN_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Start:
+class ProcessStart:
     """What to start as a process: whose it is, what it does there, and its surroundings.
 
     ``respawn`` is how much later (ns) it starts again, and how often (None: always); ``may_fail``
@@ -30,7 +30,7 @@ class Start:
 
     name: str
     key: str
-    order: Order
+    order: EntryOrder
     environment: Mapping[str, str]
     folder: Path | None
     is_main: bool
@@ -39,7 +39,7 @@ class Start:
     required: bool = False
 
 
-class Child(threading.Thread):
+class ObservedProcess(threading.Thread):
     """One process, and the thread that listens to it.
 
     ``told`` gets its frames, ``ended`` its exit status (negative: the signal that killed it).
@@ -47,9 +47,9 @@ class Child(threading.Thread):
 
     def __init__(
         self,
-        start: Start,
-        told: Callable[[Child, Frame], None],
-        ended: Callable[[Child, int], None],
+        start: ProcessStart,
+        told: Callable[[ObservedProcess, Frame], None],
+        ended: Callable[[ObservedProcess, int], None],
     ) -> None:
         super().__init__(name=f"rsltrace {start.name}", daemon=True)
         self.what = start

@@ -10,22 +10,22 @@ from rsltrace.adapters.processes.build import is_python
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate
-from rsltrace.native.apart.children import Start
-from rsltrace.native.apart.wire import Order
+from rsltrace.native.apart.children import ProcessStart
+from rsltrace.native.apart.wire import EntryOrder
 from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
-from rsltrace.run.plans.processes import Processes
+from rsltrace.run.plans.processes import ProcessPrograms
 
 THE_BAGS = "the bags"
 """The name of the process that plays them."""
 
 
-def starts_of(job: Job, like: Order) -> list[Start]:
+def starts_of(job: Job, like: EntryOrder) -> list[ProcessStart]:
     """Return what to start, in the order of the job, with orders like the given one; whoever plays
     its bags comes last.
 
     :raises JobError: a program, or the folder that it is to run in, is not there.
     """
-    processes = Processes(job, lambda text: None)
+    processes = ProcessPrograms(job, lambda text: None)
     told = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
     like = replace(like, job=told, module_path=tuple(sys.path))
     starts = []
@@ -33,7 +33,7 @@ def starts_of(job: Job, like: Order) -> list[Start]:
         where = spec.origin or locate(job, ("nodes", index, spec.kind))
         command = _command(told, index, processes, where)
         starts.append(
-            Start(
+            ProcessStart(
                 spec.target,
                 key,
                 replace(like, index=index, command=command),
@@ -47,7 +47,7 @@ def starts_of(job: Job, like: Order) -> list[Start]:
         )
     if job.bags:
         order = replace(like, plays_bags=True)
-        starts.append(Start(THE_BAGS, THE_BAGS, order, dict(os.environ), None, True))
+        starts.append(ProcessStart(THE_BAGS, THE_BAGS, order, dict(os.environ), None, True))
     return starts
 
 
@@ -62,7 +62,7 @@ def _observed(job: Job, spec: NodeSpec) -> NodeSpec:
     return spec.model_copy(update=changes)
 
 
-def _command(job: Job, index: int, processes: Processes, where: str) -> tuple[str, ...]:
+def _command(job: Job, index: int, processes: ProcessPrograms, where: str) -> tuple[str, ...]:
     """Return the command line of an entry that is not Python, empty for others."""
     spec = job.nodes[index]
     words = processes.command(spec, where)
@@ -72,7 +72,7 @@ def _command(job: Job, index: int, processes: Processes, where: str) -> tuple[st
     return (*words, *spec.arguments, *(word for part in arguments for word in part.arguments))
 
 
-def _environment(spec: NodeSpec, processes: Processes, *, is_program: bool) -> dict[str, str]:
+def _environment(spec: NodeSpec, processes: ProcessPrograms, *, is_program: bool) -> dict[str, str]:
     """Return the variables of a process; a compiled one finds the libraries of ROS's wheels."""
     around = {**os.environ, "PYTHONUNBUFFERED": "1", **spec.environment}
     if not is_program:

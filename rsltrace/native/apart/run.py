@@ -17,10 +17,10 @@ from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
 from rsltrace.child_processes import how_ended
 from rsltrace.errors import NodeError, RsltraceError, RunError
-from rsltrace.native.apart.children import Child, Start
+from rsltrace.native.apart.children import ObservedProcess, ProcessStart
 from rsltrace.native.apart.plans import start_rules, starts_of
 from rsltrace.native.apart.start_queue import StartQueue
-from rsltrace.native.apart.wire import Frame, Order, SpanDecoder
+from rsltrace.native.apart.wire import EntryOrder, Frame, SpanDecoder
 from rsltrace.native.callback_observer import EXECUTORS
 from rsltrace.native.recording import (
     ENDS_WITHIN_S,
@@ -129,16 +129,16 @@ class MultiProcessRun(NativeRun):
     """Each entry of the job in a process of its own; what they tell is merged into one trace."""
 
     def open(self, stack: ExitStack, output: Path, *, force: bool, echo: bool) -> None:
-        """Start the processes up to where they could begin, then create the trace."""
+        """ProcessStart the processes up to where they could begin, then create the trace."""
         self.merge = SpanMerger()
         self.starts = StartQueue()
-        self.children: list[Child] = []
+        self.children: list[ObservedProcess] = []
         self._ids, self._threads = count(1), count(1)
-        self._told: dict[Child, tuple[SpanDecoder, ProcessSpans]] = {}
-        self._counts: dict[Child, Counts] = {}
+        self._told: dict[ObservedProcess, tuple[SpanDecoder, ProcessSpans]] = {}
+        self._counts: dict[ObservedProcess, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
-        self._restarts: list[tuple[int, Start]] = []
+        self._restarts: list[tuple[int, ProcessStart]] = []
         self._restarted: Counter[str] = Counter()
         self._news = threading.Lock()
         self._on_message: dict[str, Any] = {}
@@ -150,7 +150,7 @@ class MultiProcessRun(NativeRun):
         number = stack.enter_context(domain(self.domain_id))
         stack.callback(self._kill_all)
         kind = EXECUTORS[self.executor]
-        like = Order(self.job, 0, kind, echo, self.policy, self.rules)
+        like = EntryOrder(self.job, 0, kind, echo, self.policy, self.rules)
         starts = starts_of(self.job, like)
         for start in starts:
             self._start(start)
@@ -174,8 +174,8 @@ class MultiProcessRun(NativeRun):
         self.create(stack, output, self.merge, described, self._sources, force=force)
         self.watch_stop_topics(self._on_message)
 
-    def _start(self, start: Start) -> Child:
-        child = Child(start, self._hear, self._ended)
+    def _start(self, start: ProcessStart) -> ObservedProcess:
+        child = ObservedProcess(start, self._hear, self._ended)
         self.children.append(child)
         return child
 
@@ -190,7 +190,7 @@ class MultiProcessRun(NativeRun):
 
     # -- what processes tell, in threads of their own -------------------------------------------
 
-    def _hear(self, child: Child, frame: Frame) -> None:
+    def _hear(self, child: ObservedProcess, frame: Frame) -> None:
         what, *values = frame
         if what == "spans":
             self._hear_spans(child, *values)
@@ -217,7 +217,7 @@ class MultiProcessRun(NativeRun):
 
     def _hear_spans(
         self,
-        child: Child,
+        child: ObservedProcess,
         until_ns: int,
         counts: Counts,
         definitions: list[tuple[Any, ...]],
@@ -242,7 +242,7 @@ class MultiProcessRun(NativeRun):
                     type_name = "" if output.entity.sends is None else output.entity.sends.name
                     told(output.data, get_message_class(type_name))
 
-    def _hear_error(self, child: Child, kind: str, said: str) -> None:
+    def _hear_error(self, child: ObservedProcess, kind: str, said: str) -> None:
         child.has_failed = True
         if child.has_begun:
             self.fail(RunError(said))
@@ -252,7 +252,7 @@ class MultiProcessRun(NativeRun):
                 self._refusal = getattr(errors, kind)(said)
 
     def _hear_raised(
-        self, child: Child, what: str, node: str, kind: str, said: str, traceback: str
+        self, child: ObservedProcess, what: str, node: str, kind: str, said: str, traceback: str
     ) -> None:
         child.has_failed = True
         if child.is_stopping:
@@ -273,7 +273,7 @@ class MultiProcessRun(NativeRun):
             reason,
         )
 
-    def _ended(self, child: Child, status: int) -> None:
+    def _ended(self, child: ObservedProcess, status: int) -> None:
         """Take note of the end of a process."""
         if child in self._told:
             self.merge.end(self._told[child][1])
@@ -306,7 +306,7 @@ class MultiProcessRun(NativeRun):
     def _at(self) -> str:
         return format_seconds(max(time.monotonic_ns() - self.begun_ns, 0))
 
-    def _restart(self, what: Start) -> bool:
+    def _restart(self, what: ProcessStart) -> bool:
         assert what.respawn is not None
         delay_ns, times = what.respawn
         with self._news:
@@ -336,13 +336,13 @@ class MultiProcessRun(NativeRun):
             self.look(sum(one[0] for one in counts), max((one[1] for one in counts), default=0))
             self._look_for_mains()
 
-    def _go(self, child: Child) -> None:
+    def _go(self, child: ObservedProcess) -> None:
         reader = SpanDecoder(self._ids, self._threads, self._log_type)
         self._told[child] = reader, self.merge.source()
         child.go()
 
     def _start_again(self) -> None:
-        """Start what has ended and is to come again."""
+        """ProcessStart what has ended and is to come again."""
         now_ns = time.monotonic_ns()
         with self._news:
             due = [what for at_ns, what in self._restarts if at_ns <= now_ns]

@@ -12,7 +12,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 
 if TYPE_CHECKING:
-    from rsltrace.native.apart.children import Child
+    from rsltrace.native.apart.children import ObservedProcess
 
 StartFact = tuple[str, str]
 """What has come true: ``topic``, ``service``, ``node``, ``started`` or ``ended``, and its name."""
@@ -26,15 +26,15 @@ class StartQueue:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._facts: set[StartFact] = set()
-        self._waiting: list[tuple[Child, StartRule, int]] = []
+        self._waiting: list[tuple[ObservedProcess, StartRule, int]] = []
         self._since_ns: dict[int, int] = {}
 
     @property
-    def waiting(self) -> list[Child]:
+    def waiting(self) -> list[ObservedProcess]:
         """The processes that have not begun."""
         return [child for child, _, _ in self._waiting]
 
-    def add(self, child: Child, rule: StartRule) -> None:
+    def add(self, child: ObservedProcess, rule: StartRule) -> None:
         """Let a process begin once its rule is met."""
         self._waiting.append((child, rule, now_ns()))
 
@@ -55,7 +55,7 @@ class StartQueue:
         with self._lock:
             self._facts |= found
 
-    def due(self) -> Iterator[Child]:
+    def due(self) -> Iterator[ObservedProcess]:
         """Yield the processes that are to begin now."""
         now, left = now_ns(), []
         for waiting in self._waiting:

@@ -34,7 +34,7 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class EntryOrder:
     """Which entry of a job's ``nodes:`` to run, or one of these: ``command`` to become another
     program, ``plays_bags`` to play the job's bags.
 

@@ -35,7 +35,7 @@ class Quantile:
 
 
 @dataclass(frozen=True, slots=True)
-class Compared:
+class SampleComparison:
     """Two samples, neither of them empty.
 
     ``distance`` is Kolmogorov and Smirnov's D, the largest difference between the shares of both
@@ -58,7 +58,7 @@ def need_scipy() -> None:
         raise SetupError("the two-sample test needs SciPy: pip install 'rsltrace[fit]'")
 
 
-def compare_samples(a: Durations, b: Durations) -> Compared:
+def compare_samples(a: Durations, b: Durations) -> SampleComparison:
     """Compare two samples, each in order of time.
 
     :raises SetupError: if SciPy is missing.
@@ -77,7 +77,7 @@ def compare_samples(a: Durations, b: Durations) -> Compared:
         ratio = of_b / of_a if of_a else float("nan")
         quantiles.append(Quantile(percent, of_a, of_b, ratio, low, high))
     test = stats.ks_2samp(a, b)
-    return Compared(
+    return SampleComparison(
         len(a),
         len(b),
         tuple(quantiles),
@@ -113,21 +113,21 @@ NEAR = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class CheckedChain:
+class ChainCheck:
     """A chain by its topics: the simulated run and the first native one against the second, and the
     simulated one against the first, to which it is fitted; None where one has no such chain."""
 
     name: str
-    simulated: Compared | None
-    native: Compared | None
-    own: Compared | None
+    simulated: SampleComparison | None
+    native: SampleComparison | None
+    own: SampleComparison | None
 
 
 @dataclass(frozen=True, slots=True)
-class Checked:
+class LatencyCheck:
     """All chains of the second run, those with the most outputs first."""
 
-    chains: tuple[CheckedChain, ...]
+    chains: tuple[ChainCheck, ...]
 
 
 def chains_of(second: Trace) -> Chains:
@@ -143,16 +143,16 @@ def chains_of(second: Trace) -> Chains:
     return found
 
 
-def check(first: Trace, second: Chains, simulated: Trace) -> Checked:
+def check_latencies(first: Trace, second: Chains, simulated: Trace) -> LatencyCheck:
     """Compare the latencies of a simulated run with those of a second native one.
 
     :raises TraceError: a trace is damaged.
     :raises SetupError: if SciPy is missing.
     """
     of_first, of_simulated = (_by_hops(measure_latencies(one)) for one in (first, simulated))
-    return Checked(
+    return LatencyCheck(
         tuple(
-            CheckedChain(
+            ChainCheck(
                 chain.name,
                 _against(chain, of_simulated.get(hops)),
                 _against(chain, of_first.get(hops)),
@@ -167,12 +167,12 @@ def _by_hops(found: Latencies) -> Chains:
     return {one.hops: one for one in found.chains if len(one.hops) > 1}
 
 
-def far(of: Compared) -> list[float]:
+def mismatched_percentiles(of: SampleComparison) -> list[float]:
     """Return the quantiles, in percent, that do not match."""
     return [one.percent for one in of.quantiles if not abs(one.ratio - 1.0) <= NEAR]
 
 
-def _against(chain: ChainLatency | None, other: ChainLatency | None) -> Compared | None:
+def _against(chain: ChainLatency | None, other: ChainLatency | None) -> SampleComparison | None:
     """Compare ``other`` with a chain: ratios are those of the other to the chain."""
     if chain is None or other is None:
         return None

@@ -135,7 +135,7 @@ _TAKES_NONE = (EventKind.CONSTRUCT, EventKind.RESUME, EventKind.TASK)
 _EXCHANGES = (int(EventKind.SERVICE), int(EventKind.CLIENT))
 
 
-def measured(trace: Trace) -> NativeTimes:
+def measure_times(trace: Trace) -> NativeTimes:
     """Return what a native run says.
 
     :raises TraceError: the trace is damaged, simulated, or has no callbacks.

@@ -21,10 +21,10 @@ from rsltrace.simulation.chance.distribution import (
     Gamma,
     Lognormal,
     Normal,
-    Series,
+    TimeSeries,
     Uniform,
 )
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 
 FEW = 30
 """Fewer durations than this say little of the tail."""
@@ -43,7 +43,7 @@ in 95 % of all samples: the second by the root of their size (Kolmogorov)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class DurationModel:
     """A distribution, and how a job says it.
 
     ``values`` is the value of ``kind`` in a job, times in ns. ``distance`` is the largest
@@ -63,11 +63,11 @@ class Model:
         """Return what a simulation would draw, in ns, shape (count,); of a series what is in it."""
         if self.points:
             return np.array([value for _, value in self.points], dtype=np.int64)
-        draw = self.distribution.sampler(Stream(0, "fit"), 0)
+        draw = self.distribution.sampler(RandomStream(0, "fit"), 0)
         return np.array([draw(0) for _ in range(count)], dtype=np.int64)
 
 
-def model_of(durations: Durations, *, family: bool = False) -> Model:
+def model_of(durations: Durations, *, family: bool = False) -> DurationModel:
     """Return a distribution for measured durations, of which there is at least one.
 
     It is a constant where they are all the same, else a table of quantiles, or with ``family`` the
@@ -78,23 +78,23 @@ def model_of(durations: Durations, *, family: bool = False) -> Model:
     ordered = np.minimum(np.sort(durations), LONGEST_NS)
     if ordered[0] == ordered[-1]:
         value_ns = int(ordered[0])
-        return Model("constant", value_ns, Constant(value_ns))
+        return DurationModel("constant", value_ns, Constant(value_ns))
     passed_over = ""
     if family:
         found = _nearest_family(ordered)
         distance = ks_distance(ordered, found.draws(), same=_NEAR)
         if distance <= max(_DISTANCE_MAX, _DISTANCE_95 / math.sqrt(len(ordered))):
-            return Model(found.kind, found.values, found.distribution, distance)
+            return DurationModel(found.kind, found.values, found.distribution, distance)
         passed_over = f"{found.kind}, D {distance:.2f}"
     percent, values_ns = table_of(ordered)
     table = Empirical(percent, values_ns)
     values = {"values": values_ns, "percent": percent}
-    made = Model("empirical", values, table)
+    made = DurationModel("empirical", values, table)
     distance = ks_distance(ordered, made.draws(), same=_NEAR)
-    return Model("empirical", values, table, distance, passed_over)
+    return DurationModel("empirical", values, table, distance, passed_over)
 
 
-def series_of(since: Durations, durations: Durations) -> Model:
+def series_of(since: Durations, durations: Durations) -> DurationModel:
     """Return durations as they were in the course of the run; ``since`` says when each began.
 
     A constant where they are all the same, or where there is only one.
@@ -104,7 +104,9 @@ def series_of(since: Durations, durations: Durations) -> Model:
     times, places = np.unique(np.maximum(since, 0), return_index=True)
     values = np.minimum(durations[places], LONGEST_NS)
     points = tuple(zip(times.tolist(), values.tolist(), strict=True))
-    return Model("series", {"file": "", "steps": True}, Series(points, steps=True), points=points)
+    return DurationModel(
+        "series", {"file": "", "steps": True}, TimeSeries(points, steps=True), points=points
+    )
 
 
 def table_of(ordered: Durations) -> tuple[tuple[float, ...], tuple[int, ...]]:
@@ -146,7 +148,7 @@ def ks_distance(a: Durations, b: Durations, *, same: float = 0.0) -> float:
     return away
 
 
-def _nearest_family(ordered: Durations) -> Model:
+def _nearest_family(ordered: Durations) -> DurationModel:
     """Return the family of the least BIC, fitted by maximum likelihood."""
     if importlib.util.find_spec("scipy") is None:
         raise SetupError("--as distributions needs SciPy: pip install 'rsltrace[fit]'")
@@ -166,31 +168,31 @@ def _nearest_family(ordered: Durations) -> Model:
     return candidates[int(np.argmax(scores))][0]
 
 
-def _uniform(values: npt.NDArray[np.float64]) -> Model:
+def _uniform(values: npt.NDArray[np.float64]) -> DurationModel:
     low, high = int(values[0]), int(values[-1])
-    return Model("uniform", {"min": low, "max": high}, Uniform(low, high))
+    return DurationModel("uniform", {"min": low, "max": high}, Uniform(low, high))
 
 
-def _normal(mean: float, sd: float) -> Model:
+def _normal(mean: float, sd: float) -> DurationModel:
     at, by = shortened(mean), max(shortened(sd), 1)
-    return Model("normal", {"mean": at, "sd": by}, Normal(at, by))
+    return DurationModel("normal", {"mean": at, "sd": by}, Normal(at, by))
 
 
-def _lognormal(logs: npt.NDArray[np.float64]) -> Model:
+def _lognormal(logs: npt.NDArray[np.float64]) -> DurationModel:
     median = max(shortened(math.exp(logs.mean())), 1)
     sigma = min(float(f"{logs.std():.{_DIGITS}g}"), 10.0)
-    return Model("lognormal", {"median": median, "sigma": sigma}, Lognormal(median, sigma))
+    return DurationModel("lognormal", {"median": median, "sigma": sigma}, Lognormal(median, sigma))
 
 
-def _gamma(shape: float, scale: float) -> Model:
+def _gamma(shape: float, scale: float) -> DurationModel:
     of, by = float(f"{min(shape, 1e9):.{_DIGITS}g}"), max(shortened(scale), 1)
-    return Model("gamma", {"shape": of, "scale": by}, Gamma(of, by))
+    return DurationModel("gamma", {"shape": of, "scale": by}, Gamma(of, by))
 
 
 NOT_TIMES = frozenset(("percent", "sigma", "shape", "file", "steps"))
 
 
-def as_job_has_it(model: Model, time: Any) -> dict[str, Any]:
+def as_job_has_it(model: DurationModel, time: Any) -> dict[str, Any]:
     """Return ``{kind: …}`` as a job file says it; ``time`` makes text of ns."""
     if not isinstance(model.values, Mapping):
         return {model.kind: time(model.values)}

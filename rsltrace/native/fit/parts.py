@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.checks.latency.instances import Durations
 from rsltrace.job import Job
 from rsltrace.native.fit.measured import CallbackDurations, LinkTimes, NativeTimes
-from rsltrace.native.fit.models import FEW, Model, as_job_has_it, model_of, series_of
+from rsltrace.native.fit.models import FEW, DurationModel, as_job_has_it, model_of, series_of
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
@@ -27,8 +27,8 @@ _TIED = 0.3
 class Fit:
     """What was measured, with a model each; links and callbacks without a duration have none."""
 
-    links: tuple[tuple[LinkTimes, Model], ...]
-    executions: tuple[tuple[CallbackDurations, Model], ...]
+    links: tuple[tuple[LinkTimes, DurationModel], ...]
+    executions: tuple[tuple[CallbackDurations, DurationModel], ...]
     measured: NativeTimes
 
 
@@ -38,7 +38,7 @@ def fit(measured: NativeTimes, how: str = TABLES) -> Fit:
     :raises SetupError: of ``distributions``, if SciPy is missing.
     """
 
-    def model(since: Durations, durations: Durations) -> Model:
+    def model(since: Durations, durations: Durations) -> DurationModel:
         if how == SERIES:
             return series_of(since, durations)
         return model_of(durations, family=how == DISTRIBUTIONS)
@@ -52,7 +52,7 @@ def with_files(fit: Fit, folder: str) -> tuple[Fit, dict[str, str]]:
     """Return a fit whose series are in files of a folder, and these: names and texts."""
     texts: dict[str, str] = {}
 
-    def placed(model: Model, what: str) -> Model:
+    def placed(model: DurationModel, what: str) -> DurationModel:
         if not model.points:
             return model
         name = f"{folder}/{len(texts) + 1}.csv"

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.checks.latency.instances import Durations
-from rsltrace.native.fit.models import Model
+from rsltrace.native.fit.models import DurationModel
 from rsltrace.native.fit.parts import Fit
 from rsltrace.trace.model.texts import printable
 
@@ -54,7 +54,7 @@ def picture_of(fit: Fit, title: str) -> Any:
     return figure
 
 
-def _panels(fit: Fit) -> Iterator[tuple[str, Durations, Model]]:
+def _panels(fit: Fit) -> Iterator[tuple[str, Durations, DurationModel]]:
     for link, model in fit.links:
         yield f"delay  {link}", link.delays, model
     for one, model in fit.executions:

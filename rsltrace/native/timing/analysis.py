@@ -11,13 +11,13 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.parts.scheduling import EntityExecutionSpec, ExecutionSpec
 from rsltrace.native.timing.bounds import bounds, utilization
-from rsltrace.native.timing.model import Wanted, longest_times, system_of
+from rsltrace.native.timing.model import ProcessorModel, longest_times, system_of
 from rsltrace.native.timing.observed import ChainKey, ObservedChains
 from rsltrace.native.timing.system import ONCE_NS, CallbackKey
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class WorstResponse:
     """The worst response time of a chain in a trace, and the event that it ended with."""
 
     worst_ns: int
@@ -35,8 +35,8 @@ class ChainResult:
     deadline_ns: int | None
     bound_ns: int | None
     method: str
-    simulated: Seen | None
-    native: tuple[Seen | None, ...] = ()
+    simulated: WorstResponse | None
+    native: tuple[WorstResponse | None, ...] = ()
 
     @property
     def name(self) -> str:
@@ -64,7 +64,7 @@ class ChainResult:
 
 
 @dataclass(frozen=True, slots=True)
-class Analysis:
+class TimingAnalysis:
     """The chains of a job, the fastest first; ``load`` is which part of its time each executor is
     busy at most."""
 
@@ -111,8 +111,8 @@ def analyze(
     *,
     times: Mapping[CallbackKey, int] | None,
     deadlines: Mapping[str, int],
-    wanted: Wanted,
-) -> Analysis:
+    wanted: ProcessorModel,
+) -> TimingAnalysis:
     """Return what is known of the chains of a job, as the simulated run has shown them.
 
     ``times`` are how long callbacks take at most, None: as the job says. ``deadlines`` are by the
@@ -139,7 +139,7 @@ def analyze(
                 _deadline(path.key, deadlines, period_ns),
                 found[index].ns,
                 found[index].method,
-                Seen(path.worst_ns, path.worst_event, path.runs),
+                WorstResponse(path.worst_ns, path.worst_event, path.runs),
                 tuple(_seen(one, path.key) for one in native),
             )
         )
@@ -163,12 +163,12 @@ def analyze(
     results.sort(key=lambda one: (one.period_ns or ONCE_NS, one.name))
     used = sorted({task.executor for task in system.tasks if task.executor is not None})
     load = {name: utilization(system, name) for name in used}
-    return Analysis(tuple(results), load, times, (*notes, *more))
+    return TimingAnalysis(tuple(results), load, times, (*notes, *more))
 
 
-def _seen(observed: ObservedChains, key: ChainKey) -> Seen | None:
+def _seen(observed: ObservedChains, key: ChainKey) -> WorstResponse | None:
     path = observed.path(key)
-    return None if path is None else Seen(path.worst_ns, path.worst_event, path.runs)
+    return None if path is None else WorstResponse(path.worst_ns, path.worst_event, path.runs)
 
 
 def _deadline(chain: ChainKey, deadlines: Mapping[str, int], period_ns: int | None) -> int | None:

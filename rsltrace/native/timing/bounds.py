@@ -31,7 +31,7 @@ class _Unbounded(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Bound:
+class ResponseBound:
     """No run takes longer from the release of the chain to the end of the task; ``method`` says by
     which analysis of its last executor. ``ns`` is None if there is no bound."""
 
@@ -39,7 +39,7 @@ class Bound:
     method: str = ""
 
 
-def bounds(system: TaskSystem) -> list[Bound]:
+def bounds(system: TaskSystem) -> list[ResponseBound]:
     """Return the bound of each task of a system."""
     return _BoundSolver(system).solve()
 
@@ -69,7 +69,7 @@ class _BoundSolver:
             self.ends.append(None if unknown else before + task.link_ns + task.wcet_ns)  # type: ignore[operator]
         self.methods = [""] * len(tasks)
 
-    def solve(self) -> list[Bound]:
+    def solve(self) -> list[ResponseBound]:
         for _ in range(_ROUNDS_MAX):
             before = list(self.ends)
             for index in range(len(self.ends)):
@@ -80,7 +80,7 @@ class _BoundSolver:
         else:
             self.ends = [None] * len(self.ends)
         return [
-            Bound(end, method if end is not None else "")
+            ResponseBound(end, method if end is not None else "")
             for end, method in zip(self.ends, self.methods, strict=True)
         ]
 

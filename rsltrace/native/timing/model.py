@@ -11,7 +11,7 @@ from typing import Any
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
-from rsltrace.native.timing.observed import ObservedChains, Path
+from rsltrace.native.timing.observed import ChainPath, ObservedChains
 from rsltrace.native.timing.system import (
     ONCE_NS,
     CallbackKey,
@@ -27,16 +27,16 @@ from rsltrace.simulation.chance.distribution import (
     Constant,
     Distribution,
     Empirical,
-    Samples,
-    Series,
+    MeasuredSamples,
+    TimeSeries,
     Uniform,
 )
-from rsltrace.simulation.loop.policy import Candidate, Policy, Priority, RateMonotonic
-from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
+from rsltrace.simulation.loop.policy import Candidate, ExecutionPolicy, Priority, RateMonotonic
+from rsltrace.simulation.loop.wait_set import RclcppWaitSetPolicy, RclpyWaitSetPolicy
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class ProcessorModel:
     """How executors share processors: each has ``supply``, or all have one processor, and real-time
     priorities by rate (``one_processor``)."""
 
@@ -106,17 +106,17 @@ def longest(distribution: Distribution) -> int | None:
             return value_ns
         case Uniform(_, max_ns):
             return max_ns
-        case Samples(values_ns):
+        case MeasuredSamples(values_ns):
             return max(values_ns)
         case Empirical(_, values_ns):
             return max(values_ns)
-        case Series(points):
+        case TimeSeries(points):
             return max(value_ns for _, value_ns in points)
     return None
 
 
 def system_of(
-    job: Job, observed: ObservedChains, times: Mapping[CallbackKey, int], wanted: Wanted
+    job: Job, observed: ObservedChains, times: Mapping[CallbackKey, int], wanted: ProcessorModel
 ) -> tuple[TaskSystem, list[str]]:
     """Return the system of a job whose tasks are the paths of ``observed``, in their order, and
     what to know of it."""
@@ -125,14 +125,18 @@ def system_of(
 
 class _SystemBuilder:
     def __init__(
-        self, job: Job, observed: ObservedChains, times: Mapping[CallbackKey, int], wanted: Wanted
+        self,
+        job: Job,
+        observed: ObservedChains,
+        times: Mapping[CallbackKey, int],
+        wanted: ProcessorModel,
     ) -> None:
         self.job = job
         self.observed = observed
         self.times = times
         self.wanted = wanted
         self.notes: list[str] = []
-        self.policy: Policy = policy_of_job(job, 0)
+        self.policy: ExecutionPolicy = policy_of_job(job, 0)
         self.plan = scheduling_plan(job, 0, self.policy)
         self.network: NetworkPlan | None = network_plan(job, 0)
         self.rates = self._rates()
@@ -159,9 +163,9 @@ class _SystemBuilder:
         return TaskSystem(tasks, executors, varying), list(dict.fromkeys(self.notes))
 
     def _order(self) -> ExecutorOrder:
-        if isinstance(self.policy, RclpyWaitSet):
+        if isinstance(self.policy, RclpyWaitSetPolicy):
             return ExecutorOrder.POLLED
-        if isinstance(self.policy, WaitSet):
+        if isinstance(self.policy, RclcppWaitSetPolicy):
             return ExecutorOrder.WAIT_SET
         if isinstance(self.policy, Priority) and self.job.policy is not None:
             if any(rule.group_of is not None for rule in self.job.policy.priority or ()):
@@ -172,7 +176,7 @@ class _SystemBuilder:
             ExecutorOrder.PRIORITY if isinstance(self.policy, RateMonotonic) else ExecutorOrder.ANY
         )
 
-    def _task(self, path: Path) -> ChainTask:
+    def _task(self, path: ChainPath) -> ChainTask:
         callback = path.key[-1]
         parent = None if path.parent is None else self.observed.paths[path.parent]
         arrivals = self._arrivals(path) if parent is None else None
@@ -180,7 +184,7 @@ class _SystemBuilder:
         candidate = self._candidate(path.entity, callback)
         place: tuple[int, ...] = ()
         urgency = 0.0
-        if isinstance(self.policy, WaitSet):
+        if isinstance(self.policy, RclcppWaitSetPolicy):
             place = self.policy.place(candidate)
         elif isinstance(self.policy, Priority):
             urgency = -self.policy.priority(candidate)
@@ -198,7 +202,7 @@ class _SystemBuilder:
             place,
         )
 
-    def _arrivals(self, path: Path) -> Arrivals:
+    def _arrivals(self, path: ChainPath) -> Arrivals:
         callback = path.key[0]
         period_ns = self.observed.period_ns(callback)
         if period_ns and callback not in self.observed.reset:

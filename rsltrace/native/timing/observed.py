@@ -12,7 +12,14 @@ import numpy.typing as npt
 from rsltrace.native.timing.system import CallbackKey
 from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, Draw, EventFlag, EventKind, OutputKind, duration_of
+from rsltrace.trace.model.event import (
+    NO_EVENT,
+    EventFlag,
+    EventKind,
+    OutputKind,
+    RandomDecision,
+    decision_duration,
+)
 from rsltrace.trace.native import timings
 from rsltrace.trace.reader import Trace
 
@@ -29,7 +36,7 @@ ChainKey = tuple[CallbackKey, ...]
 
 
 @dataclass(slots=True)
-class Path:
+class ChainPath:
     """A chain up to one of its callbacks, ``parent`` is that without the last. ``count`` is how
     many of the last one's callbacks came of one of the parent's at most, ``gap_ns`` the shortest
     time between two releases of what begins a chain. ``waits`` says that a callback of it waited.
@@ -56,7 +63,7 @@ class ObservedChains:
 
     def __init__(self, trace: Trace) -> None:
         self.trace = trace
-        self.paths: list[Path] = []
+        self.paths: list[ChainPath] = []
         self.durations: dict[CallbackKey, npt.NDArray[np.int64]] = {}
         self.callbacks = _callbacks(trace)
         self.of = {callback: trace.entity(number) for number, callback in self.callbacks.items()}
@@ -67,7 +74,7 @@ class ObservedChains:
         self._released: dict[int, int] = {}
         self._read()
 
-    def path(self, key: ChainKey) -> Path | None:
+    def path(self, key: ChainKey) -> ChainPath | None:
         """Return the chain of these callbacks, None if the trace has none."""
         return next((one for one in self.paths if one.key == key), None)
 
@@ -142,7 +149,7 @@ class ObservedChains:
         if callback in before:
             return None
         number = self._numbers[parent, entity] = len(self.paths)
-        self.paths.append(Path((*before, callback), parent, entity))
+        self.paths.append(ChainPath((*before, callback), parent, entity))
         if parent is not None:
             self.paths[parent].children.add(number)
         return number
@@ -188,7 +195,7 @@ def _busy(events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]) -> dict[i
     for event, entity, number in zip(
         draws["event"].tolist(), draws["entity"].tolist(), draws["hash"].tolist(), strict=True
     ):
-        duration_ns = duration_of(number, Draw.EXECUTION)
+        duration_ns = decision_duration(number, RandomDecision.EXECUTION)
         if duration_ns is not None and owners.get(event) == entity:
             busy[event] = duration_ns
     return busy

@@ -24,9 +24,9 @@ from rsltrace.replay.one_node.output_comparison import (
 from rsltrace.replay.one_node.result import NodeReplayResult
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
-from rsltrace.run import Observer, run
+from rsltrace.run import RunCallbacks, run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
-from rsltrace.run.process import kept_process
+from rsltrace.run.process import preserved_process
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64
@@ -84,7 +84,7 @@ def node_topics(job: Job, node: str) -> NodeTopics:
     :raises JobError, SetupError, RunError: its code cannot be loaded, or fails.
     """
     probe = _NodeProbe(job, None)
-    with kept_process(), probe:
+    with preserved_process(), probe:
         try:
             return probe.find(node if node.startswith("/") else f"/{node}")
         finally:
@@ -126,7 +126,7 @@ def replay_from_bag(
     output: Path | None = None,
     force: bool = False,
     echo: bool = False,
-    observer: Observer | None = None,
+    observer: RunCallbacks | None = None,
 ) -> NodeReplayResult:
     """Run one node of a job with inputs from bags; compare its outputs.
 

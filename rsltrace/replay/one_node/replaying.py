@@ -21,13 +21,13 @@ from rsltrace.replay.one_node.output_comparison import (
 )
 from rsltrace.replay.one_node.result import Column, NodeReplayResult, RecordingColumns
 from rsltrace.replay.one_node.script import RecordedScript, ReplayedEntry, check_payloads
-from rsltrace.replay.preparation import Preparation
+from rsltrace.replay.preparation import ReplayPlan
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
-from rsltrace.run import Observer, RunResult
+from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
-from rsltrace.run.process import kept_process
+from rsltrace.run.process import preserved_process
 from rsltrace.run.session import Session
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.policy import Fifo
@@ -40,7 +40,7 @@ from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.services import Client
-from rsltrace.trace.format import METADATA_FED
+from rsltrace.trace.format import METADATA_RECORDED_INPUTS
 from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
@@ -120,14 +120,14 @@ class NodeReplaySession(Session):
 
     def __init__(
         self,
-        plan: Preparation,
+        plan: ReplayPlan,
         columns: RecordingColumns,
         unit: ReplayedEntry,
         output: Path,
         *,
         force: bool = False,
         echo: bool = False,
-        observer: Observer | None = None,
+        observer: RunCallbacks | None = None,
     ) -> None:
         recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
         super().__init__(
@@ -192,7 +192,7 @@ class NodeReplaySession(Session):
             "node": self._unit.node.name,
             "entries": ",".join(map(str, self._unit.entries)),
         }
-        self._writer.add_metadata(METADATA_FED, values)
+        self._writer.add_metadata(METADATA_RECORDED_INPUTS, values)
         dispatcher = self.world.domain.dispatcher
         dispatcher.add_observer(_Progress(dispatcher, self.script))
 
@@ -320,7 +320,7 @@ CHANGED = Stop("the first output that is not as recorded", 1)
 
 
 def replay_node(
-    plan: Preparation,
+    plan: ReplayPlan,
     node: str,
     *,
     until_diverged: bool = False,
@@ -328,7 +328,7 @@ def replay_node(
     output: Path | None = None,
     force: bool = False,
     echo: bool = False,
-    observer: Observer | None = None,
+    observer: RunCallbacks | None = None,
 ) -> NodeReplayResult:
     """Run one node of a trace alone with its recorded inputs; compare its outputs.
 
@@ -356,7 +356,7 @@ def replay_node(
             if until_diverged and not options
             else None
         )
-        with kept_process():
+        with preserved_process():
             run = run_node(session, watch)
         place = run.path or path
         with Trace.open(place) as present:
@@ -392,7 +392,9 @@ def replay_node(
 
 def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
     """Return the job entry of each construction in a trace."""
-    told = trace.metadata(METADATA_FED).get("entries") or trace.result.get("entries", "")
+    told = trace.metadata(METADATA_RECORDED_INPUTS).get("entries") or trace.result.get(
+        "entries", ""
+    )
     some = [int(one) for one in told.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))
 

@@ -17,11 +17,11 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
-    Draw,
     EventFlag,
     EventKind,
     OutputKind,
-    duration_of,
+    RandomDecision,
+    decision_duration,
 )
 
 # The entry of the job that made the node runs, with all that came from the same construction: an
@@ -296,7 +296,9 @@ class RecordedScript:
         kinds = np.isin(outputs["kind"], (*SENT, OutputKind.ENTITY))
         matters = self._own.copy()
         matters[outputs["event"][kinds & self._others]] = True
-        draws = (outputs["kind"] == OutputKind.DRAW) & (outputs["hash"] >> 56 == Draw.EXECUTION)
+        draws = (outputs["kind"] == OutputKind.DRAW) & (
+            outputs["hash"] >> 56 == RandomDecision.EXECUTION
+        )
         matters[outputs["event"][draws]] = True
         for index in np.flatnonzero(matters[: columns.count]).tolist():
             row = columns.events[index]
@@ -315,7 +317,7 @@ class RecordedScript:
         busy_ns = self._drawn.get(entity, 0) if kind == EventKind.RESUME else 0
         for place, row in enumerate(self._columns.outputs_of(index)):
             if row["kind"] == OutputKind.DRAW:
-                drawn_ns = duration_of(int(row["hash"]), Draw.EXECUTION)
+                drawn_ns = decision_duration(int(row["hash"]), RandomDecision.EXECUTION)
                 if drawn_ns is not None:
                     busy_ns = self._drawn[entity] = drawn_ns
             elif not self._others[begin + place]:

@@ -11,7 +11,7 @@ from rsltrace.job import Job, load_job
 from rsltrace.replay.one_node.from_bag import replay_from_bag
 from rsltrace.replay.one_node.replaying import replay_node
 from rsltrace.replay.one_node.result import NodeReplayResult
-from rsltrace.replay.preparation import prepared, without_bags
+from rsltrace.replay.preparation import prepare_replay, without_bags
 
 
 def is_job(path: Path) -> bool:
@@ -54,7 +54,7 @@ def replay_one(
             force=force,
             echo=echo,
         )
-    with prepared(source, job_folder, job, bags=False) as plan:
+    with prepare_replay(source, job_folder, job, bags=False) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
         if bags:

@@ -144,7 +144,7 @@ def bag_notes(job: Job, bags: list[BagInput]) -> Iterator[str]:
 
 def _time_gaps(job: Job, bags: list[BagInput]) -> Iterator[str]:
     """Yield the bags that start long after all bags before them have ended."""
-    start_ns = start_ns_of(job, bags)
+    start_ns = run_start_ns(job, bags)
     run_ends_ns = end_ns_of(job, start_ns)
     until_ns: int | None = start_ns
     for entry in sorted(bags, key=lambda entry: entry.playback.start_ns):
@@ -161,7 +161,7 @@ def _time_gaps(job: Job, bags: list[BagInput]) -> Iterator[str]:
         until_ns = None if until_ns is None or end_ns is None else max(until_ns, end_ns)
 
 
-def start_ns_of(job: Job, bags: list[BagInput]) -> int:
+def run_start_ns(job: Job, bags: list[BagInput]) -> int:
     """Return the start of the run: the job's, else the first message of the bags, else 0."""
     if job.start_ns is not None:
         return job.start_ns

@@ -13,7 +13,7 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.adapters.rclpy.components import Component, check_loadable, load_service
-from rsltrace.adapters.rclpy.entry import Entry, StartRule, Typed, ros_arguments
+from rsltrace.adapters.rclpy.entry import JobEntry, StartRule, TypedInput, ros_arguments
 from rsltrace.adapters.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
@@ -21,7 +21,7 @@ from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import MainFinder
-from rsltrace.run.plans.processes import Processes
+from rsltrace.run.plans.processes import ProcessPrograms
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.trace.model.regular_file import not_regular
@@ -99,7 +99,7 @@ _KEY = re.compile(r"\x1b(?:\[[0-9;]*[ -/]*[@-~]|O[A-Za-z]|[^\x1b])?|.", re.DOTAL
 _LINE_MAX = 4000
 
 
-def terminal_input(job: Job, index: int) -> list[Typed] | None:
+def terminal_input(job: Job, index: int) -> list[TypedInput] | None:
     """Return the input for the terminal of an entry, None if it has none.
 
     :raises JobError: a file cannot be read, or a line is too long.
@@ -107,7 +107,7 @@ def terminal_input(job: Job, index: int) -> list[Typed] | None:
     stdin = job.nodes[index].stdin
     if stdin is None:
         return None
-    typed: list[Typed] = []
+    typed: list[TypedInput] = []
     for number, item in enumerate(stdin):
         at_ns = item.at_ns
         if item.file is not None:
@@ -149,7 +149,7 @@ def node_entries(
     job: Job,
     only: Container[int] | None = None,
     told: Callable[[str], None] = lambda text: None,
-) -> list[Entry]:
+) -> list[JobEntry]:
     """Import what the job names and let rcl parse the arguments; nothing is constructed.
 
     ``only`` are the wanted places in ``nodes:`` (None: all); ``told`` is called with a line when
@@ -157,7 +157,7 @@ def node_entries(
     """
     entries = []
     mains = MainFinder(job)
-    processes = Processes(job, told)
+    processes = ProcessPrograms(job, told)
     for_all = arguments_for_all(job)
     keys = entry_keys(job.nodes)
     for index, (spec, key) in enumerate(zip(job.nodes, keys, strict=True)):
@@ -184,7 +184,7 @@ def node_entries(
                 _check_arguments(job, index, found)
                 make = partial(found, **spec.arguments)
         entries.append(
-            Entry(
+            JobEntry(
                 spec.target,
                 make,
                 arguments if spec.component is None else [],
@@ -336,7 +336,7 @@ def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
     return keys
 
 
-def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
+def add_job_location(job: Job, entry: JobEntry, error: RunError | None) -> None:
     """Add to a constructor's error the line of the job: that of the refused parameter, or of the
     entry if several are made the same way."""
     if error is None:
@@ -355,14 +355,14 @@ def add_job_location(job: Job, entry: Entry, error: RunError | None) -> None:
 
 def hook_entries(
     job: Job, name: str, target: Target | None, argument: Callable[[], object]
-) -> list[Entry]:
+) -> list[JobEntry]:
     """Return a hook of the job, if it has it, as an entry. A hook may return more nodes."""
     if target is None:
         return []
     where = locate(job, ("hooks", name))
     function: Any = load_target(target, where=where) if isinstance(target, str) else target
     title = f"hook {name}: {target_text(target)}"
-    return [Entry(title, lambda: function(argument()) or [], [], key=title)]
+    return [JobEntry(title, lambda: function(argument()) or [], [], key=title)]
 
 
 def arguments_for_all(job: Job) -> list[str]:

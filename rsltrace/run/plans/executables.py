@@ -34,7 +34,7 @@ from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.run.process import run_as_main, user_modules
-from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.simulation.middleware.events.failure import exception_text
 from rsltrace.trace.model.regular_file import read_regular
 
 # Scripts and modules run as ``__main__``, in a module of that name of their own. So
@@ -96,7 +96,7 @@ def module_program(name: str, folder: Path, *, where: str) -> MainProgram:
             raise JobError(cannot_import(parent, error), where=where) from error
         spec = None
     except (Exception, SystemExit) as error:
-        raised = import_raised(name.rpartition(".")[0], error, text_of(error))
+        raised = import_raised(name.rpartition(".")[0], error, exception_text(error))
         raise JobError(raised, where=where) from error
     if spec is None:
         raise JobError(
@@ -224,7 +224,7 @@ def _imported_again(package: str) -> Iterator[None]:
         sys.modules.update(before)
 
 
-def why_not(package: str, name: str) -> str | None:
+def why_not_runnable(package: str, name: str) -> str | None:
     """Return why an executable cannot run here, or None. Nothing is imported."""
     compiled = compiled_file(f"{package}/{name}")
     if compiled is not None:
@@ -237,7 +237,7 @@ def why_not(package: str, name: str) -> str | None:
     return None
 
 
-def source_of(target: str, *, where: str) -> str | Path:
+def executable_source(target: str, *, where: str) -> str | Path:
     """Return the code of an executable: ``module:function``, or a script.
 
     :raises JobError: as ``find_executable``.
@@ -310,7 +310,7 @@ def process_command(target: str, *, where: str) -> list[str]:
     if found is None and name in _console_scripts(package):
         found = Path(sys.executable).parent / name
     if found is None or not Path(found).is_file():
-        found = source_of(target, where=where)
+        found = executable_source(target, where=where)
     if isinstance(found, str):
         module, _, function = found.partition(":")
         code = (

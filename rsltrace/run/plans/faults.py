@@ -13,16 +13,16 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.adapters.rclpy.wire.interface_classes import class_of
 from rsltrace.adapters.rclpy.wire.message_spec import (
-    Array,
+    ArrayType,
     FieldType,
-    Item,
-    Message,
-    Primitive,
-    Text,
+    ItemType,
+    MessageSpec,
+    PrimitiveType,
+    StringType,
     message_spec,
 )
 from rsltrace.adapters.rclpy.wire.message_spec import (
-    Sequence as SequenceType,
+    SequenceType as SequenceType,
 )
 from rsltrace.errors import BagError, did_you_mean
 from rsltrace.job import Job, locate
@@ -40,11 +40,11 @@ if TYPE_CHECKING:
 _FLOAT_MAX = {"f": 3.4028234663852886e38, "d": 1.7976931348623157e308}
 
 
-class UnfitError(ValueError):
+class FieldChangeError(ValueError):
     """A field that does not exist or cannot have the value."""
 
 
-def changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
+def field_changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
     """Return the function that changes a message (canonical CDR) as a fault says. It raises
     UnfitError for a message whose array lacks the item.
 
@@ -63,24 +63,24 @@ def changer(message_class: type, spec: FaultSpec) -> Callable[[bytes], bytes]:
     return change
 
 
-def _type_at(spec: Message, steps: tuple[Step, ...]) -> FieldType:
+def _type_at(spec: MessageSpec, steps: tuple[Step, ...]) -> FieldType:
     """Return the type of the field at a path."""
     kind: FieldType = spec
     before = ""
     for name, place in steps:
-        if isinstance(kind, (Array, SequenceType)):
-            raise UnfitError(f"{before} is an array: write {before}[0] or {before}[*]")
-        if not isinstance(kind, Message):
-            raise UnfitError(f"{before} has no fields")
+        if isinstance(kind, (ArrayType, SequenceType)):
+            raise FieldChangeError(f"{before} is an array: write {before}[0] or {before}[*]")
+        if not isinstance(kind, MessageSpec):
+            raise FieldChangeError(f"{before} has no fields")
         fields = {field.name: field.type for field in kind.fields}
         if name not in fields:
             near = did_you_mean(name, fields)
             listed = ", ".join(fields)
-            raise UnfitError(f"{kind.type_name} has no field {name} (it has {listed}){near}")
+            raise FieldChangeError(f"{kind.type_name} has no field {name} (it has {listed}){near}")
         kind, before = fields[name], name
         if place is not None:
-            if not isinstance(kind, (Array, SequenceType)):
-                raise UnfitError(f"{name} is no array, so there is no {name}[{place}]")
+            if not isinstance(kind, (ArrayType, SequenceType)):
+                raise FieldChangeError(f"{name} is no array, so there is no {name}[{place}]")
             kind = kind.item
     return kind
 
@@ -88,64 +88,64 @@ def _type_at(spec: Message, steps: tuple[Step, ...]) -> FieldType:
 def _change_of(spec: FaultSpec, kind: FieldType) -> Callable[[Any], Any]:
     """Return the function from a field's old value to its new one."""
     name = str(spec.field)
-    if isinstance(kind, (Array, SequenceType)):
+    if isinstance(kind, (ArrayType, SequenceType)):
         return _change_of_array(spec, kind, name)
     if spec.length is not None or isinstance(spec.value, list):
-        raise UnfitError(f"{name} is no array")
-    if isinstance(kind, Message):
-        raise UnfitError(f"{name} is a {kind.type_name}: name a field of it")
+        raise FieldChangeError(f"{name} is no array")
+    if isinstance(kind, MessageSpec):
+        raise FieldChangeError(f"{name} is a {kind.type_name}: name a field of it")
     if _is_character(kind):
-        raise UnfitError(f"{name} is a character, which cannot be changed")
+        raise FieldChangeError(f"{name} is a character, which cannot be changed")
     if spec.value is not None:
         value = _fitting(kind, spec.value, name)
         return lambda old: value
-    if isinstance(kind, Text) or kind.code == "?":
-        raise UnfitError(f"{name} is no number: give value")
+    if isinstance(kind, StringType) or kind.code == "?":
+        raise FieldChangeError(f"{name} is no number: give value")
     scale = 1.0 if spec.scale is None else spec.scale
     offset = spec.offset or 0.0
     return lambda old: _moved(kind, old, scale, offset)
 
 
 def _change_of_array(
-    spec: FaultSpec, kind: Array | SequenceType, name: str
+    spec: FaultSpec, kind: ArrayType | SequenceType, name: str
 ) -> Callable[[Any], Any]:
-    most = kind.length if isinstance(kind, Array) else kind.bound
-    least = kind.length if isinstance(kind, Array) else 0
+    most = kind.length if isinstance(kind, ArrayType) else kind.bound
+    least = kind.length if isinstance(kind, ArrayType) else 0
     count = len(spec.value) if isinstance(spec.value, list) else spec.length
     if count is None:
-        raise UnfitError(f"{name} is an array: write {name}[*] for all of its items")
+        raise FieldChangeError(f"{name} is an array: write {name}[*] for all of its items")
     if count < least or (most is not None and count > most):
         bound = "exactly" if least else "at most"
-        raise UnfitError(f"{name} has {bound} {most} items, not {count}")
+        raise FieldChangeError(f"{name} has {bound} {most} items, not {count}")
     item = kind.item
     if spec.length is not None:
         return lambda old: _with_length(list(old), count, item)
-    if isinstance(item, Message) or _is_character(item):
-        raise UnfitError(f"{name} cannot be changed as a whole, but its length can")
+    if isinstance(item, MessageSpec) or _is_character(item):
+        raise FieldChangeError(f"{name} cannot be changed as a whole, but its length can")
     values = [_fitting(item, value, name) for value in spec.value]
     return lambda old: values
 
 
-def _with_length(items: list[Any], count: int, item: Item) -> list[Any]:
+def _with_length(items: list[Any], count: int, item: ItemType) -> list[Any]:
     if not items and count:
         items = [_blank(item)]
     return items[:count] + items[-1:] * (count - len(items))
 
 
-def _blank(item: Item) -> Any:
-    if isinstance(item, Message):
+def _blank(item: ItemType) -> Any:
+    if isinstance(item, MessageSpec):
         return item.cls()
-    if isinstance(item, Text):
+    if isinstance(item, StringType):
         return ""
     blanks = {"?": False, "c": b"\0" if item.name == "octet" else "\0"}
     return blanks.get(item.code, 0.0 if item.code in "fd" else 0)
 
 
-def _is_character(item: Item) -> bool:
-    return isinstance(item, Primitive) and item.name == "char"
+def _is_character(item: ItemType) -> bool:
+    return isinstance(item, PrimitiveType) and item.name == "char"
 
 
-def _limits(item: Primitive) -> tuple[float, float]:
+def _limits(item: PrimitiveType) -> tuple[float, float]:
     """Return the least and the greatest finite number of a type."""
     if item.code in "fd":
         return -_FLOAT_MAX[item.code], _FLOAT_MAX[item.code]
@@ -154,30 +154,30 @@ def _limits(item: Primitive) -> tuple[float, float]:
     return (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if is_signed else (0, 2**bits - 1)
 
 
-def _fitting(item: Primitive | Text, value: Any, name: str) -> Any:
+def _fitting(item: PrimitiveType | StringType, value: Any, name: str) -> Any:
     """Return a value converted to the field's type."""
-    if isinstance(item, Text):
+    if isinstance(item, StringType):
         if not isinstance(value, str):
-            raise UnfitError(f"{name} is text, not {value!r}")
+            raise FieldChangeError(f"{name} is text, not {value!r}")
         return value
     if item.code == "?":
         if not isinstance(value, bool):
-            raise UnfitError(f"{name} is true or false, not {value!r}")
+            raise FieldChangeError(f"{name} is true or false, not {value!r}")
         return value
     number = number_of(value)
     if number is None:
-        raise UnfitError(f"{name} is a number, not {value!r}")
+        raise FieldChangeError(f"{name} is a number, not {value!r}")
     least, most = _limits(item)
     if item.code in "fd":
         if math.isfinite(number) and not least <= number <= most:
-            raise UnfitError(f"{name} is from {least:g} to {most:g}, not {number}")
+            raise FieldChangeError(f"{name} is from {least:g} to {most:g}, not {number}")
         return float(number)
     if not (math.isfinite(number) and number == int(number) and least <= number <= most):
-        raise UnfitError(f"{name} is a whole number from {least} to {most}, not {value}")
+        raise FieldChangeError(f"{name} is a whole number from {least} to {most}, not {value}")
     return bytes([int(number)]) if item.code == "c" else int(number)
 
 
-def _moved(item: Primitive, old: Any, scale: float, offset: float) -> Any:
+def _moved(item: PrimitiveType, old: Any, scale: float, offset: float) -> Any:
     """Return a scaled and shifted number. Beyond the limits, floats become infinite and integers
     are clamped."""
     least, most = _limits(item)
@@ -202,7 +202,7 @@ def _change(owner: Any, steps: tuple[Step, ...], new: Callable[[Any], Any]) -> N
         return
     chosen = range(len(held)) if place == "*" else [int(str(place))]
     if not len(held) or not -len(held) <= chosen[0] < len(held):
-        raise UnfitError(f"there is no {name}[{place}]: it has {len(held)} items")
+        raise FieldChangeError(f"there is no {name}[{place}]: it has {len(held)} items")
     items = list(held)
     for index in chosen:
         if rest:
@@ -218,8 +218,8 @@ def check_changes(job: Job, topic: str, message_class: type) -> None:
     for index, spec in enumerate(job.faults):
         if spec.change == topic:
             try:
-                changer(message_class, spec)
-            except UnfitError as error:
+                field_changer(message_class, spec)
+            except FieldChangeError as error:
                 raise BagError(f"{locate(job, ('faults', index))}: {error}") from None
 
 
@@ -312,8 +312,8 @@ class _BagFault:
     def changed(self, publisher: BagPublisher, data: bytes) -> bytes:
         """Return the changed message, or the same one if it lacks the item."""
         try:
-            return changer(class_of(publisher), self.spec)(publisher.canonical(data))
-        except UnfitError as error:
+            return field_changer(class_of(publisher), self.spec)(publisher.canonical(data))
+        except FieldChangeError as error:
             self.missed = str(error)
             return data
         except ValueError:  # it is no message of that type: the player says so

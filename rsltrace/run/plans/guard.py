@@ -13,31 +13,31 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError
-from rsltrace.guard.callers import is_own, module_of
+from rsltrace.guard.callers import is_rsltrace_module, module_of
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
-from rsltrace.guard.virtual.original_code import READERS, show_original
-from rsltrace.guard.virtual.randomness import begin_shared
+from rsltrace.guard.virtual.original_code import CODE_READERS, show_original
+from rsltrace.guard.virtual.randomness import seed_shared_generator
 from rsltrace.guard.virtual.third_party_libraries import (
-    COMPILES,
-    REWRITES,
+    PYTEST_REWRITER,
+    TORCH_COMPILER,
     TorchStreams,
     one_tbb_thread,
     plain_in_graphs,
     pygame_clock,
-    rewritten_in_pytest,
+    rewrite_in_pytest,
     torch_streams,
 )
 from rsltrace.guard.virtual.user_modules import user_modules
-from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
+from rsltrace.guard.watched.cffi_libraries import CFFI_LOADER, report_cffi_functions
 from rsltrace.job import Job, NodeSpec, policy_of
-from rsltrace.simulation.middleware.events.event import Event
+from rsltrace.simulation.middleware.events.event import CurrentEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
-from rsltrace.trace.model.finding import Finding, GuardCount, Mode, Source
+from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, NondeterminismSource
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
@@ -55,7 +55,9 @@ class _TorchGenerators(EventObserver):
 
     order = ObserverOrder.GENERATORS
 
-    def __init__(self, streams: TorchStreams, event: Event, name_of: Callable[[], str]) -> None:
+    def __init__(
+        self, streams: TorchStreams, event: CurrentEvent, name_of: Callable[[], str]
+    ) -> None:
         self._streams = streams
         self._event = event
         self._name_of = name_of
@@ -107,7 +109,7 @@ class RunGuard:
                 on_finding=on_finding,
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
-            begin_shared(job.seed)
+            seed_shared_generator(job.seed)
             for library, why in self._unpinned:
                 self._report(self.guard, library, why, sys._getframe())
             if replay is not None:
@@ -116,7 +118,7 @@ class RunGuard:
                     kept = [one for found in trace.findings.values() for one in found]
                 self.guard.answers.replay(kept, str(replay))
         world.states.policy = policy_of(job.guard)
-        if self.guard is not None and self.guard.is_virtual(Source.CLOCK):
+        if self.guard is not None and self.guard.is_virtual(NondeterminismSource.CLOCK):
             self._begin_log_time(loop.now_ns)
         if "torch" in sys.modules:
             self.torch_loaded()
@@ -146,15 +148,15 @@ class RunGuard:
             self._unpinned.append((library, why))  # met before the run
             return
         frame = sys._getframe()
-        while is_own(module_of(frame)) and frame.f_back is not None:
+        while is_rsltrace_module(module_of(frame)) and frame.f_back is not None:
             frame = frame.f_back
         self._report(self.guard, library, why, frame)
 
     def _report(self, guard: Guard, library: str, why: str, frame: FrameType) -> None:
-        mode = guard.mode(Source.THREAD, frame)
-        if mode is not Mode.ALLOW:
+        mode = guard.mode(NondeterminismSource.THREAD, frame)
+        if mode is not GuardMode.ALLOW:
             call = f"the threads of TBB in {library}"
-            guard.report(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
+            guard.report(NondeterminismSource.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
         """Record the findings of imports, from before the trace was open."""
@@ -195,13 +197,13 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
             "pygame": lambda: pygame_clock(stack),
-            COMPILES: plain_in_graphs,
-            LOADS_LIBRARIES: lambda: watched_libraries(stack),
-            **{name: partial(show_original, name, stack) for name in READERS},
+            TORCH_COMPILER: plain_in_graphs,
+            CFFI_LOADER: lambda: report_cffi_functions(stack),
+            **{name: partial(show_original, name, stack) for name in CODE_READERS},
         }
         orders = _orders_sets(job)
         if orders:
-            at_once[REWRITES] = lambda: rewritten_in_pytest(stack)
+            at_once[PYTEST_REWRITER] = lambda: rewrite_in_pytest(stack)
         for name, begin in at_once.items():
             if name in sys.modules:
                 begin()
@@ -214,8 +216,8 @@ def _orders_sets(job: Job) -> bool:
     """Whether the guard rewrites uses of sets; otherwise code is compiled unchanged."""
     policies = [policy_of(job.guard)]
     policies += [policy_of(job.guard, spec.guard) for spec in job.nodes if spec.guard is not None]
-    modes = (policy.modes.get(Source.ORDER, Mode.VIRTUAL) for policy in policies)
-    return any(mode is not Mode.ALLOW for mode in modes)
+    modes = (policy.modes.get(NondeterminismSource.ORDER, GuardMode.VIRTUAL) for policy in policies)
+    return any(mode is not GuardMode.ALLOW for mode in modes)
 
 
 def node_packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:

@@ -11,12 +11,12 @@ from rsltrace.job.parts.distribution import DistributionSpec
 from rsltrace.job.reading.delay_files import read_rslcpp, read_samples, read_series
 from rsltrace.job.values.problem import Loc
 from rsltrace.simulation.chance.channel import (
-    Burst,
+    BurstLoss,
+    LinkModel,
+    LinkOutage,
     LinkRule,
-    Model,
     NameRule,
     NetworkPlan,
-    Outage,
     OutageRule,
 )
 from rsltrace.simulation.chance.distribution import (
@@ -25,16 +25,16 @@ from rsltrace.simulation.chance.distribution import (
     Empirical,
     Gamma,
     Lognormal,
+    MeasuredSamples,
     Normal,
-    Samples,
-    Series,
+    TimeSeries,
     Uniform,
 )
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.trace.model.texts import format_duration
 
 
-def clocks_of(job: Job) -> tuple[ClockRule, ...]:
+def clock_rules(job: Job) -> tuple[ClockRule, ...]:
     """Return the rules for the nodes' clocks; the first match counts."""
     found = []
     for spec in job.clocks:
@@ -87,7 +87,7 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
         services=tuple(NameRule(name, link_model(job, s)) for name, s in delay.services.items()),
         default=None if delay.default is None else link_model(job, delay.default),
         outages=tuple(
-            OutageRule(*spec.what, Outage(start_ns + spec.from_ns, start_ns + spec.to_ns))
+            OutageRule(*spec.what, LinkOutage(start_ns + spec.from_ns, start_ns + spec.to_ns))
             for spec in delay.outages
         ),
         seed=job.seed,
@@ -106,21 +106,21 @@ def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
     )
 
 
-def link_model(job: Job, spec: DelaySpec) -> Model:
+def link_model(job: Job, spec: DelaySpec) -> LinkModel:
     burst = spec.burst
-    return Model(
-        delay=distribution_of(job, spec) if spec.kinds() else None,
+    return LinkModel(
+        delay=make_distribution(job, spec) if spec.kinds() else None,
         drop=spec.drop,
         burst=None
         if burst is None
-        else Burst(burst.good_to_bad, burst.bad_to_good, burst.loss_bad, burst.loss_good),
+        else BurstLoss(burst.good_to_bad, burst.bad_to_good, burst.loss_bad, burst.loss_good),
         duplicate=spec.duplicate,
         keep_order=spec.keep_order,
         retransmit_ns=spec.retransmit_ns,
     )
 
 
-def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
+def make_distribution(job: Job, spec: DistributionSpec) -> Distribution:
     """Return the distribution of a job's spec; reads files."""
     if spec.constant_ns is not None:
         return Constant(spec.constant_ns)
@@ -146,8 +146,8 @@ def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
         samples = spec.samples
         if samples.file is not None:
             path, name = job.resolve(samples.file), job.shown(samples.file)
-            return Samples(read_samples(samples, path, name))
-        return Samples(samples.values_ns or ())
+            return MeasuredSamples(read_samples(samples, path, name))
+        return MeasuredSamples(samples.values_ns or ())
     if spec.empirical is not None:
         values, percent = spec.empirical.values_ns, spec.empirical.percent
         if percent is None:
@@ -157,5 +157,5 @@ def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
     assert series is not None
     if series.file is not None:
         path, name = job.resolve(series.file), job.shown(series.file)
-        return Series(read_series(series, path, name), series.steps)
-    return Series(series.points or (), series.steps)
+        return TimeSeries(read_series(series, path, name), series.steps)
+    return TimeSeries(series.points or (), series.steps)

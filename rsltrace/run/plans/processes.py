@@ -12,7 +12,7 @@ from functools import cached_property, partial
 from pathlib import Path
 
 from rsltrace.adapters.processes.build import (
-    Library,
+    PreloadLibrary,
     interpreter,
     is_compiled,
     is_python,
@@ -20,9 +20,9 @@ from rsltrace.adapters.processes.build import (
     program,
     why_not_run,
 )
-from rsltrace.adapters.processes.door import Interfaces, ProcessDoor, Program
+from rsltrace.adapters.processes.door import ProcessAdapter, ProcessProgram, TypeLookup
 from rsltrace.adapters.rclpy.arguments import RosArguments
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.wire.interfaces import (
     get_message_class,
     message_type,
@@ -33,27 +33,27 @@ from rsltrace.errors import JobError, RunError, SetupError
 from rsltrace.guard.pin import pinned_variables
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.executables import compiled_file, process_command
-from rsltrace.run.plans.network import clocks_of
+from rsltrace.run.plans.network import clock_rules
 from rsltrace.simulation.chance.stream import ClockModel
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.model.texts import printable
 
 
-class Processes:
+class ProcessPrograms:
     """Makes the command lines of a job's processes; the first one builds the library."""
 
     def __init__(self, job: Job, told: Callable[[str], None]) -> None:
         self._job = job
         self._told = told
-        self._library: Library | None = None
+        self._library: PreloadLibrary | None = None
         pinned = pinned_variables() if job.guard.pins else {}  # this process need not be
         self._surroundings = {**os.environ, **pinned}
         """As they are before modules of nodes are imported, which may set variables."""
 
     def find(
         self, spec: NodeSpec, arguments: Sequence[RosArguments], *, where: str
-    ) -> Program | None:
+    ) -> ProcessProgram | None:
         """Return the process that an entry starts, None if it runs in this process.
 
         :raises JobError: the file does not exist or is not executable.
@@ -203,10 +203,10 @@ def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
     return shown_ns, not clocks.advances(node)
 
 
-def make_process_adapter(job: Job, world: World) -> ProcessDoor:
+def make_process_adapter(job: Job, world: World) -> ProcessAdapter:
     """Return the adapter through which a job's processes take part in its world."""
-    interfaces = Interfaces(_message_type, _service_type)
-    door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
+    interfaces = TypeLookup(_message_type, _service_type)
+    door = ProcessAdapter(world.domain, interfaces, seed=job.seed, log=world.show_log)
     programs = world.stacks.programs
     restarts: Counter[str] = Counter()
 
@@ -223,11 +223,11 @@ def make_process_adapter(job: Job, world: World) -> ProcessDoor:
     door.on_end = ended
     door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
 
-    if any(rule.advances or rule.model != ClockModel() for rule in clocks_of(job)):
+    if any(rule.advances or rule.model != ClockModel() for rule in clock_rules(job)):
         door.clock = lambda node, looks: _shown(world, node, looks)
 
-    def start(entry: Entry, cause: tuple[int, int]) -> None:
-        assert isinstance(entry.program, Program)
+    def start(entry: JobEntry, cause: tuple[int, int]) -> None:
+        assert isinstance(entry.program, ProcessProgram)
         door.start(
             entry.program,
             name=entry.name,

@@ -11,22 +11,22 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.run.plans.scheduling import policy_named, user_policy
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.policy import (
     Candidate,
+    ChoicePoint,
     Departure,
     Departures,
+    ExecutionPolicy,
     Fifo,
     FifoUntil,
-    Moment,
     Pct,
-    Policy,
     PolicyChoices,
     Priority,
     PriorityRule,
-    decoded,
+    decode_choices,
 )
 from rsltrace.simulation.loop.recorded_order import (
     CALLBACKS,
@@ -37,7 +37,7 @@ from rsltrace.simulation.loop.recorded_order import (
     RecordedOrder,
     entity_text,
 )
-from rsltrace.simulation.loop.wait_set import RclpyWaitSet
+from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
@@ -84,7 +84,9 @@ def follow_recording(
     order = RecordedOrder(file, _EventCursor(trace).event, _chosen(trace), census.describe_all())
     from_ns = _polls_from_ns(trace)
     if from_ns is not None:
-        order.poll_as(RclpyWaitSet() if from_ns < 0 else FifoUntil(from_ns, RclpyWaitSet()))
+        order.poll_as(
+            RclpyWaitSetPolicy() if from_ns < 0 else FifoUntil(from_ns, RclpyWaitSetPolicy())
+        )
     return RecordedOrderObserver(domain.dispatcher, order, is_whole=trace.complete)
 
 
@@ -131,14 +133,14 @@ def _polls_from_ns(trace: Trace) -> int | None:
     return getattr(made, "polls_from_ns", None)  # it was cut off
 
 
-def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:
+def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], ChoicePoint], int | None] | None:
     """Return the function that repeats the choices of the recording's policy, or None.
 
     An incomplete recording has no choices; its policy, made again, makes the same ones.
     """
     data = trace.attachment(ATTACHMENT_CHOICES)
     if data is not None:
-        choices = decoded(data)
+        choices = decode_choices(data)
         return lambda ready, moment: next(choices, None) if len(ready) > 1 else 0
     resolved = json.loads(trace.job.get("resolved") or "null")
     if not isinstance(resolved, dict):
@@ -147,7 +149,7 @@ def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None]
     return None if policy is None else policy.choose
 
 
-def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
+def _same_policy(spec: dict[str, Any], seed: int) -> ExecutionPolicy | None:
     """Return the policy of a resolved job, None if it cannot be made."""
     if spec.get("after_ns") is not None:
         return None  # where a run that was cut off began is not known
@@ -157,7 +159,7 @@ def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
     if spec.get("departures") is not None:
         return Departures([Departure(**one) for one in spec["departures"]])
     if spec.get("pct") is not None:
-        return Pct(Stream(seed, "pct"), **spec["pct"])
+        return Pct(RandomStream(seed, "pct"), **spec["pct"])
     if spec.get("function") is not None:
         with suppress(JobError):
             return user_policy(spec["function"], "")

@@ -10,26 +10,26 @@ from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError, RsltraceError, did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.scheduling import EVERY_LINE, PolicySpec
-from rsltrace.run.plans.network import distribution_of
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.run.plans.network import make_distribution
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.policy import (
     Departure,
     Departures,
+    ExecutionPolicy,
     Fifo,
     FifoUntil,
     Pct,
     Permutation,
-    Policy,
     Priority,
     PriorityRule,
     RateMonotonic,
 )
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.simulation.loop.wait_set import RclpyWaitSet, WaitSet
-from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.simulation.loop.wait_set import RclcppWaitSetPolicy, RclpyWaitSetPolicy
+from rsltrace.simulation.middleware.events.failure import exception_text
 
 if TYPE_CHECKING:
-    from rsltrace.adapters.rclpy.entry import Entry
+    from rsltrace.adapters.rclpy.entry import JobEntry
     from rsltrace.adapters.rclpy.world import World
     from rsltrace.simulation.middleware.scheduling import SchedulingPlan
 
@@ -55,7 +55,9 @@ def load_target(target: str, *, where: str) -> Any:
     except RsltraceError:
         raise
     except (Exception, SystemExit) as error:
-        raise JobError(import_raised(module_name, error, text_of(error)), where=where) from error
+        raise JobError(
+            import_raised(module_name, error, exception_text(error)), where=where
+        ) from error
     for part in attribute.split("."):
         try:
             value = getattr(value, part)
@@ -82,7 +84,7 @@ def switches_at_lines(job: Job) -> bool:
     return job.threads is not None and job.threads.switch == EVERY_LINE
 
 
-def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> SchedulingPlan:
+def scheduling_plan(job: Job, start_ns: int, policy: ExecutionPolicy | None) -> SchedulingPlan:
     """Return the plan of a job. ``policy`` is what it follows instead of its own.
 
     :raises JobError: if the policy's class cannot be made.
@@ -96,11 +98,11 @@ def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> Schedulin
     rules = []
     if job.execution is not None:
         for spec in job.execution.entities:
-            rules.append(ExecutionRule(spec.node, spec.entity, distribution_of(job, spec)))
+            rules.append(ExecutionRule(spec.node, spec.entity, make_distribution(job, spec)))
         for name, by_node in job.execution.nodes.items():
-            rules.append(ExecutionRule(name, None, distribution_of(job, by_node)))
+            rules.append(ExecutionRule(name, None, make_distribution(job, by_node)))
         if job.execution.default is not None:
-            rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
+            rules.append(ExecutionRule("*", None, make_distribution(job, job.execution.default)))
     return SchedulingPlan(
         policy=policy or policy_of_job(job, start_ns),
         executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
@@ -111,7 +113,7 @@ def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> Schedulin
     )
 
 
-def policy_of_job(job: Job, start_ns: int) -> Policy:
+def policy_of_job(job: Job, start_ns: int) -> ExecutionPolicy:
     """Return the policy of a job, at its beginning.
 
     :raises JobError: if the policy's class cannot be made.
@@ -123,14 +125,14 @@ def policy_of_job(job: Job, start_ns: int) -> Policy:
     return policy if spec.after_ns is None else FifoUntil(start_ns + spec.after_ns, policy)
 
 
-def continued_policy(policy: Policy, before: Policy) -> Policy:
+def continued_policy(policy: ExecutionPolicy, before: ExecutionPolicy) -> ExecutionPolicy:
     """Return a policy that goes on in the middle of a run, in the place of another one."""
     if isinstance(policy, Departures) and isinstance(before, Departures):
         policy.choices = before.choices
     return policy
 
 
-def _policy(job: Job, spec: PolicySpec) -> Policy:
+def _policy(job: Job, spec: PolicySpec) -> ExecutionPolicy:
     seed = job.seed if spec.seed is None else spec.seed
     if spec.order is not None:
         policy = policy_named(spec.order, seed)
@@ -142,11 +144,11 @@ def _policy(job: Job, spec: PolicySpec) -> Policy:
     if spec.departures is not None:
         return Departures(Departure(one.choice, one.run, one.of) for one in spec.departures)
     if spec.pct is not None:
-        return Pct(Stream(seed, "pct"), spec.pct.depth, spec.pct.choices)
+        return Pct(RandomStream(seed, "pct"), spec.pct.depth, spec.pct.choices)
     return user_policy(spec.function, locate(job, ("policy", "function")))
 
 
-def unmet_departures(job: Job, policy: Policy) -> Iterator[str]:
+def unmet_departures(job: Job, policy: ExecutionPolicy) -> Iterator[str]:
     """Yield the departures that a run has not come to, which had so few choices."""
     if job.policy is None or not isinstance(policy, Departures):
         return
@@ -159,20 +161,20 @@ def unmet_departures(job: Job, policy: Policy) -> Iterator[str]:
             )
 
 
-def policy_named(order: str, seed: int) -> Policy | None:
+def policy_named(order: str, seed: int) -> ExecutionPolicy | None:
     """Return the policy that a job calls by a word alone, None if there is none of that name."""
     if order == "permutation":
-        return Permutation(Stream(seed, "permutation"))
-    makers: dict[str, Callable[[], Policy]] = {
+        return Permutation(RandomStream(seed, "permutation"))
+    makers: dict[str, Callable[[], ExecutionPolicy]] = {
         "fifo": Fifo,
         "rate_monotonic": RateMonotonic,
-        "wait_set": WaitSet,
-        "rclpy": RclpyWaitSet,
+        "wait_set": RclcppWaitSetPolicy,
+        "rclpy": RclpyWaitSetPolicy,
     }
     return makers[order]() if order in makers else None
 
 
-def user_policy(function: Any, where: str) -> Policy:
+def user_policy(function: Any, where: str) -> ExecutionPolicy:
     """Make a policy of the user's own.
 
     :raises JobError: beginning with ``where``, if there is no such class, or it is no policy.
@@ -194,7 +196,7 @@ def user_policy(function: Any, where: str) -> Policy:
     return policy  # type: ignore[no-any-return]
 
 
-def stop_with(world: World, entries: Sequence[Entry]) -> None:
+def stop_with(world: World, entries: Sequence[JobEntry]) -> None:
     """Let the run end when an entry has ended that is required."""
     required = {entry.key for entry in entries if entry.required}
     loop = world.domain.loop

@@ -81,14 +81,14 @@ def git_environment() -> dict[str, str]:
     return {**env, "LC_ALL": "C", "GIT_TERMINAL_PROMPT": "0"}
 
 
-class Repository:
+class GitRepository:
     """A repository with a checkout in ``top``."""
 
     def __init__(self, top: Path) -> None:
         self.top = top
 
     @classmethod
-    def of(cls, file: Path) -> Repository:
+    def of(cls, file: Path) -> GitRepository:
         """Return the repository that a file lies in.
 
         :raises BisectError: there is none.

@@ -12,14 +12,14 @@ from pathlib import Path
 from rsltrace.child_processes import OWN_FOLDER, Processes, rsltrace_command
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import BisectError, ConditionError
-from rsltrace.search.bisect.repository import Repository
+from rsltrace.search.bisect.repository import GitRepository
 from rsltrace.search.bisect.worktree import Worktree
 from rsltrace.search.perturb import (
-    Recorded,
-    Surroundings,
+    Perturbation,
+    PerturbedRun,
     can_fix_addresses,
+    perturbed_run,
     record_words,
-    recorded,
 )
 from rsltrace.terminal import tell
 from rsltrace.trace.reader import Trace
@@ -33,14 +33,14 @@ _SKIP = 125
 
 
 @dataclass(frozen=True, slots=True)
-class Check:
+class RevisionCheck:
     """How a run is judged; ``words`` name it in messages."""
 
     words: str
     judge: Judge
 
 
-def check_of(text: str) -> Check:
+def expression_check(text: str) -> RevisionCheck:
     """Return the check of ``--check``: an expression, or ``module:function`` of a ``Trace``.
 
     :raises BisectError: it is neither.
@@ -59,7 +59,7 @@ def check_of(text: str) -> Check:
                 except ConditionError as error:
                     raise BisectError(f"--check {text!r}: {error.message}") from None
 
-        return Check(expression.text, judge)
+        return RevisionCheck(expression.text, judge)
     from rsltrace.run.plans.scheduling import load_target
 
     sys.path.insert(0, str(Path.cwd()))
@@ -73,10 +73,10 @@ def check_of(text: str) -> Check:
                 said = f"{type(error).__name__}: {error}"
                 raise BisectError(f"--check {text} has no answer there: {said}") from error
 
-    return Check(text.strip(), call)
+    return RevisionCheck(text.strip(), call)
 
 
-def command(words: str, processes: Processes) -> Check:
+def command_check(words: str, processes: Processes) -> RevisionCheck:
     """Return the check of ``--run``: a shell command, judged as ``git bisect run`` does.
 
     It runs where the run did, with the path of the run's trace in ``RSLTRACE_TRACE``.
@@ -90,31 +90,31 @@ def command(words: str, processes: Processes) -> Check:
             raise BisectError(f"--run {words!r} ended with exit status {done.exit_code}")
         return done.exit_code == 0
 
-    return Check(words, judge)
+    return RevisionCheck(words, judge)
 
 
 @dataclass(frozen=True, slots=True)
-class Runner:
+class RevisionRunner:
     """Runs a job in a worktree; ``arguments`` are those of ``rsltrace record``, paths in it."""
 
-    repository: Repository
+    repository: GitRepository
     worktree: Worktree
     arguments: tuple[str, ...]
     processes: Processes
     timeout_s: float | None = None
 
-    def run(self, name: str) -> Recorded:
+    def run(self, name: str) -> PerturbedRun:
         """Run the revision in the worktree; its trace is ``name``.mcap."""
         cwd = self.folder
         cwd.mkdir(parents=True, exist_ok=True)
         path = self.worktree.folder / f"{name}.mcap"
-        command = rsltrace_command(record_words(self.arguments, path))
+        command_check = rsltrace_command(record_words(self.arguments, path))
         if can_fix_addresses():
-            command = ["setarch", "-R", *command]
+            command_check = ["setarch", "-R", *command_check]
         done = self.processes.run(
-            command, cwd=cwd, env=self._environment(), timeout_s=self.timeout_s
+            command_check, cwd=cwd, env=self._environment(), timeout_s=self.timeout_s
         )
-        return recorded(Surroundings(0, {}), path, done)
+        return perturbed_run(Perturbation(0, {}), path, done)
 
     @property
     def folder(self) -> Path:
@@ -134,7 +134,7 @@ class Runner:
         }
 
 
-def python_folders(repository: Repository) -> list[Path]:
+def python_folders(repository: GitRepository) -> list[Path]:
     """Return the checkout's folders on Python's path, also of packages installed in place
     (``pip install -e``). A revision's own folders replace them."""
     found = []

@@ -10,8 +10,8 @@ from enum import Enum
 
 from rsltrace.errors import BisectError
 from rsltrace.search.bisect.repository import Commit
-from rsltrace.search.bisect.runs import Check, Runner
-from rsltrace.search.perturb import Recorded
+from rsltrace.search.bisect.runs import RevisionCheck, RevisionRunner
+from rsltrace.search.perturb import PerturbedRun
 
 _FIRST = re.compile(r"^([0-9a-f]{40,64}) is the first bad commit$", re.MULTILINE)
 _COMMIT = re.compile("[0-9a-f]{40,64}")
@@ -31,17 +31,17 @@ class RevisionVerdict(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Tried:
+class TestedRevision:
     """A revision that was run. ``why`` says why it is skipped."""
 
     commit: Commit
-    run: Recorded
+    run: PerturbedRun
     answer: RevisionVerdict
     why: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class BisectResult:
     """The result of a search.
 
     ``first`` is the first changed commit; None if it is one of ``candidates``, of which all but the
@@ -51,13 +51,13 @@ class Found:
 
     first: Commit | None
     candidates: tuple[Commit, ...]
-    before: Tried
-    after: Tried
-    tried: tuple[Tried, ...]
+    before: TestedRevision
+    after: TestedRevision
+    tried: tuple[TestedRevision, ...]
     notes: tuple[str, ...]
 
 
-class Search:
+class BisectSearch:
     """A search between two commits. ``check`` None: by the digest.
 
     ``on_try`` receives each revision that was run, ``on_note`` further notes.
@@ -65,13 +65,13 @@ class Search:
 
     def __init__(
         self,
-        runner: Runner,
+        runner: RevisionRunner,
         good: Commit,
         bad: Commit,
-        check: Check | None,
+        check: RevisionCheck | None,
         *,
         first_parent: bool = False,
-        on_try: Callable[[Tried], object] = lambda tried: None,
+        on_try: Callable[[TestedRevision], object] = lambda tried: None,
         on_note: Callable[[str], object] = lambda note: None,
     ) -> None:
         self._runner = runner
@@ -79,13 +79,13 @@ class Search:
         self._check = check
         self._first_parent = first_parent
         self._on_try, self._on_note = on_try, on_note
-        self._tried: dict[str, Tried] = {}
+        self._tried: dict[str, TestedRevision] = {}
         self._notes: list[str] = []
         self._failure_counts = False
         """Whether a run in which a node raises is judged, not skipped: one end raises, too."""
 
-    def find(self) -> Found:
-        """Search.
+    def find(self) -> BisectResult:
+        """BisectSearch.
 
         :raises BisectError: an end does not run, is not good or bad, or is nondeterministic.
         """
@@ -109,7 +109,7 @@ class Search:
 
     # -- the ends --------------------------------------------------------------------------------
 
-    def _ends(self) -> tuple[Tried, Tried]:
+    def _ends(self) -> tuple[TestedRevision, TestedRevision]:
         good, bad = self._end(self._good, "good"), self._end(self._bad, "bad")
         self._failure_counts = bool(good.failure or bad.failure)
         if self._check is None and good.outcome == bad.outcome:
@@ -134,7 +134,7 @@ class Search:
             self._expect(ends[-1], wanted)
         return ends[0], ends[1]
 
-    def _end(self, commit: Commit, name: str) -> Recorded:
+    def _end(self, commit: Commit, name: str) -> PerturbedRun:
         begin = time.monotonic()
         run = self._run(commit)
         if self._runner.timeout_s is None:
@@ -144,7 +144,7 @@ class Search:
             raise BisectError(f"the {name} revision ({commit}) does not run: {self._why(run)}")
         return run
 
-    def _expect(self, tried: Tried, wanted: RevisionVerdict) -> None:
+    def _expect(self, tried: TestedRevision, wanted: RevisionVerdict) -> None:
         if tried.answer is wanted:
             return
         assert self._check is not None
@@ -157,7 +157,7 @@ class Search:
 
     # -- one revision ----------------------------------------------------------------------------
 
-    def _at(self, commit_id: str) -> Tried:
+    def _at(self, commit_id: str) -> TestedRevision:
         """Run and judge the revision in the worktree, once."""
         if commit_id in self._tried:
             return self._tried[commit_id]
@@ -165,38 +165,40 @@ class Search:
         run = self._run(commit)
         return self._tell(self._judged(commit, run))
 
-    def _judged(self, commit: Commit, run: Recorded) -> Tried:
+    def _judged(self, commit: Commit, run: PerturbedRun) -> TestedRevision:
         if not run.digest or (run.failure and not self._failure_counts):
-            return Tried(commit, run, RevisionVerdict.SKIP, self._why(run))
+            return TestedRevision(commit, run, RevisionVerdict.SKIP, self._why(run))
         if self._check is not None:
             try:
                 holds = self._check.judge(run.path, self._runner.folder)
             except BisectError as error:
-                return Tried(commit, run, RevisionVerdict.SKIP, str(error))
-            return Tried(commit, run, RevisionVerdict.GOOD if holds else RevisionVerdict.BAD)
+                return TestedRevision(commit, run, RevisionVerdict.SKIP, str(error))
+            return TestedRevision(
+                commit, run, RevisionVerdict.GOOD if holds else RevisionVerdict.BAD
+            )
         if run.outcome == self._digest:
-            return Tried(commit, run, RevisionVerdict.GOOD)
+            return TestedRevision(commit, run, RevisionVerdict.GOOD)
         seen = any(run.outcome == known.run.outcome for known in self._tried.values())
         if not seen and commit != self._bad:
             again = self._run(commit, "again")
             if again.outcome != run.outcome:
                 why = f"not deterministic: digests {run.digest} and {again.digest or '-'}"
-                return Tried(commit, run, RevisionVerdict.SKIP, why)
-        return Tried(commit, run, RevisionVerdict.BAD)
+                return TestedRevision(commit, run, RevisionVerdict.SKIP, why)
+        return TestedRevision(commit, run, RevisionVerdict.BAD)
 
-    def _run(self, commit: Commit, more: str = "") -> Recorded:
+    def _run(self, commit: Commit, more: str = "") -> PerturbedRun:
         tree = self._runner.worktree
         tree.check_out(commit.id)
         if missing := tree.missing_submodules():
             self._note(f"submodules are not checked out: {', '.join(missing)}")
         return self._runner.run("-".join(filter(None, (commit.id, more))))
 
-    def _tell(self, tried: Tried) -> Tried:
+    def _tell(self, tried: TestedRevision) -> TestedRevision:
         self._tried[tried.commit.id] = tried
         self._on_try(tried)
         return tried
 
-    def _why(self, run: Recorded) -> str:
+    def _why(self, run: PerturbedRun) -> str:
         """Return why a run failed: its error message, if it printed one."""
         said = [line for line in run.errors.splitlines() if line.startswith(_ERROR)]
         why = run.failure if run.digest or not said else said[-1].removeprefix(_ERROR)
@@ -209,12 +211,12 @@ class Search:
 
     # -- the answer ------------------------------------------------------------------------------
 
-    def _found(self, ids: list[str]) -> Found:
+    def _found(self, ids: list[str]) -> BisectResult:
         candidates = self._runner.repository.in_order(ids, self._good, self._bad)
         first = candidates[0] if len(candidates) == 1 else None
         known = [one for one in self._tried.values() if one.answer is RevisionVerdict.BAD]
         after = next((one for one in known if one.commit.id in ids), known[0])
-        return Found(
+        return BisectResult(
             first,
             tuple(candidates),
             self._before(first),
@@ -223,7 +225,7 @@ class Search:
             tuple(self._notes),
         )
 
-    def _before(self, first: Commit | None) -> Tried:
+    def _before(self, first: Commit | None) -> TestedRevision:
         """Return the run to compare with: of the commit's parent, if that runs."""
         if first is not None:
             found = self._at(first.parents[0])

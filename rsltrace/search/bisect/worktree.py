@@ -17,7 +17,7 @@ from pathlib import Path
 from types import TracebackType
 
 from rsltrace.errors import BisectError
-from rsltrace.search.bisect.repository import Repository, git, git_environment, git_program
+from rsltrace.search.bisect.repository import GitRepository, git, git_environment, git_program
 
 # Waits until its stdin is closed by the parent or the kernel. A git or a run that is just ending
 # may still write, so it tries again.
@@ -44,7 +44,7 @@ class Worktree:
     unless the revision has one of that name. ``folder`` is for traces.
     """
 
-    def __init__(self, repository: Repository, shared: Iterable[Path] = ()) -> None:
+    def __init__(self, repository: GitRepository, shared: Iterable[Path] = ()) -> None:
         self._repository = repository
         self._shared = tuple(shared)
 

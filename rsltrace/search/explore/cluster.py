@@ -94,9 +94,9 @@ def bundle_of(source: JobSource) -> Bundle:
     :raises JobError: the job is wrong.
     :raises ExploreError: a file cannot be read.
     """
-    from rsltrace.run.inputs import without_launch_files
+    from rsltrace.run.inputs import expand_launch_files
 
-    job = without_launch_files(source.job()).job
+    job = expand_launch_files(source.job()).job
     base = Path(job.base_dir)
     paths = sorted(set(_sources(job)) | set(_named(job)))
     root = os.path.commonpath([base, *(path.parent for path in paths)])

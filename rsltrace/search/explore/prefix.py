@@ -198,21 +198,21 @@ class _PausedRun:
     """A run that is paused after its prefix."""
 
     def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any], stack: ExitStack) -> None:
-        from rsltrace.run.branching import run_up_to, why_never
-        from rsltrace.run.process import end_with_run, kept_process
+        from rsltrace.run.branching import run_up_to, why_no_branches
+        from rsltrace.run.process import preserved_process, skip_final_collection
         from rsltrace.run.session import Session
         from rsltrace.search.explore.outcome import TrialOptions
         from rsltrace.search.explore.steps import TrialObserver
         from rsltrace.trace.writer import TraceWriter
 
-        end_with_run()
+        skip_final_collection()
         self._stack = stack
         self._source = source_of(task)
         wants = TrialOptions(**task["wants"])
         job = self._source.job(Trial(0, overlay))
-        self.why = why_never(job)
+        self.why = why_no_branches(job)
         writer = TraceWriter(None, force=True, events_per_segment=job.record.segment_events)
-        stack.enter_context(kept_process())
+        stack.enter_context(preserved_process())
         self.session: Session = Session(job, None, force=True, writer=writer)
         self.session.may_become = True
         stack.enter_context(self.session)
@@ -254,7 +254,7 @@ class _PausedRun:
         answer_and_end(lambda: self._made(task, TrialOptions(**task["wants"])), self._answer_at)
 
     def _made(self, task: dict[str, Any], wants: TrialOptions) -> dict[str, Any]:
-        from rsltrace.run.branching import why_not as why_no_branch
+        from rsltrace.run.branching import why_no_branch as why_no_branch
         from rsltrace.search.explore.outcome import result_of_run
 
         began = time.perf_counter()

@@ -13,23 +13,23 @@ from typing import Any, Protocol
 from rsltrace.job import Job
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.strategies.strategy import Strategy
-from rsltrace.search.explore.table import Table
+from rsltrace.search.explore.table import ResultsFolder
 from rsltrace.search.explore.trial import KeptTraces, Trial, TrialResult
-from rsltrace.trace.mcap.sink import unfinished
+from rsltrace.trace.mcap.sink import unfinished_path
 
 _TIMEOUT_MIN_S = 60.0
 _TIMEOUT_FACTOR = 30
 
 
 @dataclass(frozen=True, slots=True)
-class Budget:
+class SearchBudget:
     """Limits of a search: trials, or seconds of real time (None: no limit)."""
 
     trials: int | None = None
     seconds: float | None = None
 
 
-class Pool(Protocol):
+class TrialPool(Protocol):
     """Where trials run: ``workers.Workers``, or a cluster."""
 
     @property
@@ -50,7 +50,7 @@ class Pool(Protocol):
 
 
 @dataclass
-class Tally:
+class SearchTally:
     """The results of a search so far, without anything that grows with each run."""
 
     runs: int = 0
@@ -83,7 +83,7 @@ class Tally:
                 self.first[key] = result
 
 
-class Search:
+class Explorer:
     """One search; a context manager, around that of its pool.
 
     ``run`` returns when the budget is used up, nothing is left to try, or ``stop`` is called.
@@ -93,15 +93,15 @@ class Search:
         self,
         job: Job,
         strategy: Strategy,
-        table: Table,
+        table: ResultsFolder,
         *,
-        budget: Budget,
+        budget: SearchBudget,
         stop_at_first: bool = False,
         timeout_s: float | None = None,
         fork_ns: int = -1,
     ) -> None:
         """``fork_ns``: the simulated time after which runs may be forked from the plain one."""
-        self.tally = Tally()
+        self.tally = SearchTally()
         self.strategy = strategy
         self.began_s = time.monotonic()
         self.runs_here = 0
@@ -120,7 +120,7 @@ class Search:
         self._under_way: set[int] = set()
         self._number = 1
 
-    def __enter__(self) -> Search:
+    def __enter__(self) -> Explorer:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -130,14 +130,16 @@ class Search:
         """Delete the traces of runs that ended with the pool and have no row."""
         for number in self._under_way:
             path = self._table.trace_of(number)
-            for one in (path, unfinished(path)):
+            for one in (path, unfinished_path(path)):
                 one.unlink(missing_ok=True)
 
     def stop(self) -> None:
         """Begin no more trials."""
         self._stopped = True
 
-    def run(self, pool: Pool, on_result: Callable[[TrialResult], None] = lambda one: None) -> None:
+    def run(
+        self, pool: TrialPool, on_result: Callable[[TrialResult], None] = lambda one: None
+    ) -> None:
         """Search; ``on_result`` receives each run that has ended.
 
         :raises ExploreError: a run cannot start, or a result cannot be written.
@@ -150,7 +152,7 @@ class Search:
         finally:
             self._delete_unfinished()
 
-    def _go_on(self, pool: Pool, on_result: Callable[[TrialResult], None]) -> None:
+    def _go_on(self, pool: TrialPool, on_result: Callable[[TrialResult], None]) -> None:
         while True:
             while pool.idle and self._may_begin(pool):
                 trial = self._next()
@@ -182,7 +184,7 @@ class Search:
                     self.strategy.recall(learned.get(row.trial.number, row))
         return plain
 
-    def _run_plain(self, pool: Pool, on_result: Callable[[TrialResult], None]) -> None:
+    def _run_plain(self, pool: TrialPool, on_result: Callable[[TrialResult], None]) -> None:
         """Run the job as it is."""
         wants = replace(self._wants(), keep=True, strict=True)
         self._submit(pool, self._plain, wants)
@@ -192,7 +194,7 @@ class Search:
         self._begin(found[0])
         self._keep(found[0], found[0], on_result)
 
-    def _submit(self, pool: Pool, trial: Trial, wants: TrialOptions) -> None:
+    def _submit(self, pool: TrialPool, trial: Trial, wants: TrialOptions) -> None:
         self._under_way.add(trial.number)
         pool.submit(trial, self._table.trace_of(trial.number), wants, self._timeout_s)
 
@@ -202,7 +204,7 @@ class Search:
             self._timeout_s = max(_TIMEOUT_MIN_S, _TIMEOUT_FACTOR * plain.wall_s)
         self.strategy.begin(plain)
 
-    def _may_begin(self, pool: Pool) -> bool:
+    def _may_begin(self, pool: TrialPool) -> bool:
         if self._stopped or self._left_s() == 0:
             return False
         if self._stop_at_first and self.tally.failures:

@@ -16,11 +16,11 @@ import numpy.typing as npt
 from rsltrace.run.session import Session
 from rsltrace.search.explore.trial import TrialStep
 from rsltrace.simulation.loop.ordered import OrderedLoop
-from rsltrace.simulation.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, OutputKind
-from rsltrace.trace.model.finding import Source
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.reader import Trace
 
 # What a run did, as hashes that other runs of the job can be compared with.
@@ -172,7 +172,7 @@ class TrialObserver:
             if steps:
                 loop.on_lull = self._note_lull
 
-    def _note(self, ready: Sequence[Candidate], chosen: int, moment: Moment) -> None:
+    def _note(self, ready: Sequence[Candidate], chosen: int, moment: ChoicePoint) -> None:
         self.entities.update([(one.entity_id, one.thread) for one in ready])
         if len(ready) > 1:
             self.order.append((chosen, len(ready)))
@@ -242,7 +242,7 @@ class TrialObserver:
             return False  # messages may be in transit, workers busy
         if any(entity.kind in _COMES_AND_GOES for entity in trace.entities.values()):
             return False
-        return not any(met.source is Source.RANDOM for met in trace.guarded)
+        return not any(met.source is NondeterminismSource.RANDOM for met in trace.guarded)
 
 
 def _name(names: dict[int, str], entity_id: int, kind: str, node: str, entity: str) -> str:

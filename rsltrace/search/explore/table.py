@@ -29,7 +29,7 @@ RESULTS, SEARCH, LEARNED, TRACES = "results.jsonl", "search.json", "learned.json
 PAGE, PARQUET, SMALL = "report.html", "results.parquet", "small"
 
 
-class Table:
+class ResultsFolder:
     """A folder that results are written to. A context manager.
 
     :raises ExploreError: on entering, if there is a search in the folder that is not to be resumed,
@@ -51,7 +51,7 @@ class Table:
         self._force = force
         self._files: dict[str, int] = {}
 
-    def __enter__(self) -> Table:
+    def __enter__(self) -> ResultsFolder:
         try:
             (self.folder / TRACES).mkdir(parents=True, exist_ok=True)
             self._check()
@@ -135,7 +135,7 @@ class Table:
             (self.folder / name).unlink(missing_ok=True)
 
 
-def rows(folder: Path) -> Iterator[TrialResult]:
+def result_rows(folder: Path) -> Iterator[TrialResult]:
     """Yield the results in a folder.
 
     :raises ExploreError: there are none, or they cannot be read.

@@ -12,7 +12,7 @@ from rsltrace.errors import ExploreError, JobError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.vary import SettingSpec, VarySpec
 from rsltrace.search.explore.trial import JobSource, Trial
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 
 _SAMPLES = 100
 _DIGITS = 9
@@ -45,7 +45,7 @@ class Variations:
         found = {}
         for place, (name, setting) in enumerate(self._spec.settings.items()):
             if self._spec.method == "random":
-                share = Stream(self._seed, f"vary\0{name}\0{number}").uniform()
+                share = RandomStream(self._seed, f"vary\0{name}\0{number}").uniform()
             else:
                 share = float(self._shares[number][place])
             found[name] = _value(setting, share)

@@ -38,12 +38,12 @@ def main(words: list[str]) -> None:
     """Serve whoever has started this process until they close the socket."""
     if "--no-pin" not in words:
         pin()
-    from rsltrace.adapters.rclpy.boundary.installation import check_free
+    from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation
     from rsltrace.adapters.rclpy.world import World  # noqa: F401  # with all that a run loads
     from rsltrace.search.explore import outcome  # noqa: F401
 
     with suppress(RsltraceError):  # a run says so, if it needs rclpy
-        check_free()
+        check_no_simulation()
         importlib.import_module("rclpy")
     idle = other_threads()  # of rclpy's, which does nothing in a simulation
 
@@ -213,11 +213,11 @@ def _timeout(timeout_s: float) -> Failure:
 def _make(task: dict[str, Any], tell: int, *, tells: bool) -> None:
     """Run the trial here, from its beginning, and end this process. Never returns."""
     before = frozenset(sys.modules)
-    from rsltrace.run.process import end_with_run
+    from rsltrace.run.process import skip_final_collection
     from rsltrace.search.explore.outcome import TrialOptions, run_trial
 
     def run() -> dict[str, Any]:
-        end_with_run()
+        skip_final_collection()
         trial, wants = Trial(**task["trial"]), TrialOptions(**task["wants"])
         result = run_trial(source_of(task), trial, Path(task["trace"]), wants)
         answer: dict[str, Any] = {"result": result.as_values()}

@@ -1,6 +1,6 @@
 """The delay, loss and order of messages on one link.
 
-``Model`` describes a link, ``LinkChannel`` is its state in a run. Each purpose (delay,
+``LinkModel`` describes a link, ``LinkChannel`` is its state in a run. Each purpose (delay,
 drop, burst, duplicate, the delay of the copy) has a random stream of its own, so
 enabling one does not change what others draw.
 """
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 from rsltrace.simulation.chance.distribution import Constant, Distribution
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 
 LOST_DROP = -1
 LOST_BURST = -2
@@ -23,7 +23,7 @@ _ATTEMPTS_MAX = 1000
 
 
 @dataclass(frozen=True, slots=True)
-class Burst:
+class BurstLoss:
     """Loss in bursts (Gilbert and Elliott): a Markov chain of a good and a bad state.
 
     Probabilities per message: of changing state in each direction, and of a loss in each state.
@@ -36,7 +36,7 @@ class Burst:
 
 
 @dataclass(frozen=True, slots=True)
-class Model:
+class LinkModel:
     """What happens to the messages of a link. No ``delay``: they arrive at once.
 
     ``retransmit_ns`` is what each loss costs on a reliable link. ``keep_order``: a message never
@@ -45,21 +45,21 @@ class Model:
 
     delay: Distribution | None = None
     drop: float = 0.0
-    burst: Burst | None = None
+    burst: BurstLoss | None = None
     duplicate: float = 0.0
     keep_order: bool = True
     retransmit_ns: int = 10_000_000
 
 
 @dataclass(frozen=True, slots=True)
-class Outage:
+class LinkOutage:
     """Nothing gets through from ``from_ns`` up to, not including, ``to_ns`` of simulated time."""
 
     from_ns: int
     to_ns: int
 
 
-PERFECT_LINK = Model()
+PERFECT_LINK = LinkModel()
 
 
 class LinkChannel:
@@ -73,13 +73,13 @@ class LinkChannel:
 
     def __init__(
         self,
-        model: Model,
+        model: LinkModel,
         *,
         seed: int,
         name: str,
         start_ns: int,
         reliable: bool,
-        outages: tuple[Outage, ...] = (),
+        outages: tuple[LinkOutage, ...] = (),
     ) -> None:
         delay = model.delay or Constant(0)
         self.name = name
@@ -88,11 +88,11 @@ class LinkChannel:
         self._model = model
         self._reliable = reliable
         self.outages = _merge_outages(outages)
-        self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
-        self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
-        self._drop = Stream(seed, f"{name}\0drop").uniform
-        self._burst = Stream(seed, f"{name}\0burst").uniform
-        self._duplicate = Stream(seed, f"{name}\0duplicate").uniform
+        self._delay = delay.sampler(RandomStream(seed, f"{name}\0delay"), start_ns)
+        self._copy = delay.sampler(RandomStream(seed, f"{name}\0copy"), start_ns)
+        self._drop = RandomStream(seed, f"{name}\0drop").uniform
+        self._burst = RandomStream(seed, f"{name}\0burst").uniform
+        self._duplicate = RandomStream(seed, f"{name}\0duplicate").uniform
         self._bad = False
         self._last_ns = -1
         self.keep_order = model.keep_order
@@ -176,12 +176,12 @@ class LinkChannel:
         return None
 
 
-def _merge_outages(outages: Sequence[Outage]) -> tuple[Outage, ...]:
+def _merge_outages(outages: Sequence[LinkOutage]) -> tuple[LinkOutage, ...]:
     """Return outages in order; those that overlap or touch are merged."""
-    found: list[Outage] = []
+    found: list[LinkOutage] = []
     for outage in sorted(outages, key=lambda outage: outage.from_ns):
         if found and outage.from_ns <= found[-1].to_ns:
-            found[-1] = Outage(found[-1].from_ns, max(found[-1].to_ns, outage.to_ns))
+            found[-1] = LinkOutage(found[-1].from_ns, max(found[-1].to_ns, outage.to_ns))
         else:
             found.append(outage)
     return tuple(found)
@@ -198,7 +198,7 @@ class LinkRule:
     topic: str
     sender: str
     receiver: str
-    model: Model
+    model: LinkModel
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +207,7 @@ class NameRule:
     delays."""
 
     name: str
-    model: Model
+    model: LinkModel
     where: str = ""
 
 
@@ -217,7 +217,7 @@ class OutageRule:
 
     kind: str
     name: str
-    outage: Outage
+    outage: LinkOutage
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ class NetworkPlan:
     topics: tuple[NameRule, ...] = ()
     table: tuple[NameRule, ...] = ()
     services: tuple[NameRule, ...] = ()
-    default: Model | None = None
+    default: LinkModel | None = None
     outages: tuple[OutageRule, ...] = ()
     seed: int = 0
     start_ns: int = 0
@@ -246,13 +246,13 @@ class NetworkPlan:
         name = f"topic\0{topic}\0{_end(sender)}\0{_end(receiver)}"
         return self._channel(model, outages, name, reliable=reliable)
 
-    def topic_model(self, topic: str, sender: str, receiver: str) -> Model | None:
+    def topic_model(self, topic: str, sender: str, receiver: str) -> LinkModel | None:
         """Return the model of a link between two nodes, or None."""
         model = self._link_model(topic, sender, receiver)
         model = model or _by_name(self.topics, topic) or _by_name(self.table, topic)
         return self.default if model is None and topic not in QUIET_TOPICS else model
 
-    def service_model(self, service: str) -> Model | None:
+    def service_model(self, service: str) -> LinkModel | None:
         """Return the model of a service's requests and responses, or None."""
         model = _by_name(self.services, service)
         return self.default if model is None else model
@@ -269,7 +269,7 @@ class NetworkPlan:
         return self._channel(model, outages, name, reliable=True)
 
     def _channel(
-        self, model: Model | None, outages: tuple[Outage, ...], name: str, *, reliable: bool
+        self, model: LinkModel | None, outages: tuple[LinkOutage, ...], name: str, *, reliable: bool
     ) -> LinkChannel | None:
         if model is None and not outages:
             return None
@@ -282,7 +282,7 @@ class NetworkPlan:
             outages=outages,
         )
 
-    def _link_model(self, topic: str, sender: str, receiver: str) -> Model | None:
+    def _link_model(self, topic: str, sender: str, receiver: str) -> LinkModel | None:
         for rule in self.links:
             if (
                 fnmatchcase(topic, rule.topic)
@@ -292,7 +292,7 @@ class NetworkPlan:
                 return rule.model
         return None
 
-    def _outages(self, kind: str, name: str, nodes: tuple[str, str]) -> tuple[Outage, ...]:
+    def _outages(self, kind: str, name: str, nodes: tuple[str, str]) -> tuple[LinkOutage, ...]:
         return tuple(
             rule.outage
             for rule in self.outages
@@ -301,7 +301,7 @@ class NetworkPlan:
         )
 
 
-def _by_name(rules: Sequence[NameRule], name: str) -> Model | None:
+def _by_name(rules: Sequence[NameRule], name: str) -> LinkModel | None:
     for rule in rules:
         if rule.name == name:
             return rule.model

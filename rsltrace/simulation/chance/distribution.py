@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Protocol
 from rsltrace.simulation.chance.stream import exp, log
 
 if TYPE_CHECKING:
-    from rsltrace.simulation.chance.stream import Stream
+    from rsltrace.simulation.chance.stream import RandomStream
 
 # The quantile function of the normal distribution: algorithm AS 241 (PPND16) of M. J. Wichura,
 # Applied Statistics 37 (1988) 477-484, to about 16 digits. One uniform number gives one normal
@@ -118,7 +118,7 @@ simulated time, like ROS's own, ends at 2**63 ns."""
 class Distribution(Protocol):
     """How long something takes."""
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         """Return a function of the present time (ns) that draws the next value (ns)."""
 
 
@@ -128,7 +128,7 @@ class Constant:
 
     value_ns: int
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         value_ns = self.value_ns
         return lambda now_ns: value_ns
 
@@ -140,7 +140,7 @@ class Uniform:
     min_ns: int
     max_ns: int
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         values = stream.whole_numbers(self.min_ns, self.max_ns - self.min_ns + 1)
         # No Python function, since this is the usual jitter. The present time goes where ``next``
         # takes what to return at the end, and there is none.
@@ -154,7 +154,7 @@ class Normal:
     mean_ns: int
     sd_ns: int
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         uniform, mean, sd = stream.uniform, float(self.mean_ns), float(self.sd_ns)
 
         def draw(now_ns: int) -> int:
@@ -181,7 +181,7 @@ class Lognormal:
             return cls(mean_ns, sqrt(square))
         return cls(mean_ns / sqrt(spread), sqrt(log(spread)))
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         uniform, median, sigma = stream.uniform, self.median_ns, self.sigma
         return lambda now_ns: int(
             min(median * exp(sigma * normal_quantile(uniform())), LONGEST_NS) + 0.5
@@ -204,7 +204,7 @@ class Gamma:
         ratio = mean_ns / sd_ns
         return cls(ratio * ratio, sd_ns / ratio)
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         uniform, scale, small = stream.uniform, self.scale_ns, self.shape < 1.0
         power = 1.0 / self.shape
         d = (self.shape + 1.0 if small else self.shape) - 1.0 / 3.0
@@ -228,12 +228,12 @@ class Gamma:
 
 
 @dataclass(frozen=True, slots=True)
-class Samples:
+class MeasuredSamples:
     """One of some measured values, each as likely as the others."""
 
     values_ns: tuple[int, ...]
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         below, values, count = stream.below, self.values_ns, len(self.values_ns)
         return lambda now_ns: values[below(count)]
 
@@ -248,7 +248,7 @@ class Empirical:
     percent: tuple[float, ...]
     values_ns: tuple[int, ...]
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         uniform, percent, values = stream.uniform, self.percent, self.values_ns
 
         def draw(now_ns: int) -> int:
@@ -262,7 +262,7 @@ class Empirical:
 
 
 @dataclass(frozen=True, slots=True)
-class Series:
+class TimeSeries:
     """A value that changes over time: points (ns since the start of the run, value in ns).
 
     Before the first point and after the last one, theirs holds. Between points the value is
@@ -272,7 +272,7 @@ class Series:
     points: tuple[tuple[int, int], ...]
     steps: bool = False
 
-    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+    def sampler(self, stream: RandomStream, start_ns: int) -> Sampler:
         times = [time_ns for time_ns, _ in self.points]
         points, steps, last = self.points, self.steps, len(self.points) - 1
 

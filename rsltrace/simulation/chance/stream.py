@@ -60,7 +60,7 @@ _ONE = np.float64(1.0).view(np.uint64)
 _LESS = np.float64(1.0 - 2.0**-53)
 
 
-class Stream:
+class RandomStream:
     """Random numbers of one purpose. ``uniform()`` is in (0, 1), both ends excluded.
 
     Counter mode: block *n* is SHAKE-128 of a 32-byte key and *n*; the key is BLAKE2b of seed and
@@ -119,10 +119,10 @@ class ClockModel:
     random_most_ns: int = 0
 
 
-class WrongClock:
+class SkewedClock:
     """The time that one node's clock shows. Exact: no floats after the draws."""
 
-    def __init__(self, model: ClockModel, stream: Stream, start_ns: int) -> None:
+    def __init__(self, model: ClockModel, stream: RandomStream, start_ns: int) -> None:
         self._model = model
         self._start_ns = start_ns
         self._given_at = [at_ns for at_ns, _ in model.jumps]

@@ -14,12 +14,18 @@ from typing import Any
 
 from rsltrace.errors import RunError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
-from rsltrace.simulation.loop.policy import Candidate, Fifo, Moment, Policy, PolicyChoices
+from rsltrace.simulation.loop.policy import (
+    Candidate,
+    ChoicePoint,
+    ExecutionPolicy,
+    Fifo,
+    PolicyChoices,
+)
 from rsltrace.simulation.loop.timer_queue import TimerState
 
 
 @dataclass(eq=False)
-class Workers:
+class SimulatedExecutor:
     """A simulated executor: how many callbacks it can run at once, and how many are running."""
 
     name: str
@@ -32,7 +38,7 @@ class Workers:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ReadyItem:
     """Something that may run, as the loop sees it.
 
     ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
@@ -41,7 +47,7 @@ class Place:
     """
 
     candidate: Candidate
-    workers: Workers | None
+    workers: SimulatedExecutor | None
     exclusive: object | None
     told: bool = False
 
@@ -56,8 +62,10 @@ class ExecutionCharge:
 class _ReadyQueue:
     """The ordered loop's queue of what is ready, in order of arrival."""
 
-    def __init__(self, place: Callable[[Dispatchable], Place], runs: Callable[[Place], bool]):
-        self.places: list[Place] = []
+    def __init__(
+        self, place: Callable[[Dispatchable], ReadyItem], runs: Callable[[ReadyItem], bool]
+    ):
+        self.places: list[ReadyItem] = []
         self._place = place
         self._runs = runs
 
@@ -86,7 +94,7 @@ class _ReadyQueue:
         item: Dispatchable = self.places[index].candidate.item
         return item
 
-    def runnable(self) -> Iterator[Place]:
+    def runnable(self) -> Iterator[ReadyItem]:
         return filter(self._runs, self.places)
 
     def __bool__(self) -> bool:
@@ -101,19 +109,19 @@ class OrderedLoop(EventLoop):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.policy: Policy = Fifo()
-        self.place: Callable[[Dispatchable], Place]
+        self.policy: ExecutionPolicy = Fifo()
+        self.place: Callable[[Dispatchable], ReadyItem]
         self.charge = ExecutionCharge()
         self.choices: PolicyChoices | None = None
         """The policy's choices so far, if they are recorded."""
-        self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
+        self.on_choice: Callable[[Sequence[Candidate], int, ChoicePoint], None] | None = None
         """Called at every choice, even of one candidate."""
-        self.hold_until: Callable[[Sequence[Candidate], Moment], int | None] | None = None
+        self.hold_until: Callable[[Sequence[Candidate], ChoicePoint], int | None] | None = None
         """Returns until when all that is ready has to wait, or None."""
         self.on_lull: Callable[[], None] | None = None
         """Called each time that nothing is left to run."""
         self.has_begun = False
-        self._forced: Place | None = None
+        self._forced: ReadyItem | None = None
         self._held_until_ns = -1
         self._held: dict[object, None] = {}
         self._ready = _ReadyQueue(lambda item: self.place(item), self._runs)
@@ -155,7 +163,7 @@ class OrderedLoop(EventLoop):
                 now_ns = self.now_ns  # a callback has waited, and time has passed meanwhile
                 limit = self.events + self._livelock_limit
 
-    def _next(self) -> Place | None:
+    def _next(self) -> ReadyItem | None:
         """Take what runs next: tasks first, as rclpy does, then the policy's choice."""
         forced, self._forced = self._forced, None
         if forced is not None:
@@ -164,7 +172,7 @@ class OrderedLoop(EventLoop):
         polls = self.polls
         if polls:
             self.hand_over()
-        tasks: list[Place] = []
+        tasks: list[ReadyItem] = []
         for place in self._tasks.runnable():
             if polls and place.candidate.kind == "task":
                 tasks.append(place)
@@ -184,25 +192,25 @@ class OrderedLoop(EventLoop):
     def _must_wait(self, ready: list[Candidate]) -> bool:
         """Whether what is ready has to wait; if so, look again when that is over."""
         assert self.hold_until is not None
-        until_ns = self.hold_until(ready, Moment(self.now_ns, self.events))
+        until_ns = self.hold_until(ready, ChoicePoint(self.now_ns, self.events))
         self._held_until_ns = -1 if until_ns is None else until_ns
         if until_ns is None:
             return False
         self.schedule(until_ns, lambda: None)
         return True
 
-    def runnable(self) -> list[Place]:
+    def runnable(self) -> list[ReadyItem]:
         """Return all that could run now: tasks, what is ready, and due timers."""
         return [*self._tasks.runnable(), *self._waiting()]
 
-    def starved(self) -> list[Place]:
+    def starved(self) -> list[ReadyItem]:
         """Return what is ready but finds no free worker."""
         due, _ = self.timers.due(self.now_ns)
         timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
         every = [*self._tasks.places, *self._ready.places, *timers]
         return [place for place in every if place.workers is not None and place.workers.are_busy]
 
-    def run_next(self, place: Place) -> None:
+    def run_next(self, place: ReadyItem) -> None:
         """Run one of ``runnable`` first, after the current event."""
         self._forced = place
 
@@ -233,7 +241,7 @@ class OrderedLoop(EventLoop):
 
         :raises RunError: the policy fails.
         """
-        moment = Moment(self.now_ns, self.events)
+        moment = ChoicePoint(self.now_ns, self.events)
         choice = self._chosen(ready, moment)
         if self.on_choice is not None:
             self.on_choice(ready, choice, moment)
@@ -241,19 +249,19 @@ class OrderedLoop(EventLoop):
             self.choices.add(choice)
         return choice
 
-    def _waiting(self) -> list[Place]:
+    def _waiting(self) -> list[ReadyItem]:
         due, _ = self.timers.due(self.now_ns)
         timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
         return [*self._ready.runnable(), *filter(self._runs, timers)]
 
-    def _take_out(self, place: Place) -> None:
+    def _take_out(self, place: ReadyItem) -> None:
         for queue in (self._ready.places, self._tasks.places):
             for index, other in enumerate(queue):
                 if other is place:
                     del queue[index]
                     return
 
-    def _chosen(self, ready: list[Candidate], moment: Moment) -> int:
+    def _chosen(self, ready: list[Candidate], moment: ChoicePoint) -> int:
         name = type(self.policy).__qualname__
         try:
             choice = self.policy.choose(ready, moment)
@@ -270,13 +278,13 @@ class OrderedLoop(EventLoop):
             )
         return choice
 
-    def _runs(self, place: Place) -> bool:
+    def _runs(self, place: ReadyItem) -> bool:
         workers = place.workers
         if workers is not None and workers.are_busy:
             return False
         return place.exclusive is None or place.exclusive not in self._held
 
-    def _dispatch(self, place: Place) -> None:
+    def _dispatch(self, place: ReadyItem) -> None:
         """Run an event and keep its worker busy for its execution time."""
         workers = place.workers
         item: Dispatchable = place.candidate.item

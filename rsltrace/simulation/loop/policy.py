@@ -12,7 +12,7 @@ from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.trace.model.texts import format_seconds
 
 # A policy's choices are recorded, one byte each. A trace's events are not enough to repeat them:
@@ -43,7 +43,7 @@ class PolicyChoices:
         return bytes(self._data)
 
 
-def decoded(data: bytes) -> Iterator[int]:
+def decode_choices(data: bytes) -> Iterator[int]:
     at = 0
     while at < len(data):
         index, at = data[at], at + 1
@@ -75,24 +75,24 @@ class Candidate:
     executor: str = ""
 
 
-class Moment(NamedTuple):
+class ChoicePoint(NamedTuple):
     """When a policy is asked: simulated time, and how many events have run."""
 
     now_ns: int
     events: int
 
 
-class Policy(Protocol):
+class ExecutionPolicy(Protocol):
     """Chooses what runs next."""
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         """Return the index of the one to run; ``ready`` is never empty."""
 
 
 class Fifo:
     """First come, first served; timers when nothing else is ready."""
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         return 0
 
 
@@ -123,7 +123,7 @@ class Priority:
         self._rules = tuple(rules)
         self._default = default
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         return max(range(len(ready)), key=lambda i: (self.priority(ready[i]), -i))
 
     def priority(self, candidate: Candidate) -> int:
@@ -141,7 +141,7 @@ class RateMonotonic:
 
     follows_chains = True
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         never = float("inf")
         periods = [never if one.period_ns is None else one.period_ns for one in ready]
         return periods.index(min(periods))
@@ -150,10 +150,10 @@ class RateMonotonic:
 class Permutation:
     """What is ready at one instant runs in an order that a seeded stream decides."""
 
-    def __init__(self, stream: Stream) -> None:
+    def __init__(self, stream: RandomStream) -> None:
         self._below = stream.below
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         return self._below(len(ready)) if len(ready) > 1 else 0
 
 
@@ -190,7 +190,7 @@ class Departures:
         self.choices = 0
         """How many choices there have been."""
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         if len(ready) == 1:
             return 0
         departure = self._departures.get(self.choices)
@@ -207,7 +207,9 @@ class Departures:
         return sorted(choice for choice in self._departures if choice >= self.choices)
 
 
-def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Moment) -> RunError:
+def _cannot_depart(
+    departure: Departure, ready: Sequence[Candidate], moment: ChoicePoint
+) -> RunError:
     what = f"candidate {departure.run}" + (f" ({departure.of})" if departure.of else "")
     names = ", ".join(f"{i}: {candidate_name(one)}" for i, one in enumerate(ready[:_SHOWN]))
     more = ", …" if len(ready) > _SHOWN else ""
@@ -221,14 +223,14 @@ def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Mom
 class FifoUntil:
     """First come, first served up to ``time_ns``, then another policy."""
 
-    def __init__(self, time_ns: int, policy: Policy) -> None:
+    def __init__(self, time_ns: int, policy: ExecutionPolicy) -> None:
         self._time_ns = time_ns
         self._policy = policy
         self.follows_chains = getattr(policy, "follows_chains", False)
         self.polls_from_ns = time_ns if hasattr(policy, "polls_from_ns") else None
         self.forget = getattr(policy, "forget", None)
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         return 0 if moment.now_ns <= self._time_ns else self._policy.choose(ready, moment)
 
 
@@ -241,7 +243,7 @@ class Pct:
     ``depth`` constraints is met with a probability of at least 1 / (entities x choices^(depth-1)).
     """
 
-    def __init__(self, stream: Stream, depth: int, choices: int) -> None:
+    def __init__(self, stream: RandomStream, depth: int, choices: int) -> None:
         self._stream = stream
         self._choices = 0
         self._changes: dict[int, list[int]] = {}
@@ -250,7 +252,7 @@ class Pct:
         self._depth = depth
         self._priorities: dict[tuple[int, int], float] = {}
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         for one in ready:
             if (one.entity_id, one.thread) not in self._priorities:
                 self._priorities[one.entity_id, one.thread] = self._depth + self._stream.uniform()

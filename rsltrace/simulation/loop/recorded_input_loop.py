@@ -14,7 +14,7 @@ from heapq import heappop
 from typing import Any, Protocol
 
 from rsltrace.simulation.loop.loop import EventLoop
-from rsltrace.simulation.loop.ordered import OrderedLoop, Place
+from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem
 from rsltrace.simulation.loop.stop import Progress, Stop
 from rsltrace.trace.model.event import EventKind
 
@@ -189,7 +189,9 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
         item.dispatch()
         return True
 
-    def _recorded_choice(self, places: list[Place], step: RecordedStep | None) -> Place | None:
+    def _recorded_choice(
+        self, places: list[ReadyItem], step: RecordedStep | None
+    ) -> ReadyItem | None:
         if step is not None:
             for place in places:
                 if not _has_no_event(place.candidate.item) and self._matches(place, step):
@@ -204,20 +206,20 @@ class OrderedRecordedInputLoop(RecordedInputLoop, OrderedLoop):
         entity, following = self.script.entity, self.script.following
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
 
-    def _next_for_poll(self, free: list[Place], step: RecordedStep | None) -> Place:
+    def _next_for_poll(self, free: list[ReadyItem], step: RecordedStep | None) -> ReadyItem:
         """Return the next recorded item if it is ready: the policy let the poll wait."""
         if step is None:
             return free[0]
         return next((place for place in free if self._matches(place, step)), free[0])
 
-    def _matches(self, place: Place, step: RecordedStep) -> bool:
+    def _matches(self, place: ReadyItem, step: RecordedStep) -> bool:
         candidate = place.candidate
         recorded = self.script.entity(candidate.entity_id)
         if recorded < 0 and candidate.kind == _QOS_EVENT:  # which has its id when it runs first
             return step.kind == EventKind.QOS_EVENT
         return recorded == step.entity
 
-    def _waits_for_recording(self, place: Place) -> bool:
+    def _waits_for_recording(self, place: ReadyItem) -> bool:
         """Whether it waits for its recorded time."""
         candidate = place.candidate
         if (
@@ -234,7 +236,7 @@ def _is_handed_over(item: Any) -> bool:
     return getattr(getattr(item, "node", None), "mailbox", None) is not None
 
 
-def _is_poll(place: Place) -> bool:
+def _is_poll(place: ReadyItem) -> bool:
     """Whether it is a call that only polls, and then has no event."""
     return bool(getattr(place.candidate.item, "quiet", False))
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
-from rsltrace.simulation.loop.policy import Candidate, FifoUntil, Moment
-from rsltrace.simulation.loop.wait_set import RclpyWaitSet
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint, FifoUntil
+from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_seconds
@@ -72,7 +72,7 @@ class RecordedOrder:
         self,
         file: str,
         event: Callable[[int], RecordedEvent | None],
-        chosen: Callable[[Sequence[Candidate], Moment], int | None] | None,
+        chosen: Callable[[Sequence[Candidate], ChoicePoint], int | None] | None,
         name_of: Callable[[int], str | None],
     ) -> None:
         self.file = file
@@ -82,12 +82,12 @@ class RecordedOrder:
         self.polls_from_ns: int | None = None
         self.forget: Callable[[str], None] | None = None
 
-    def poll_as(self, policy: RclpyWaitSet | FifoUntil) -> None:
+    def poll_as(self, policy: RclpyWaitSetPolicy | FifoUntil) -> None:
         """Let executors poll as in the recording: this policy's choices follow from the events."""
         self._chosen = policy.choose
         self.polls_from_ns, self.forget = policy.polls_from_ns, policy.forget
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         chosen = None if self._chosen is None else self._chosen(ready, moment)
         expected = self.event(moment.events)
         if expected is None:
@@ -106,7 +106,7 @@ class RecordedOrder:
         raise self._cannot_choose(ready, moment, expected)
 
     def _cannot_choose(
-        self, ready: Sequence[Candidate], moment: Moment, expected: RecordedEvent
+        self, ready: Sequence[Candidate], moment: ChoicePoint, expected: RecordedEvent
     ) -> RunError:
         names = ", ".join(f"{c.node}: {c.kind} {c.entity}" for c in ready[:_SHOWN])
         more = ", …" if len(ready) > _SHOWN else ""
@@ -182,7 +182,7 @@ class NativeOrder:
         self._in_turn = self._late = self._others = 0
         self._first: tuple[NativeCallback, str] | None = None
 
-    def hold_until(self, ready: Sequence[Candidate], moment: Moment) -> int | None:
+    def hold_until(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int | None:
         """Return until when all that is ready waits for earlier callbacks; None: run one now."""
         places = [self._place(one) for one in ready]
         first = (
@@ -193,7 +193,7 @@ class NativeOrder:
         until_ns = self._observed[first].event.stamp_ns - self._ahead_ns
         return until_ns if until_ns > moment.now_ns else None
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         places = [self._place(one) for one in ready]
         if self._next in places:
             return places.index(self._next)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rsltrace.simulation.loop.policy import Candidate, Moment
+from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
 
 _RCLCPP = ("timer", "subscription", "service", "client")
 _RCLPY = ("timer", "subscription", "guard_condition", "client", "service")
@@ -18,7 +18,7 @@ _ON_NO_EXECUTOR = frozenset(("resume", "thread"))
 _Key = tuple[int, int]
 
 
-class WaitSet:
+class RclcppWaitSetPolicy:
     """rclcpp's executor, up to Humble, as the analyses have it: a timer that is due runs first,
     polling point or not; then what the last polling point has found: subscriptions, services,
     clients, others, each kind in the order of creation."""
@@ -26,7 +26,7 @@ class WaitSet:
     def __init__(self) -> None:
         self._found: dict[str, set[_Key]] = {}
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         executor = ready[0].executor
         mine = [index for index, one in enumerate(ready) if one.executor == executor]
         at_once = [index for index in mine if ready[index].kind == "timer"]
@@ -46,7 +46,7 @@ class WaitSet:
         return _rank(_RCLCPP, candidate.kind, last=True), candidate.entity_id
 
 
-class RclpyWaitSet(WaitSet):
+class RclpyWaitSetPolicy(RclcppWaitSetPolicy):
     """rclpy's executors, including the user's own. They work in rounds: first the tasks that exist,
     the newest first (the oldest first in releases whose tasks say so); then what a polling point
     finds, each entity once: actions and other waitables, then node by node timers, subscriptions,
@@ -59,7 +59,7 @@ class RclpyWaitSet(WaitSet):
         super().__init__()
         self._rounds: dict[str, _PollingRound] = {}
 
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
         for index, one in enumerate(ready):
             if one.kind in _ON_NO_EXECUTOR:
                 return index

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import Door
+from rsltrace.simulation.middleware.events.event import ExceptionHandler
 from rsltrace.simulation.middleware.events.failure import RunEndingExceptionHandler
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
@@ -59,7 +59,9 @@ class Domain:
                 publisher.observers = found
         return found
 
-    def join(self, name: str, namespace: str = "/", door: Door | None = None) -> Participant:
+    def join(
+        self, name: str, namespace: str = "/", door: ExceptionHandler | None = None
+    ) -> Participant:
         """Make a participant. Without a ``door`` of its own, an exception ends the run."""
         participant = Participant(self.dispatcher, name, namespace, door or self._door)
         self.graph.add_node(participant)

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.interface import source_of
+from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 
 
@@ -89,7 +89,7 @@ class DomainEntity:
 
     def entity(self) -> Entity:
         detail = self.trace_detail()
-        if source := source_of(self.user_callback()):
+        if source := callback_source(self.user_callback()):
             detail["source"] = source
         if group := self.trace_group():
             detail["group"] = group

@@ -69,20 +69,22 @@ class AllTopicFaults(dict[str, TopicFaults]):
 _WRAPPED_MAX = 50
 
 
-def source_of(callback: object) -> str:
+def callback_source(callback: object) -> str:
     """Return ``package/module.py:24`` of the function that a callback runs in the end, or "".
 
     The line is that of ``def``, or of its first decorator. The file is named as it is imported, so
     that traces do not differ by the folder in which they were made.
     """
-    found = function_of(callback)
+    found = callback_code(callback)
     if found is None:
         return ""
     code, names = found
-    return f"{file_of(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
+    return (
+        f"{imported_file(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
+    )
 
 
-def function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:
+def callback_code(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:
     """Return the code that a callback runs in the end, with its module's names; None if unknown.
 
     Goes through methods, partials, decorators and callable objects (which may answer anything).
@@ -110,7 +112,7 @@ def function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | Non
     return None
 
 
-def file_of(code: CodeType, names: Mapping[str, object]) -> str:
+def imported_file(code: CodeType, names: Mapping[str, object]) -> str:
     """Return a code's file as it is imported, ``package/module.py``: the same on any machine."""
     path = PurePath(code.co_filename)
     module = names.get("__name__")

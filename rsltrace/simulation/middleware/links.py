@@ -28,7 +28,7 @@ from rsltrace.simulation.middleware.qos.timing import RequestedLease, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT
-from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
+from rsltrace.trace.model.event import OutputKind, RandomDecision, encode_decision
 
 # Fast links: every message arrives, in order, at once or later. With a delay on every link, most
 # events of a run come this way, so lookups are bound once in a closure, arrivals go straight into
@@ -37,7 +37,7 @@ from rsltrace.trace.model.event import Draw, OutputKind, encode_draw
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
-_FAST_LINK_DELAY = encode_draw(Draw.DELAY)
+_FAST_LINK_DELAY = encode_decision(RandomDecision.DELAY)
 _DRAW = int(OutputKind.DRAW)
 _pack_output = OUTPUT_CONTENT.pack
 
@@ -139,11 +139,11 @@ def direct_send(dispatcher: Dispatcher, link: FastLink) -> Send:
 # number: what a Delivery has from [4] on.
 Message = tuple[bytes, int, int, int, int, int]
 
-_DELAY = encode_draw(Draw.DELAY)
+_DELAY = encode_decision(RandomDecision.DELAY)
 _LOST = {
-    LOST_DROP: encode_draw(Draw.DROP),
-    LOST_BURST: encode_draw(Draw.BURST),
-    LOST_OUTAGE: encode_draw(Draw.OUTAGE),
+    LOST_DROP: encode_decision(RandomDecision.DROP),
+    LOST_BURST: encode_decision(RandomDecision.BURST),
+    LOST_OUTAGE: encode_decision(RandomDecision.OUTAGE),
 }
 
 
@@ -175,7 +175,9 @@ class ServiceLink:
             dispatcher.draw(self._entity, _DELAY | delay_ns)
         elif channel is not None:
             delay_ns = channel.transmit(arrival_ns)
-            draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
+            draw = (
+                _LOST[delay_ns] if delay_ns < 0 else encode_decision(RandomDecision.DELAY, delay_ns)
+            )
             dispatcher.draw(self._entity, draw)
             if delay_ns < 0:
                 return
@@ -262,11 +264,13 @@ class PublisherLink:
                 dispatcher.draw(self._receiver, _LOST[delay_ns])
                 self._lost += 1
                 return
-            dispatcher.draw(self._receiver, encode_draw(Draw.DELAY, delay_ns))
+            dispatcher.draw(self._receiver, encode_decision(RandomDecision.DELAY, delay_ns))
             arrivals_ns = [arrival_ns + delay_ns]
             if channel.duplicate_ns >= 0:
                 copy_ns = arrival_ns + channel.duplicate_ns
-                dispatcher.draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+                dispatcher.draw(
+                    self._receiver, encode_decision(RandomDecision.DUPLICATE, copy_ns - now_ns)
+                )
                 arrivals_ns.append(copy_ns)
             self.last_ns = max(self.last_ns, *arrivals_ns)
             if channel.held_until_ns >= 0:
@@ -290,14 +294,14 @@ class PublisherLink:
             self._lost += 1
             return
         arrivals_ns = [max(sent_ns + delay_ns, self._behind_ns)]
-        draw(self._receiver, encode_draw(Draw.DELAY, fault.late_ns + delay_ns))
+        draw(self._receiver, encode_decision(RandomDecision.DELAY, fault.late_ns + delay_ns))
         if channel is not None and channel.duplicate_ns >= 0:
             arrivals_ns.append(sent_ns + channel.duplicate_ns)
         if fault.copy_ns >= 0:
             arrivals_ns.append(arrivals_ns[-1] + fault.copy_ns)
         now_ns = self._loop.now_ns
         for copy_ns in arrivals_ns[1:]:
-            draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+            draw(self._receiver, encode_decision(RandomDecision.DUPLICATE, copy_ns - now_ns))
         if channel is None:
             self._behind_ns = arrivals_ns[-1]
         else:

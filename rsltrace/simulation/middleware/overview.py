@@ -22,7 +22,7 @@ _STATIC_TRANSFORMS = "/tf_static"
 
 
 @dataclass(frozen=True, slots=True)
-class End:
+class GraphEnd:
     """One end of a topic, service or action: the node, and (of a topic) its QoS as text."""
 
     node: str
@@ -30,7 +30,7 @@ class End:
 
 
 @dataclass(frozen=True, slots=True)
-class Link:
+class GraphLink:
     """A topic, service or action with its ends in creation order. ``senders`` publish or call,
     ``receivers`` subscribe or serve. ``apart`` has (sender, receiver, policies) of incompatible
     pairs."""
@@ -38,9 +38,9 @@ class Link:
     kind: str
     name: str
     type: str
-    senders: tuple[End, ...]
-    receivers: tuple[End, ...]
-    apart: tuple[tuple[End, End, str], ...] = ()
+    senders: tuple[GraphEnd, ...]
+    receivers: tuple[GraphEnd, ...]
+    apart: tuple[tuple[GraphEnd, GraphEnd, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,15 +53,15 @@ class GraphNode:
 
 
 @dataclass(frozen=True, slots=True)
-class Overview:
+class GraphOverview:
     """The graph after construction. ``waiting`` says what has not finished."""
 
     nodes: tuple[GraphNode, ...]
-    links: tuple[Link, ...]
+    links: tuple[GraphLink, ...]
     waiting: tuple[str, ...] = ()
     problems: tuple[str, ...] = field(default=())
 
-    def of_kind(self, kind: str) -> list[Link]:
+    def of_kind(self, kind: str) -> list[GraphLink]:
         """Return the links of one kind (``topic``, ``service``, ``action``)."""
         return [link for link in self.links if link.kind == kind]
 
@@ -72,7 +72,7 @@ def graph_overview(
     *,
     everything: bool = False,
     follows: Callable[[str], bool] = lambda node: False,
-) -> Overview:
+) -> GraphOverview:
     """Return the current graph; ``everything`` includes what every node has.
 
     ``follows`` says whether ``/clock`` drives a node's time; other nodes subscribe to it in vain.
@@ -87,7 +87,7 @@ def graph_overview(
     links.sort(key=lambda link: (link.kind, link.name))
     moving = any(link.name == _TRANSFORMS and link.senders for link in links)
     doubtful = [link for link in links if not (moving and _is_unheard_static(link))]
-    return Overview(
+    return GraphOverview(
         nodes,
         tuple(links),
         waiting=tuple(waiting),
@@ -108,10 +108,10 @@ def _namesakes(nodes: Iterable[GraphNode]) -> Iterator[str]:
             )
 
 
-def _topics(graph: Graph) -> Iterator[Link]:
+def _topics(graph: Graph) -> Iterator[GraphLink]:
     for name, (type_name,) in graph.topic_names_and_types():
         publishers, subscriptions = graph.publishers(name), graph.subscriptions(name)
-        yield Link(
+        yield GraphLink(
             "topic",
             name,
             type_name,
@@ -130,30 +130,30 @@ def _topics(graph: Graph) -> Iterator[Link]:
         )
 
 
-def _services(graph: Graph) -> Iterator[Link]:
+def _services(graph: Graph) -> Iterator[GraphLink]:
     for name, (type_name, *_) in graph.service_names_and_types():
-        yield Link(
+        yield GraphLink(
             "service",
             name,
             type_name,
-            tuple(End(_name_of(client)) for client in graph.clients(name)),
-            tuple(End(_name_of(server)) for server in graph.services(name)),
+            tuple(GraphEnd(_name_of(client)) for client in graph.clients(name)),
+            tuple(GraphEnd(_name_of(server)) for server in graph.services(name)),
         )
 
 
-def _actions(graph: Graph) -> Iterator[Link]:
-    ends: dict[tuple[str, str], tuple[list[End], list[End]]] = {}
+def _actions(graph: Graph) -> Iterator[GraphLink]:
+    ends: dict[tuple[str, str], tuple[list[GraphEnd], list[GraphEnd]]] = {}
     for node in graph.nodes:
         for action in node.actions:
             key = (action.name, action.type_name)
             ends.setdefault(key, ([], []))[0 if action.is_client else 1].append(
-                End(node.fully_qualified_name)
+                GraphEnd(node.fully_qualified_name)
             )
     for (name, type_name), (clients, servers) in ends.items():
-        yield Link("action", name, type_name, tuple(clients), tuple(servers))
+        yield GraphLink("action", name, type_name, tuple(clients), tuple(servers))
 
 
-def _end(endpoint: Publisher | Subscription) -> End:
+def _end(endpoint: Publisher | Subscription) -> GraphEnd:
     qos = endpoint.qos
     history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
     words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
@@ -162,14 +162,14 @@ def _end(endpoint: Publisher | Subscription) -> End:
         words.append("liveliness manual by topic")
     limits = {"deadline": qos.deadline_ns, "lease": qos.lease_ns, "lifespan": qos.lifespan_ns}
     words += [f"{name} {format_duration(ns)}" for name, ns in limits.items() if finite(ns)]
-    return End(_name_of(endpoint), ", ".join(words))
+    return GraphEnd(_name_of(endpoint), ", ".join(words))
 
 
 def _name_of(endpoint: DomainEntity) -> str:
     return "(no node)" if endpoint.node is None else str(endpoint.node.fully_qualified_name)
 
 
-def _is_everywhere(link: Link) -> bool:
+def _is_everywhere(link: GraphLink) -> bool:
     """Whether a link is one that rclpy makes for every node, or part of an action."""
     if _ACTION in link.name:
         return True
@@ -180,12 +180,12 @@ def _is_everywhere(link: Link) -> bool:
     )
 
 
-def _is_unheard_static(link: Link) -> bool:
+def _is_unheard_static(link: GraphLink) -> bool:
     """Whether a link is the ``/tf_static`` subscription of tf2 listeners, without publishers."""
     return link.name == _STATIC_TRANSFORMS and not link.senders
 
 
-def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:
+def _problems(link: GraphLink, follows: Callable[[str], bool]) -> Iterator[str]:
     for sender, receiver, policy in link.apart:
         yield (
             f"topic {link.name}: {sender.node} and {receiver.node} do not connect: {policy} "

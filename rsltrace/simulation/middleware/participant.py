@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.events.event import Door, ParticipantState
+from rsltrace.simulation.middleware.events.event import ExceptionHandler, ParticipantState
 from rsltrace.simulation.middleware.qos.status import EndpointEvents
 from rsltrace.simulation.middleware.timer import Timer
 from rsltrace.trace.model.entity import EntityKind
@@ -88,7 +88,9 @@ class Participant(DomainEntity):
     """What waits to run, besides its callbacks, while it hangs."""
     number = 1
 
-    def __init__(self, dispatcher: Dispatcher, name: str, namespace: str, door: Door) -> None:
+    def __init__(
+        self, dispatcher: Dispatcher, name: str, namespace: str, door: ExceptionHandler
+    ) -> None:
         super().__init__(dispatcher, None)
         self.node = self
         self.name = name

@@ -9,15 +9,15 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from rsltrace.simulation.chance.distribution import Distribution, Sampler
-from rsltrace.simulation.chance.stream import Stream
-from rsltrace.simulation.loop.ordered import OrderedLoop, Place, Workers
-from rsltrace.simulation.loop.policy import Candidate, Policy
+from rsltrace.simulation.chance.stream import RandomStream
+from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem, SimulatedExecutor
+from rsltrace.simulation.loop.policy import Candidate, ExecutionPolicy
 from rsltrace.simulation.middleware.entity import Receiver, Runnable
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.event import EventOwner, OutsideEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.simulation.middleware.participant import Participant
-from rsltrace.trace.model.event import Draw, EventKind, encode_draw
+from rsltrace.trace.model.event import EventKind, RandomDecision, encode_decision
 
 # The period of a subscription (service, client) is that of the fastest chain that has reached it;
 # without a timer as cause (bags, drivers), that of its node's fastest timer.
@@ -107,7 +107,7 @@ class SchedulingPlan:
     workers at all.
     """
 
-    policy: Policy
+    policy: ExecutionPolicy
     executors: tuple[ExecutorRule, ...] = ()
     execution: tuple[ExecutionRule, ...] = ()
     occupies: bool = False
@@ -120,7 +120,7 @@ class Scheduling:
 
     def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
         self._plan = plan
-        self._workers: dict[object, Workers] = {}
+        self._workers: dict[object, SimulatedExecutor] = {}
         loop.policy = plan.policy
         loop.place = self.place
         self._rates: ChainPeriods | None = None
@@ -129,7 +129,7 @@ class Scheduling:
         if plan.execution:
             dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
 
-    def place(self, item: Any) -> Place:
+    def place(self, item: Any) -> ReadyItem:
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
         workers = self._workers_of(what)
@@ -144,9 +144,9 @@ class Scheduling:
             what.thread,
             "" if workers is None else workers.name,
         )
-        return Place(candidate, workers, what.group, what.told)
+        return ReadyItem(candidate, workers, what.group, what.told)
 
-    def _workers_of(self, what: Runnable) -> Workers | None:
+    def _workers_of(self, what: Runnable) -> SimulatedExecutor | None:
         """Return the simulated executor of an item, or None."""
         if not self._plan.occupies or what.node is None or not what.executor:
             return None
@@ -159,7 +159,7 @@ class Scheduling:
                 break
         workers = self._workers.get(key)
         if workers is None:
-            workers = self._workers[key] = Workers(str(key), count)
+            workers = self._workers[key] = SimulatedExecutor(str(key), count)
         return workers
 
 
@@ -174,14 +174,16 @@ class ExecutionTimes(EventObserver):
         self._counts: dict[tuple[str, str, str], int] = {}
 
     def before_event(self, call: EventCall) -> bool:
-        """Draw the execution time, and charge it when the callback is over."""
+        """RandomDecision the execution time, and charge it when the callback is over."""
         event, charge = self._dispatcher.event, self._loop.charge
         duration = None
         if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):
             duration = self._duration_of(call.handle, call.entity, call.node)
         duration_ns = 0 if duration is None else duration(self._loop.now_ns)
         if duration is not None:
-            self._dispatcher.draw(call.entity, encode_draw(Draw.EXECUTION, duration_ns))
+            self._dispatcher.draw(
+                call.entity, encode_decision(RandomDecision.EXECUTION, duration_ns)
+            )
         before, event.busy_ns = event.busy_ns, duration_ns
 
         def ended() -> None:
@@ -207,7 +209,7 @@ class ExecutionTimes(EventObserver):
                 if fnmatchcase(owner, rule.node) and (
                     rule.entity is None or fnmatchcase(name, rule.entity)
                 ):
-                    stream = Stream(
+                    stream = RandomStream(
                         self._plan.seed, f"execution\0{owner}\0{kind}\0{name}\0{ordinal}"
                     )
                     sampler = rule.duration.sampler(stream, self._plan.start_ns)

@@ -45,7 +45,7 @@ class ServiceInfo:
 Exchange = tuple[bytes, int, int, int, ServiceInfo]
 
 
-class ServiceEnd(Receiver):
+class ServiceEndpoint(Receiver):
     def __init__(
         self, transport: Transport, node: Any, service: str, type: ServiceType, qos: Qos
     ) -> None:
@@ -88,7 +88,7 @@ class ServiceEnd(Receiver):
         self.queue.clear()
 
 
-class Service(ServiceEnd):
+class Service(ServiceEndpoint):
     """Serves; ``callback`` is called with a request's bytes and returns the response's."""
 
     kind = EntityKind.SERVICE
@@ -137,7 +137,7 @@ class Service(ServiceEnd):
         return {"callback": callback_name(self.user_callback())}
 
 
-class Client(ServiceEnd):
+class Client(ServiceEndpoint):
     """Calls a service; each request's ``callback`` is called with the response's bytes."""
 
     kind = EntityKind.CLIENT

@@ -15,7 +15,7 @@ from rsltrace.trace.mcap.records import (
     MESSAGE,
     MESSAGE_HEAD,
     RECORD_HEAD,
-    Damaged,
+    DamageError,
     RecordSpan,
     records_in,
 )
@@ -50,25 +50,25 @@ def read_chunk(
     and extra fields at the end of a record; ``strict`` does not.
     """
     if span.length < _CHUNK_HEAD.size:
-        raise Damaged(f"its length is given as {span.length}")
+        raise DamageError(f"its length is given as {span.length}")
     record = source.read_at(*span)
     opcode, length, _, _, size, crc, text = _CHUNK_HEAD.unpack_from(record)
     if opcode != Opcode.CHUNK or length + _HEAD_BYTES != span.length:
-        raise Damaged("there is no chunk where the index says")
+        raise DamageError("there is no chunk where the index says")
     data_at = _CHUNK_HEAD.size + text + _U64.size
     data_end = data_at
     if data_at <= span.length:
         data_end += _U64.unpack_from(record, data_at - _U64.size)[0]
     if data_end > span.length or (strict and data_end != span.length):
-        raise Damaged("the chunk's bytes do not end where its record does")
+        raise DamageError("the chunk's bytes do not end where its record does")
     if size > size_max:
-        raise Damaged(f"a chunk of {size} bytes, where at most {size_max} can be")
+        raise DamageError(f"a chunk of {size} bytes, where at most {size_max} can be")
     data = memoryview(record)[data_at:data_end]
     records = _unpacked(data, record[_CHUNK_HEAD.size : data_at - _U64.size], size)
     if len(records) != size:
-        raise Damaged(f"the chunk holds {len(records)} bytes where {size} are promised")
+        raise DamageError(f"the chunk holds {len(records)} bytes where {size} are promised")
     if (crc or strict) and crc32(records) != crc:
-        raise Damaged("the chunk's CRC does not match its content")
+        raise DamageError("the chunk's CRC does not match its content")
     return records
 
 
@@ -80,7 +80,7 @@ def _unpacked(data: memoryview, compression: bytes, size: int) -> bytes:
     if compression == b"lz4":
         return _unlz4(data, size)
     name = compression.decode("utf-8", "replace")
-    raise Damaged(f"the compression {name!r} is unknown (not zstd or lz4)")
+    raise DamageError(f"the compression {name!r} is unknown (not zstd or lz4)")
 
 
 def _unzstd(data: memoryview, size: int) -> bytes:
@@ -90,12 +90,12 @@ def _unzstd(data: memoryview, size: int) -> bytes:
         # The frame may claim any size, so check it before allocating memory.
         claimed = zstandard.frame_content_size(data)
         if claimed > size:
-            raise Damaged(f"the chunk holds {claimed} bytes where {size} are promised")
+            raise DamageError(f"the chunk holds {claimed} bytes where {size} are promised")
         if size == 0:
             return b""
         return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except (zstandard.ZstdError, MemoryError) as error:
-        raise Damaged(f"the chunk cannot be decompressed ({error})") from None
+        raise DamageError(f"the chunk cannot be decompressed ({error})") from None
 
 
 def _unlz4(data: memoryview, size: int) -> bytes:
@@ -104,20 +104,20 @@ def _unlz4(data: memoryview, size: int) -> bytes:
     try:
         return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
     except (RuntimeError, EOFError, MemoryError) as error:
-        raise Damaged(f"the chunk cannot be decompressed ({error})") from None
+        raise DamageError(f"the chunk cannot be decompressed ({error})") from None
 
 
 def message_at(records: bytes, offset: int, of_channel: int) -> ChunkMessage:
     """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none of that
     channel."""
     if offset + _MESSAGE_BYTES_MIN > len(records):
-        raise Damaged(f"no message fits at {offset} of the chunk")
+        raise DamageError(f"no message fits at {offset} of the chunk")
     opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
     end = offset + _HEAD_BYTES + length
     if opcode != MESSAGE or length < _MESSAGE_BYTES_MIN - _HEAD_BYTES or end > len(records):
-        raise Damaged(f"there is no whole message at {offset} of the chunk")
+        raise DamageError(f"there is no whole message at {offset} of the chunk")
     if channel_id != of_channel:
-        raise Damaged(f"the message at {offset} is of another channel than the index says")
+        raise DamageError(f"the message at {offset} is of another channel than the index says")
     return ChunkMessage(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
 
 
@@ -141,7 +141,7 @@ def cut_messages(
             at = following
             continue
         if following > end or following - at < shortest:
-            raise Damaged("a message runs past the end of its chunk")
+            raise DamageError("a message runs past the end of its chunk")
         number = number_of(channel)
         if number is not None and stamp_ns >= first_ns:
             messages.append((stamp_ns, number, records[at + data_at : following]))
@@ -151,7 +151,7 @@ def cut_messages(
         at = following
     # The rest can only be other records, shorter than any message.
     if at > end or any(opcode == MESSAGE for opcode, _, _ in records_in(records[at:])):
-        raise Damaged("a record runs past the end of its chunk")
+        raise DamageError("a record runs past the end of its chunk")
     if not ordered:
         messages.sort(key=itemgetter(0))
     return messages

@@ -20,7 +20,7 @@ _NUMBERS_MAX = 4096
 _ROOM = 64
 
 
-class Descriptor:
+class PrivateDescriptor:
     """A descriptor that belongs to this process alone."""
 
     def __init__(self, fd: int) -> None:
@@ -32,7 +32,7 @@ class Descriptor:
         _all.add(self)
 
     @classmethod
-    def copy_of(cls, fd: int) -> Descriptor:
+    def copy_of(cls, fd: int) -> PrivateDescriptor:
         """Return a descriptor of the file of ``fd``, which stays open."""
         return cls(os.dup(fd))
 
@@ -80,7 +80,7 @@ def _moved(fd: int) -> int:
     return number
 
 
-_all: WeakSet[Descriptor] = WeakSet()
+_all: WeakSet[PrivateDescriptor] = WeakSet()
 
 
 def _close_in_child() -> None:

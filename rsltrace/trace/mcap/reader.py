@@ -16,12 +16,12 @@ from rsltrace.trace.mcap.records import (
     RECORD_HEAD,
     SUMMARY_BYTES_MAX,
     ChunkIndexEntry,
-    Damaged,
-    Fields,
+    DamageError,
     McapChannel,
     McapHeader,
     McapSchema,
     McapStatistics,
+    RecordFields,
     RecordSpan,
     TruncatedFile,
     channels_of_chunk_index,
@@ -42,11 +42,11 @@ _KNOWN = frozenset(map(int, Opcode))
 def read_body(source: ByteSource, span: RecordSpan, opcode: int) -> bytes:
     """Return the body of the record at ``span``. Raises Damaged if it is another record."""
     if not RECORD_HEAD.size <= span.length <= RECORD_BYTES_MAX:
-        raise Damaged(f"its length is given as {span.length}")
+        raise DamageError(f"its length is given as {span.length}")
     record = source.read_at(*span)
     found, length = RECORD_HEAD.unpack_from(record)
     if found != opcode or length + RECORD_HEAD.size != span.length:
-        raise Damaged("another record is there")
+        raise DamageError("another record is there")
     return record[RECORD_HEAD.size :]
 
 
@@ -58,11 +58,11 @@ def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int
     at = start
     while at < end:
         if at + RECORD_HEAD.size > end:
-            raise Damaged(f"the record at byte {at} is cut off")
+            raise DamageError(f"the record at byte {at} is cut off")
         opcode, length = RECORD_HEAD.unpack(source.read_at(at, RECORD_HEAD.size))
         span = RecordSpan(at, length + RECORD_HEAD.size)
         if span.end > end:
-            raise Damaged(f"the record at byte {at} runs past the end of its section")
+            raise DamageError(f"the record at byte {at} runs past the end of its section")
         yield opcode, span
         at = span.end
 
@@ -80,10 +80,10 @@ def whole_records(source: ByteSource) -> Iterator[tuple[int, RecordSpan]]:
                 break
             yield opcode, span
             at = span.end
-    except Damaged:
+    except DamageError:
         pass  # where it was cut, or is damaged
     if why := _damage_at(source, at):
-        raise Damaged(why)
+        raise DamageError(why)
 
 
 def _damage_at(source: ByteSource, at: int) -> str:
@@ -128,7 +128,7 @@ def length_by_fields(opcode: int, body: bytes) -> int | None:
     if opcode not in _BEFORE_TEXTS:
         return None
     fixed, texts = _BEFORE_TEXTS[Opcode(opcode)]
-    fields = Fields(body)
+    fields = RecordFields(body)
     try:
         fields.take(fixed)
         for number in range(texts):
@@ -137,7 +137,7 @@ def length_by_fields(opcode: int, body: bytes) -> int | None:
                 return fields.position + length
             fields.take(length)
         length = fields.u64()
-    except Damaged:
+    except DamageError:
         return None
     return fields.position + length + (4 if opcode == Opcode.ATTACHMENT else 0)
 
@@ -185,7 +185,7 @@ class McapSummary:
         elif opcode == _STATISTICS:
             self.statistics = parse_statistics(body)
         elif opcode in (_ATTACHMENT_INDEX, _METADATA_INDEX):
-            entry = Fields(body)
+            entry = RecordFields(body)
             span = RecordSpan(entry.u64(), entry.u64())
             if opcode == _ATTACHMENT_INDEX:
                 entry.take(24)  # log time, creation time, size
@@ -226,7 +226,7 @@ def read_footer(source: ByteSource) -> McapFooter:
     body = read_body(source, RecordSpan(offset, _FOOTER_BYTES), Opcode.FOOTER)
     start, _, crc = _FOOTER.unpack(body)
     if start and not len(MAGIC) < start <= offset:
-        raise Damaged("the summary would be outside of the file")
+        raise DamageError("the summary would be outside of the file")
     return McapFooter(offset, start, crc)
 
 
@@ -234,10 +234,10 @@ def read_summary(source: ByteSource, footer: McapFooter) -> McapSummary:
     """Return the summary. Raises Damaged."""
     length = footer.offset - footer.summary_start
     if length > SUMMARY_BYTES_MAX:
-        raise Damaged(f"it has {length} bytes, more than {SUMMARY_BYTES_MAX}")
+        raise DamageError(f"it has {length} bytes, more than {SUMMARY_BYTES_MAX}")
     data = source.read_at(footer.summary_start, length + _BEFORE_CRC)
     if footer.crc and crc32(data) != footer.crc:
-        raise Damaged("its CRC does not match")
+        raise DamageError("its CRC does not match")
     chunk_indexes: list[bytes] = []
     summary = McapSummary(chunk_indexes)
     records = data[:length]
@@ -262,4 +262,4 @@ def check_data(source: ByteSource, end: int) -> None:
     at = end - _DATA_END_BYTES
     body = read_body(source, RecordSpan(at, _DATA_END_BYTES), Opcode.DATA_END)
     if data_crc(source, at) != int.from_bytes(body, "little"):
-        raise Damaged("its checksum does not match")
+        raise DamageError("its checksum does not match")

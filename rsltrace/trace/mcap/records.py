@@ -79,11 +79,11 @@ _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 _CHANNEL_NUMBER = struct.Struct("<HQ")
 
 
-class Damaged(ValueError):
+class DamageError(ValueError):
     """The bytes are not what they should be. Callers that know the file add its name."""
 
 
-class TruncatedFile(Damaged):
+class TruncatedFile(DamageError):
     """The file ends too early."""
 
 
@@ -99,7 +99,7 @@ class RecordSpan(NamedTuple):
         return self.offset + self.length
 
 
-class Fields:
+class RecordFields:
     """Reads fields from the front of a record's body. Every method raises Damaged at its end."""
 
     __slots__ = ("_data", "position")
@@ -144,11 +144,11 @@ class Fields:
         try:
             return self._data[begin:end].decode()
         except UnicodeDecodeError as error:
-            raise Damaged(f"a text is not UTF-8: {error}") from error
+            raise DamageError(f"a text is not UTF-8: {error}") from error
 
     def mapping(self) -> dict[str, str]:
         """Return the next map of strings."""
-        inner = Fields(self.take(self.u32()))
+        inner = RecordFields(self.take(self.u32()))
         result = {}
         while not inner.at_end:
             key = inner.text()
@@ -159,7 +159,7 @@ class Fields:
         """Return the next map from channels to numbers."""
         data = self.take(self.u32())
         if len(data) % _CHANNEL_NUMBER.size:
-            raise Damaged("a map is cut off")
+            raise DamageError("a map is cut off")
         return list(_CHANNEL_NUMBER.iter_unpack(data))
 
     def _integer(self, layout: struct.Struct) -> int:
@@ -170,9 +170,9 @@ class Fields:
         self.position += layout.size
         return int(value)
 
-    def _ended(self, length: int) -> Damaged:
+    def _ended(self, length: int) -> DamageError:
         left = len(self._data) - self.position
-        return Damaged(f"{length} bytes are expected where {left} are left")
+        return DamageError(f"{length} bytes are expected where {left} are left")
 
 
 class McapHeader(NamedTuple):
@@ -224,26 +224,26 @@ class ChunkIndexEntry(NamedTuple):
 
 def parse_header(body: bytes) -> McapHeader:
     """Parse a Header record. All parsers raise Damaged."""
-    fields = Fields(body)
+    fields = RecordFields(body)
     return McapHeader(fields.text(), fields.text())
 
 
 def parse_schema(body: bytes) -> McapSchema:
     """Parse a Schema record."""
-    fields = Fields(body)
+    fields = RecordFields(body)
     return McapSchema(fields.u16(), fields.text(), fields.text(), fields.text())
 
 
 def parse_channel(body: bytes) -> McapChannel:
     """Parse a Channel record."""
-    fields = Fields(body)
+    fields = RecordFields(body)
     channel_id, schema_id = fields.u16(), fields.u16()
     return McapChannel(channel_id, schema_id, fields.text(), fields.text(), fields.mapping())
 
 
 def parse_statistics(body: bytes) -> McapStatistics:
     """Parse a Statistics record."""
-    fields = Fields(body)
+    fields = RecordFields(body)
     messages = fields.u64()
     fields.take(14)  # how many schemas, channels, attachments and metadata records there are
     chunks, start_ns, end_ns = fields.u32(), fields.u64(), fields.u64()
@@ -253,11 +253,11 @@ def parse_statistics(body: bytes) -> McapStatistics:
 def parse_chunk_index(body: bytes) -> ChunkIndexEntry:
     """Parse a ChunkIndex record."""
     if len(body) < _CHUNK_INDEX_HEAD.size:
-        raise Damaged("an entry of the list of chunks is cut off")
+        raise DamageError("an entry of the list of chunks is cut off")
     start_ns, end_ns, offset, length, size = _CHUNK_INDEX_HEAD.unpack_from(body)
     entries_end = _CHUNK_INDEX_HEAD.size + size
     if size % _CHANNEL_NUMBER.size or entries_end + _U64.size > len(body):
-        raise Damaged("an entry of the list of chunks is cut off")
+        raise DamageError("an entry of the list of chunks is cut off")
     indexes = list(_CHANNEL_NUMBER.iter_unpack(body[_CHUNK_INDEX_HEAD.size : entries_end]))
     end = offset + length + _U64.unpack_from(body, entries_end)[0]
     return ChunkIndexEntry(start_ns, end_ns, RecordSpan(offset, length), indexes, end)
@@ -277,10 +277,10 @@ def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
     at, size, unpack = 0, len(data), RECORD_HEAD.unpack_from
     while at < size:
         if at + _HEAD_BYTES > size:
-            raise Damaged("a record runs past the end of its chunk")
+            raise DamageError("a record runs past the end of its chunk")
         opcode, length = unpack(data, at)
         start = at + _HEAD_BYTES
         at = start + length
         if at > size:
-            raise Damaged("a record runs past the end of its chunk")
+            raise DamageError("a record runs past the end of its chunk")
         yield opcode, start, at

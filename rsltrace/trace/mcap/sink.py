@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rsltrace.errors import OutputError
 from rsltrace.trace.mcap.checksum import crc32, joined_crc
-from rsltrace.trace.mcap.descriptor import Descriptor
+from rsltrace.trace.mcap.descriptor import PrivateDescriptor
 from rsltrace.trace.mcap.records import MAGIC
 
 if sys.platform != "win32":
@@ -33,7 +33,7 @@ _PARTS_MAX = 512
 """The number of parts in one call; Linux allows 1024."""
 
 
-def unfinished(path: Path) -> Path:
+def unfinished_path(path: Path) -> Path:
     """Return the path of the trace that will replace the one at ``path``, while it is written."""
     real = Path(os.path.realpath(path)) if path.is_symlink() else path
     return real.with_name(f"{real.stem}.unfinished{real.suffix}")
@@ -62,7 +62,7 @@ class Sink:
         if replaced is None:
             flags |= os.O_EXCL
         else:
-            self.place = unfinished(path)
+            self.place = unfinished_path(path)
             _check_replaceable(self.place)
         # A node may change the working directory.
         self._final = os.path.realpath(path)
@@ -70,7 +70,7 @@ class Sink:
         if replaced is not None:
             self._absolute = os.path.join(os.path.dirname(self._final), self.place.name)
         try:
-            self._descriptor = Descriptor(os.open(self._absolute, flags, 0o666))
+            self._descriptor = PrivateDescriptor(os.open(self._absolute, flags, 0o666))
         except OSError as error:
             raise OutputError(_why_not_created(self.place, error)) from error
         self._lock()
@@ -170,7 +170,7 @@ class Sink:
         """Open the file again: a node closed the descriptor or used its number."""
         if self.closed:
             raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-        again = Descriptor(os.open(self._absolute, _OPEN))
+        again = PrivateDescriptor(os.open(self._absolute, _OPEN))
         if again.identity != self._descriptor.identity:
             again.close()
             raise self._spoilt("another file has its name")

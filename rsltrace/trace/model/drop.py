@@ -10,7 +10,7 @@ _KEPT = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Drop:
+class QueueDrops:
     """How many messages a full queue of ``depth`` dropped: that of the receiving entity or,
     ``in_outage``, that of a publisher that could not reach it."""
 
@@ -20,17 +20,17 @@ class Drop:
     in_outage: bool = False
 
 
-def kept_drops(drops: Iterable[Drop]) -> dict[str, str]:
+def encode_drops(drops: Iterable[QueueDrops]) -> dict[str, str]:
     """Return the entry of a run's result for its drops."""
     kept = [astuple(one) for one in drops][:_KEPT]
     return {"drops": json.dumps(kept)} if kept else {}
 
 
-def drops_of(result: Mapping[str, str]) -> list[Drop]:
+def decode_drops(result: Mapping[str, str]) -> list[QueueDrops]:
     """Return the drops of a result; none if another program wrote them."""
     try:
         return [
-            Drop(int(entity), int(depth), int(count), bool(in_outage))
+            QueueDrops(int(entity), int(depth), int(count), bool(in_outage))
             for entity, depth, count, in_outage in json.loads(result.get("drops", "[]"))
         ]
     except (ValueError, TypeError):

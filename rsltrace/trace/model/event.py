@@ -33,7 +33,7 @@ _SHIFT = 56
 _VALUE_MAX = (1 << _SHIFT) - 1
 
 
-class Draw(IntEnum):
+class RandomDecision(IntEnum):
     """Kinds of decisions. The numbers are part of the trace format."""
 
     DELAY = 1
@@ -52,68 +52,74 @@ class Draw(IntEnum):
 
 
 _WORDS = {
-    Draw.DROP: "lost",
-    Draw.BURST: "lost in a burst",
-    Draw.OUTAGE: "lost in an outage",
-    Draw.CRASH: "crashes",
-    Draw.GOES_ON: "goes on",
+    RandomDecision.DROP: "lost",
+    RandomDecision.BURST: "lost in a burst",
+    RandomDecision.OUTAGE: "lost in an outage",
+    RandomDecision.CRASH: "crashes",
+    RandomDecision.GOES_ON: "goes on",
 }
 
 
 _FAULTS = {
-    Draw.HANG: ("hangs", " for"),
-    Draw.RESTART: ("crashes and starts again", " after"),
+    RandomDecision.HANG: ("hangs", " for"),
+    RandomDecision.RESTART: ("crashes and starts again", " after"),
 }
-_CLOCKS = {Draw.CLOCK_AHEAD: "ahead", Draw.CLOCK_BACK: "back"}
+_CLOCKS = {RandomDecision.CLOCK_AHEAD: "ahead", RandomDecision.CLOCK_BACK: "back"}
 
 
-def encode_draw(kind: int, value_ns: int = 0) -> int:
+def encode_decision(kind: int, value_ns: int = 0) -> int:
     """Return the number for a decision."""
     return (kind << _SHIFT) | min(value_ns, _VALUE_MAX)
 
 
-def encode_clock(by_ns: int) -> int:
+def encode_clock_change(by_ns: int) -> int:
     """Return the number for a clock that was set by this much."""
-    return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
+    return encode_decision(
+        RandomDecision.CLOCK_AHEAD if by_ns > 0 else RandomDecision.CLOCK_BACK, abs(by_ns)
+    )
 
 
-def kind_of(number: int) -> Draw | None:
+def decision_kind(number: int) -> RandomDecision | None:
     """Return the kind of a decision, None if a newer version wrote it."""
     kind = number >> _SHIFT
-    return Draw(kind) if kind in {int(one) for one in Draw} else None
+    return RandomDecision(kind) if kind in {int(one) for one in RandomDecision} else None
 
 
 def is_switch(number: int) -> bool:
     """Whether a decision lets another thread continue in the middle of a callback."""
-    return number >> _SHIFT == Draw.SWITCH
+    return number >> _SHIFT == RandomDecision.SWITCH
 
 
 def is_second_copy(number: int) -> bool:
     """Whether a decision sends a message twice."""
-    return number >> _SHIFT == Draw.DUPLICATE
+    return number >> _SHIFT == RandomDecision.DUPLICATE
 
 
-def duration_of(number: int, kind: Draw) -> int | None:
+def decision_duration(number: int, kind: RandomDecision) -> int | None:
     """Return the duration of a decision of that kind in nanoseconds, None for another kind."""
     return number & _VALUE_MAX if number >> _SHIFT == kind else None
 
 
-def draw_text(number: int, digits: int = 6) -> str:
+def decision_text(number: int, digits: int = 6) -> str:
     """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
-    draw, value_ns = kind_of(number), number & _VALUE_MAX
+    draw, value_ns = decision_kind(number), number & _VALUE_MAX
     duration = format_duration(value_ns, digits)
     if draw is None:
         return f"draw of kind {number >> _SHIFT}: {value_ns}"
     if draw in _WORDS:
         return _WORDS[draw]
-    if draw is Draw.SWITCH:
+    if draw is RandomDecision.SWITCH:
         return f"another thread goes on before line {value_ns}"
     if draw in _CLOCKS:
         return f"clock set {duration} {_CLOCKS[draw]}"
     if draw in _FAULTS:
         word, more = _FAULTS[draw]
         return word + (f"{more} {duration}" if value_ns else "")
-    names = {Draw.DELAY: "delay", Draw.DUPLICATE: "second copy after", Draw.EXECUTION: "takes"}
+    names = {
+        RandomDecision.DELAY: "delay",
+        RandomDecision.DUPLICATE: "second copy after",
+        RandomDecision.EXECUTION: "takes",
+    }
     return f"{names[draw]} {duration}"
 
 
@@ -183,7 +189,7 @@ class OutputKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Event:
+class EventRecord:
     """One event of the loop. Hashes are unsigned 64-bit integers.
 
     ``stamp_ns`` is simulated time. ``cause_event`` and ``cause_output`` name the event, and its

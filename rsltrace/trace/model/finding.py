@@ -50,13 +50,13 @@ class EndlessWait:
     held: tuple[int, ...] = ()
 
 
-def kept_waits(waits: Iterable[EndlessWait]) -> dict[str, str]:
+def encode_waits(waits: Iterable[EndlessWait]) -> dict[str, str]:
     """Return the entry of a run's result for its endless waits."""
     kept = [(one.since_ns, one.text, one.held[:_HELD_KEPT]) for one in waits][:_KEPT]
     return {"waits": json.dumps(kept)} if kept else {}
 
 
-def waits_of(result: Mapping[str, str]) -> list[EndlessWait]:
+def decode_waits(result: Mapping[str, str]) -> list[EndlessWait]:
     """Return the endless waits of a result, one line each; none if another program wrote them."""
     try:
         return [
@@ -69,7 +69,7 @@ def waits_of(result: Mapping[str, str]) -> list[EndlessWait]:
         return []
 
 
-class Source(str, Enum):
+class NondeterminismSource(str, Enum):
     """Sources of nondeterminism: kinds of calls with answers from outside, or random ones."""
 
     CLOCK = "clock"
@@ -85,7 +85,7 @@ class Source(str, Enum):
     ORDER = "order"
 
 
-class Mode(str, Enum):
+class GuardMode(str, Enum):
     """What the guard does about a source.
 
     ``virtual``: the run answers; ``record``: the trace keeps the real answer for a re-run;
@@ -102,37 +102,38 @@ class Mode(str, Enum):
 READ_BY = ", read by "
 """Separates an environment variable and the library that reads it, in the text of a call."""
 
-_ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
-MODES: Mapping[Source, tuple[Mode, ...]] = {
-    Source.CLOCK: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
-    Source.RANDOM: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
-    Source.DIRECTORY: (Mode.VIRTUAL, *_ALWAYS),
-    Source.FILE: (Mode.RECORD, *_ALWAYS),
-    Source.ENVIRONMENT: (Mode.RECORD, *_ALWAYS),
-    Source.PID: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
-    Source.THREAD: _ALWAYS,
-    Source.PROCESS: (Mode.RECORD, *_ALWAYS),
-    Source.SOCKET: (Mode.RECORD, *_ALWAYS),
-    Source.ADDRESS: _ALWAYS,
-    Source.ORDER: (Mode.VIRTUAL, *_ALWAYS),
+_ALWAYS = (GuardMode.WARN, GuardMode.ERROR, GuardMode.ALLOW)
+MODES: Mapping[NondeterminismSource, tuple[GuardMode, ...]] = {
+    NondeterminismSource.CLOCK: (GuardMode.VIRTUAL, GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.RANDOM: (GuardMode.VIRTUAL, GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.DIRECTORY: (GuardMode.VIRTUAL, *_ALWAYS),
+    NondeterminismSource.FILE: (GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.ENVIRONMENT: (GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.PID: (GuardMode.VIRTUAL, GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.THREAD: _ALWAYS,
+    NondeterminismSource.PROCESS: (GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.SOCKET: (GuardMode.RECORD, *_ALWAYS),
+    NondeterminismSource.ADDRESS: _ALWAYS,
+    NondeterminismSource.ORDER: (GuardMode.VIRTUAL, *_ALWAYS),
 }
 """The possible modes of each source."""
 
-DEFAULT_MODES: Mapping[Source, Mode] = {
-    source: Mode.VIRTUAL if Mode.VIRTUAL in modes else Mode.WARN for source, modes in MODES.items()
+DEFAULT_MODES: Mapping[NondeterminismSource, GuardMode] = {
+    source: GuardMode.VIRTUAL if GuardMode.VIRTUAL in modes else GuardMode.WARN
+    for source, modes in MODES.items()
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Policy:
+class GuardPolicy:
     """The mode of each source in the code of one node, and the exempt modules.
 
     ``allowed`` has globs of module names by source. ``state`` is empty, ``true`` (hashed after each
     callback) or ``record`` (attributes are recorded, too).
     """
 
-    modes: Mapping[Source, Mode] = field(default_factory=lambda: DEFAULT_MODES)
-    allowed: Mapping[Source, tuple[str, ...]] = field(default_factory=dict)
+    modes: Mapping[NondeterminismSource, GuardMode] = field(default_factory=lambda: DEFAULT_MODES)
+    allowed: Mapping[NondeterminismSource, tuple[str, ...]] = field(default_factory=dict)
     state: str = ""
 
 
@@ -148,8 +149,8 @@ class Finding:
     event: int
     entity: int
     node: str
-    source: Source
-    mode: Mode
+    source: NondeterminismSource
+    mode: GuardMode
     call: str
     value: str
     stack: str
@@ -159,8 +160,8 @@ class Finding:
 class GuardCount:
     """How often a node made one call in a run, and what was done about it."""
 
-    source: Source
-    mode: Mode
+    source: NondeterminismSource
+    mode: GuardMode
     node: str
     call: str
     count: int
@@ -168,4 +169,4 @@ class GuardCount:
     @property
     def is_finding(self) -> bool:
         """Whether runs may differ because of it: the run did not answer it."""
-        return self.mode is not Mode.VIRTUAL
+        return self.mode is not GuardMode.VIRTUAL

@@ -20,7 +20,7 @@ _LINE_MAX = 160
 _LEFT = {"style": "text-align: left; vertical-align: top"}
 
 
-class Sheet:
+class HtmlSheet:
     """A title with tables and texts, built from top to bottom."""
 
     def __init__(self, title: str) -> None:

@@ -37,7 +37,7 @@ def read_regular(path: Path, size_max: int = -1) -> bytes:
         return file.read(size_max)
 
 
-def in_the_way(path: Path) -> str:
+def not_replaceable(path: Path) -> str:
     """Return what is at ``path`` if a file must not replace it, "" for a file or nothing.
 
     A rename replaces anything: for root even /dev/null.

@@ -17,7 +17,7 @@ def format_seconds(stamp_ns: int) -> str:
     return f"{sign}{whole}.{fraction:09d}"
 
 
-def patience_ns(seconds: float) -> int:
+def waiting_ns(seconds: float) -> int:
     """Return ``seconds`` in nanoseconds, at least one if it is more than 0.
 
     Code that waits for the rest of a timeout (``Semaphore.acquire``, ``Condition.wait_for``) may
@@ -49,7 +49,7 @@ def format_milliseconds(duration_ns: int | None) -> str:
     return f"{duration_ns / 1e6:.{4 if abs(duration_ns) < 10 * NS_PER_S else 9}g}"
 
 
-def durations_apart(a_ns: int, b_ns: int) -> tuple[str, str]:
+def contrasting_durations(a_ns: int, b_ns: int) -> tuple[str, str]:
     """Return two durations with as many digits as it takes to see the difference."""
     for digits in range(_DIGITS, _DIGITS_MAX):
         a, b = format_duration(a_ns, digits), format_duration(b_ns, digits)
@@ -96,7 +96,7 @@ def shortened(text: str, width: int) -> str:
     return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
 
 
-def told_apart(a: str, b: str, width: int = 40, before: int = 20) -> tuple[str, str]:
+def contrasting_texts(a: str, b: str, width: int = 40, before: int = 20) -> tuple[str, str]:
     """Return two different texts, printable and cut to ``width`` characters in which they differ:
     long ones from ``before`` characters before the difference."""
     a, b = printable(a), printable(b)

@@ -32,7 +32,7 @@ from rsltrace.trace.mcap.records import (
     MAGIC,
     MESSAGE,
     RECORD_HEAD,
-    Damaged,
+    DamageError,
     McapChannel,
     RecordSpan,
     TruncatedFile,
@@ -116,7 +116,7 @@ def scan_records(
     for opcode, span in walk_records(source, start, end):
         if opcode == MESSAGE:
             if span.length < RECORD_HEAD.size + _BODY.size:
-                raise Damaged(f"the message at byte {span.offset} is too short")
+                raise DamageError(f"the message at byte {span.offset} is too short")
             body = source.read_at(span.offset + RECORD_HEAD.size, _BODY.size)
             channel, _, stamp_ns, _ = _BODY.unpack(body)
             run.add(span, channel, stamp_ns)
@@ -152,8 +152,8 @@ def _scan_chunk(source: ByteSource, span: RecordSpan, index: McapIndex) -> None:
                 start_ns, end_ns = min(start_ns, stamp_ns), max(end_ns, stamp_ns)
             elif opcode in _DEFINITIONS:
                 index.definitions.add(opcode, records[at:after])
-    except (Damaged, struct.error) as error:
-        raise Damaged(f"{error}, in the chunk at byte {span.offset}") from None
+    except (DamageError, struct.error) as error:
+        raise DamageError(f"{error}, in the chunk at byte {span.offset}") from None
     if counts:
         index.add(span, (start_ns, end_ns), counts, is_chunk=True)
 
@@ -191,7 +191,7 @@ def intact_length(source: ByteSource) -> tuple[int, str]:
                 # The last log time of a chunk, or the log time of a message.
                 at = span.offset + RECORD_HEAD.size + (8 if opcode == _CHUNK else 6)
                 end_ns = max(end_ns, int.from_bytes(source.read_at(at, 8), "little"))
-    except Damaged:
+    except DamageError:
         pass  # The first record that is not whole is what we look for.
     text = f"the first {good} of {source.size} bytes are whole, with {counts[_CHUNK]} chunks"
     if counts[MESSAGE]:
@@ -223,8 +223,8 @@ def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
     profile, data_start = _profile(source)
     try:
         footer = read_footer(source)
-    except Damaged as error:
-        raise Damaged(f"the footer before byte {source.size} is damaged ({error})") from None
+    except DamageError as error:
+        raise DamageError(f"the footer before byte {source.size} is damaged ({error})") from None
     start = footer.summary_start
     index = McapIndex(profile)
     complete = start != 0 and _add_summary(source, footer, data_start, index)
@@ -234,7 +234,7 @@ def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
     # What no chunk's CRC covers: a file that was walked, messages outside chunks.
     unchecked = not complete or not all(part.is_chunk for part in index.parts)
     if unchecked and index.data_crc and index.data_crc != data_crc(source, index.data_size):
-        raise Damaged(f"the CRC of the data section (up to byte {index.data_size}) is wrong")
+        raise DamageError(f"the CRC of the data section (up to byte {index.data_size}) is wrong")
     return index
 
 
@@ -242,8 +242,8 @@ def _profile(source: ByteSource) -> tuple[str, int]:
     """Return the profile and where the data begins."""
     try:
         header, data_start = read_header(source)
-    except Damaged as error:
-        raise Damaged(f"there is no header record ({error})") from None
+    except DamageError as error:
+        raise DamageError(f"there is no header record ({error})") from None
     return header.profile, data_start
 
 
@@ -252,13 +252,13 @@ def _add_summary(source: ByteSource, footer: McapFooter, data_start: int, index:
     start = footer.summary_start
     try:
         if start < data_start:
-            raise Damaged("it would begin in the header")
+            raise DamageError("it would begin in the header")
         summary = read_summary(source, footer)
         if not _is_complete(summary):
             return False
         return _add_ranges(source, summary, data_start, start, index)
-    except Damaged as error:
-        raise Damaged(f"the summary at byte {start} is damaged ({error})") from None
+    except DamageError as error:
+        raise DamageError(f"the summary at byte {start} is damaged ({error})") from None
 
 
 def _is_complete(summary: McapSummary) -> bool:
@@ -280,14 +280,14 @@ def _add_ranges(
     at = data_start
     for chunk in sorted(summary.chunks(), key=lambda chunk: chunk.span.offset):
         if chunk.span.offset < at or chunk.span.end > data_end:
-            raise Damaged(f"a chunk at byte {chunk.span.offset} lies outside the data")
+            raise DamageError(f"a chunk at byte {chunk.span.offset} lies outside the data")
         if not scan_records(source, at, chunk.span.offset, index, skip_chunks=True):
             return False
         channels = frozenset(channel for channel, _ in chunk.indexes) or None
         index.parts.append(RecordRange(chunk.span, chunk.start_ns, chunk.end_ns, channels, True))
         at = chunk.end
     if at > data_end:
-        raise Damaged(f"the index reaches past byte {data_end}, the end of the data")
+        raise DamageError(f"the index reaches past byte {data_end}, the end of the data")
     complete = scan_records(source, at, data_end, index, skip_chunks=True)
     statistics = summary.statistics
     assert statistics is not None
@@ -376,8 +376,8 @@ class McapFile:
             )
             # The order of the stream depends on these two times.
             if messages and not (part.start_ns <= messages[0][0] <= messages[-1][0] <= part.end_ns):
-                raise Damaged("messages lie outside the times the index promises")
-        except Damaged as error:
+                raise DamageError("messages lie outside the times the index promises")
+        except DamageError as error:
             raise BagError(
                 f"{self.path}: {error}, in the {'chunk' if part.is_chunk else 'messages'} at byte "
                 f"{part.span.offset} (log time {format_seconds(part.start_ns)} to "
@@ -394,7 +394,7 @@ class McapFile:
                 f"{error}. Repair it with 'mcap recover {self.path.name} -o repaired.mcap' (and "
                 "'ros2 bag reindex' if it belongs to a bag folder)"
             ) from None
-        except Damaged as error:
+        except DamageError as error:
             raise BagError(f"{self.path}: {error}; repair it with 'mcap recover'") from None
         if index.profile not in ("ros2", ""):
             ros1 = index.profile == "ros1"

@@ -10,8 +10,8 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import (
     NO_SEQUENCE,
     CodeLine,
-    Event,
     EventKind,
+    EventRecord,
     Output,
     OutputKind,
     is_switch,
@@ -27,13 +27,13 @@ _LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKin
 _PLACES_SHOWN = 3
 
 
-def code_place(trace: Trace, event: Event) -> str:
+def code_place(trace: Trace, event: EventRecord) -> str:
     """Return the only entry of ``code_places``, "" for none or several."""
     places = code_places(trace, event)
     return places[0] if len(places) == 1 else ""
 
 
-def code_places(trace: Trace, event: Event) -> list[str]:
+def code_places(trace: Trace, event: EventRecord) -> list[str]:
     """Return ``module.py:24`` of the function that an event ran: the constructor of a new node, the
     call of an awaited response.
 
@@ -52,7 +52,7 @@ def code_places(trace: Trace, event: Event) -> list[str]:
     return [source] if source else []
 
 
-def _functions(lines: list[CodeLine], event: Event) -> list[str]:
+def _functions(lines: list[CodeLine], event: EventRecord) -> list[str]:
     met = [line for line in lines if line.event <= event.index and line.place]
     of_call = [line for line in met if event.kind is EventKind.CLIENT]
     best = [line for line in met if line.output == NO_SEQUENCE] or of_call
@@ -76,7 +76,7 @@ def output_places(trace: Trace, output: Output) -> list[str]:
     if output.kind not in _SENT:
         return []
     running = trace.event(output.event).entity
-    lines = trace.sent_from.get((output.entity, running), [])
+    lines = trace.output_lines.get((output.entity, running), [])
     number = NO_SEQUENCE
     if any(line.event == output.event for line in lines):
         outputs = trace.outputs_of(output.event)
@@ -105,7 +105,7 @@ def places_text(places: list[str], joint: str = " or ") -> str:
     return joint.join(shown)
 
 
-def place_here(trace: Trace, place: str) -> str:
+def relative_place(trace: Trace, place: str) -> str:
     """Return a place relative to the working directory if it is below, else unchanged."""
     found = code_file(trace, place)
     if found is None or found[0].is_absolute() or ".." in found[0].parts:

@@ -7,7 +7,14 @@ from itertools import groupby
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import Event, EventKind, Output, OutputKind, draw_text, is_switch
+from rsltrace.trace.model.event import (
+    EventKind,
+    EventRecord,
+    Output,
+    OutputKind,
+    decision_text,
+    is_switch,
+)
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
@@ -37,7 +44,7 @@ def output_text(kind: int, name: str, entity_kind: str) -> str:
     return f"{kind_label(OutputKind, kind)} {name}".rstrip()
 
 
-def counted(texts: Iterable[str]) -> Iterator[str]:
+def group_equal(texts: Iterable[str]) -> Iterator[str]:
     """Yield texts; equal neighbours once with their number: ``/odom ×3``."""
     for text, same in groupby(texts):
         count = sum(1 for _ in same)
@@ -57,7 +64,7 @@ class EventWords:
         self._entities = trace.entities
         self.names = EntityNames(trace.entities)
 
-    def node(self, event: Event, outputs: Sequence[Output]) -> str:
+    def node(self, event: EventRecord, outputs: Sequence[Output]) -> str:
         """Return the node of an event: for a constructor the new node; "" for the run."""
         if event.kind is EventKind.CONSTRUCT:
             for output in outputs:
@@ -76,7 +83,7 @@ class EventWords:
             place = self._trace.switches.get(output.event) if is_switch(output.hash) else None
             if place:
                 return f"another thread goes on before {printable(place)}"
-            return f"{draw_text(output.hash)} ({self.names.node(output.entity) or name})"
+            return f"{decision_text(output.hash)} ({self.names.node(output.entity) or name})"
         entity = self._entities.get(output.entity)
         text = output_text(kind, name, entity.kind.label if entity is not None else "")
         detail = self._detail(output) if kind not in _WITHOUT_DETAIL else ""
@@ -98,7 +105,7 @@ class EventWords:
                 built_in += 1
             else:
                 own.append(output)
-        yield from counted(f"{self.output(one)} {more(one)}".rstrip() for one in own)
+        yield from group_equal(f"{self.output(one)} {more(one)}".rstrip() for one in own)
         if built_in:
             yield f"{built_in} that every node has"
 

@@ -52,7 +52,7 @@ def silent_topics(entities: Iterable[Entity]) -> str:
     return f"topics without a publisher: {_names_text(silent, 'topics')}"
 
 
-def without_server(entities: Iterable[Entity]) -> str:
+def missing_servers(entities: Iterable[Entity]) -> str:
     """Return ``nobody serves /reset, of which /panel is a client``, "" if there is none."""
     nodes: dict[int, str] = {}
     served: set[str] = set()

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.debug.checkpoints import Breakpoint, Stopped
+from rsltrace.debug.checkpoints import Breakpoint, StopReport
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace_viewer.model.run import Run
@@ -123,7 +123,7 @@ class Execution:
         found = self.session.first_true(condition)
         return found.index if found.is_next else max(found.index - 1, 0)
 
-    def _reach(self, index: int, wanted: Callable[[], bool]) -> Stopped:
+    def _reach(self, index: int, wanted: Callable[[], bool]) -> StopReport:
         while True:
             if not wanted():
                 raise Superseded
@@ -131,7 +131,7 @@ class Execution:
             if stopped.reason != "paused":
                 return stopped
 
-    def _stop(self, stopped: Stopped) -> Stop:
+    def _stop(self, stopped: StopReport) -> Stop:
         place = stopped.position
         event = place.index if place.is_next else place.index - 1
         why = {

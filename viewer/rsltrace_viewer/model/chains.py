@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.checks.latency.instances import Figures
+from rsltrace.checks.latency.instances import LatencyFigures
 from rsltrace.checks.latency.measure import Latencies, measuring
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import RsltraceError, TraceError
@@ -28,7 +28,7 @@ class Chain:
     hops: tuple[Hop, ...]
     via: tuple[str, ...]
     outputs: int
-    latency: Figures | None
+    latency: LatencyFigures | None
     oldest_ns: int | None
     slowest: int | None
 

@@ -7,7 +7,7 @@ import numpy as np
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.run import Run
@@ -53,7 +53,7 @@ class Comparison:
         """Return the index of the event of run b at a place."""
         return self.rows.row(place).b
 
-    def sign(self, place: int) -> Sign:
+    def sign(self, place: int) -> RowSign:
         """Return how the two compare."""
         return self.rows.row(place).sign
 

@@ -9,9 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.contents import Series, add_series
+from rsltrace.trace.contents import Occurrences, add_occurrences
 from rsltrace.trace.model.entity import EntityKind
-from rsltrace.trace.model.event import Draw, EventFlag, EventKind, OutputKind, encode_draw
+from rsltrace.trace.model.event import (
+    EventFlag,
+    EventKind,
+    OutputKind,
+    RandomDecision,
+    encode_decision,
+)
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.logs import LEVEL_WARN, silent_topics
@@ -21,9 +27,9 @@ from rsltrace_viewer.model.run import Run, Segment
 _LEVEL_ERROR = 40
 _DRAW = int(OutputKind.DRAW)
 _NOT_SENT = (_DRAW, int(OutputKind.ENTITY))
-_VALUE_BITS = np.uint64(encode_draw(1).bit_length() - 1)
-_VALUE = np.uint64(encode_draw(1) - 1)
-_LOST = (int(Draw.DROP), int(Draw.BURST), int(Draw.OUTAGE))
+_VALUE_BITS = np.uint64(encode_decision(1).bit_length() - 1)
+_VALUE = np.uint64(encode_decision(1) - 1)
+_LOST = (int(RandomDecision.DROP), int(RandomDecision.BURST), int(RandomDecision.OUTAGE))
 
 
 @dataclass(slots=True)
@@ -69,8 +75,8 @@ class Overview:
     they waited themselves, in a call or a sleep.
     """
 
-    events: dict[int, Series] = field(default_factory=dict)
-    sent: dict[int, Series] = field(default_factory=dict)
+    events: dict[int, Occurrences] = field(default_factory=dict)
+    sent: dict[int, Occurrences] = field(default_factory=dict)
     waited: dict[int, Times] = field(default_factory=dict)
     took: dict[int, Times] = field(default_factory=dict)
     paused: dict[int, Times] = field(default_factory=dict)
@@ -92,15 +98,15 @@ def read_overview(run: Run) -> Iterator[Overview]:
             yield found
             continue
         events, stamps = segment.events, segment.events["stamp"]
-        add_series(found.events, events["entity"], stamps)
+        add_occurrences(found.events, events["entity"], stamps)
         draws = outputs[outputs["kind"] == _DRAW]
         sent = outputs[~np.isin(outputs["kind"], _NOT_SENT)]
         places = (sent["event"] - np.uint64(segment.first)).astype(np.intp)
-        add_series(found.sent, sent["entity"], stamps[places])
+        add_occurrences(found.sent, sent["entity"], stamps[places])
         _add_since_causes(found, segment, before)
         before = segment
         kinds, values = draws["hash"] >> _VALUE_BITS, (draws["hash"] & _VALUE).astype(np.int64)
-        took = kinds == np.uint64(Draw.EXECUTION)
+        took = kinds == np.uint64(RandomDecision.EXECUTION)
         _add_times(found.took, draws["entity"][took], values[took])
         found.lost.add(draws["event"][np.isin(kinds, _LOST)])
         found.raised.add(events["index"][(events["flags"] & int(EventFlag.RAISED)) != 0])
@@ -163,10 +169,12 @@ class Part:
 
 def nodes_of(run: Run, overview: Overview) -> list[Part]:
     """Return the nodes, the busiest first."""
-    nodes: dict[str, tuple[Series, Times]] = {node.name: (Series(), Times()) for node in run.nodes}
+    nodes: dict[str, tuple[Occurrences, Times]] = {
+        node.name: (Occurrences(), Times()) for node in run.nodes
+    }
     for entity, series in overview.events.items():
         if entity:
-            own = nodes.setdefault(run.node_name(entity), (Series(), Times()))
+            own = nodes.setdefault(run.node_name(entity), (Occurrences(), Times()))
             own[0].add(series.count, series.first_ns, series.last_ns)
             if (took := overview.took.get(entity)) is not None:
                 own[1].add(took.count, took.total_ns, took.most_ns)
@@ -222,11 +230,11 @@ def _whole(run: Run, overview: Overview) -> int:
 
 def topics_of(run: Run, overview: Overview) -> list[Part]:
     """Return the topics that messages were sent on, the busiest first."""
-    topics: dict[tuple[str, str], Series] = {}
+    topics: dict[tuple[str, str], Occurrences] = {}
     for entity in run.entities.values():
         if entity.kind is not EntityKind.PUBLISHER or is_built_in(entity):
             continue
-        own = topics.setdefault((run.entity_name(entity.id), entity.type), Series())
+        own = topics.setdefault((run.entity_name(entity.id), entity.type), Occurrences())
         series = overview.sent.get(entity.id)
         if series is not None:
             own.add(series.count, series.first_ns, series.last_ns)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from rsltrace.errors import TraceError
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.trace.model.event import NO_EVENT, Event, EventKind, Output, OutputKind
+from rsltrace.trace.model.event import NO_EVENT, EventKind, EventRecord, Output, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
@@ -131,7 +131,7 @@ class Run:
         row: np.void = segment.events[index - segment.first]
         return row
 
-    def event(self, index: int) -> Event:
+    def event(self, index: int) -> EventRecord:
         """Return event ``index``. Raises IndexError, TraceError."""
         row = self.row(index)
         damage = self._damaged.get(self.segment_of(index))
@@ -186,7 +186,7 @@ class Run:
         """Whether times are those since 1970, as from bags: too long to be read."""
         return self.start_ns >= _EPOCH_NS
 
-    def input_of(self, event: Event) -> Output | None:
+    def input_of(self, event: EventRecord) -> Output | None:
         """Return the output that was the input of ``event``, or None if no event caused it.
 
         What goes on after a callback that ran on its own stack has that as its cause, but nothing

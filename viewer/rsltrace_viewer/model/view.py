@@ -14,7 +14,7 @@ from rich.cells import cell_len, set_cell_size
 
 if TYPE_CHECKING:
     from rsltrace.diff.alignment.aligned_rows import AlignedRows
-    from rsltrace.diff.row_sign import Sign
+    from rsltrace.diff.row_sign import RowSign
 
 # Counting events in columns without aliasing: a sensor with a steady rate gets a steady bar.
 #
@@ -216,7 +216,7 @@ class View(Protocol):
         """Return the index of the event of run b at a place; None if it has none there."""
         ...
 
-    def sign(self, place: int) -> Sign | None:
+    def sign(self, place: int) -> RowSign | None:
         """Return how the two compare; None with one trace."""
         ...
 
@@ -258,7 +258,7 @@ class OneRun:
         """Return ``place``, if this is run b."""
         return place if self._other else None
 
-    def sign(self, place: int) -> Sign | None:
+    def sign(self, place: int) -> RowSign | None:
         """Return how the event compares with that of the other run."""
         if self._aligned is None:
             return None

@@ -19,7 +19,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.diff.facts.evidence import CauseStep, EventView, LinkKind
+from rsltrace.diff.facts.evidence import CauseLinkKind, CauseStep, EventSummary
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import plain_text
@@ -236,14 +236,14 @@ def document(diff: Diff) -> str:
 def _step(step: CauseStep) -> str:
     view = _either(step.a, step.b)
     side = "" if step.a and step.b else (" (only in a)" if step.a else " (only in b)")
-    relation = f", {link_text(step.link)}" if step.link.kind is not LinkKind.NOTHING else ""
+    relation = f", {link_text(step.link)}" if step.link.kind is not CauseLinkKind.NOTHING else ""
     return f"{_event(view) if view else 'an event'}{relation}{side}"
 
 
-def _event(view: EventView) -> str:
+def _event(view: EventSummary) -> str:
     when = f"#{view.index} at {format_seconds(view.stamp_ns)} s"
     return f"{when}: {event_title(view.kind, view.entity)}"
 
 
-def _either(a: EventView | None, b: EventView | None) -> EventView | None:
+def _either(a: EventSummary | None, b: EventSummary | None) -> EventSummary | None:
     return a if a is not None else b

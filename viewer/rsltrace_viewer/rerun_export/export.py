@@ -13,7 +13,7 @@ import rerun as rr
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
-from rsltrace.trace.model.regular_file import in_the_way
+from rsltrace.trace.model.regular_file import not_replaceable
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for, joining_chunks
@@ -132,7 +132,7 @@ def _check_output(output: Path, traces: Sequence[Path], *, force: bool) -> None:
     for trace in traces:
         if output.exists() and trace.exists() and output.samefile(trace):
             raise OutputError(f"{output} is the trace itself; give the recording another name")
-    if kind := in_the_way(output):
+    if kind := not_replaceable(output):
         raise OutputError(f"{output} is {kind}; name a file, or remove it")
     if output.exists() and not force:
         raise OutputError(f"{output} exists; use --force to replace it, or another name")

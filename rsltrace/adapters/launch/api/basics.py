@@ -10,14 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.launch.model import (
-    Argument,
-    Launched,
+    LaunchArgument,
+    LaunchResult,
     LaunchScope,
     UnsupportedItem,
     truth,
 )
 from rsltrace.errors import JobError
-from rsltrace.job.reading.yaml_source import Place
+from rsltrace.job.reading.yaml_source import SourcePlace
 
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
 
@@ -101,7 +101,7 @@ class LaunchContext:
     ) -> None:
         self.argv = list(argv or ())
         self.noninteractive = noninteractive
-        self.launched = Launched()
+        self.launched = LaunchResult()
         self.scope = LaunchScope(configurations=dict(arguments or {}))
         self.file = Path()
         """The launch file being read."""
@@ -210,7 +210,7 @@ class Action(LaunchDescriptionEntity):
         return action
 
     where: str
-    place: Place | None = None
+    place: SourcePlace | None = None
     _condition: Condition | None
 
     @property
@@ -277,7 +277,7 @@ def visit_all(context: LaunchContext, entities: Any) -> None:
 
 def note_arguments(context: LaunchContext, entity: LaunchDescriptionEntity) -> None:
     """Note what an entity declares, and what is in it does."""
-    declared: Argument | None = getattr(entity, "argument", None)
+    declared: LaunchArgument | None = getattr(entity, "argument", None)
     if declared is not None:
         context.launched.arguments.setdefault(declared.name, declared)
     for inner in entity.inside():

@@ -13,7 +13,12 @@ from rsltrace.adapters.launch.api.basics import (
     visit_all,
 )
 from rsltrace.adapters.launch.api.parameters import ParameterFile, plain_value
-from rsltrace.adapters.launch.model import ENVIRONMENT, Argument, LaunchScope, joined_namespace
+from rsltrace.adapters.launch.model import (
+    ENVIRONMENT,
+    LaunchArgument,
+    LaunchScope,
+    joined_namespace,
+)
 from rsltrace.errors import JobError, nearest
 
 
@@ -36,7 +41,7 @@ class DeclareLaunchArgument(Action):
         self.choices = None if choices is None else list(choices)
         text = default_value and "".join(part.describe() for part in self.default_value or ())
         default = None if default_value is None else text or ""
-        self.argument = Argument(name, default, (description or "").strip())
+        self.argument = LaunchArgument(name, default, (description or "").strip())
 
     def execute(self, context: LaunchContext) -> None:
         """Give it its default if it has no value, and check the value."""

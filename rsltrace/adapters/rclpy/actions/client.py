@@ -5,7 +5,11 @@ from __future__ import annotations
 from functools import partialmethod
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.parts import ActionHandle, ActionSubscriptionHandle, GoalClient
+from rsltrace.adapters.rclpy.actions.parts import (
+    ActionHandle,
+    ActionServiceClient,
+    ActionSubscriptionHandle,
+)
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 
 
@@ -28,9 +32,13 @@ class ActionClientHandle(ActionHandle):
     ) -> None:
         super().__init__(node, action_type, name)
         impl = action_type.Impl
-        self._goal = self.own(GoalClient, impl.SendGoalService, "send_goal", goal_qos)
-        self._cancel = self.own(GoalClient, impl.CancelGoalService, "cancel_goal", cancel_qos)
-        self._result = self.own(GoalClient, impl.GetResultService, "get_result", result_qos)
+        self._goal = self.own(ActionServiceClient, impl.SendGoalService, "send_goal", goal_qos)
+        self._cancel = self.own(
+            ActionServiceClient, impl.CancelGoalService, "cancel_goal", cancel_qos
+        )
+        self._result = self.own(
+            ActionServiceClient, impl.GetResultService, "get_result", result_qos
+        )
         self._feedback = self.own(
             ActionSubscriptionHandle, impl.FeedbackMessage, "feedback", feedback_qos
         )

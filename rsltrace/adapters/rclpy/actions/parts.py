@@ -74,10 +74,10 @@ class GoalHandle(Handle):
 
 ACTION = int(EventKind.ACTION)
 
-PartT = TypeVar("PartT", bound="Part")
+PartT = TypeVar("PartT", bound="ActionEndpoint")
 
 
-class Part(ReceiverHandle):
+class ActionEndpoint(ReceiverHandle):
     """An endpoint of an action; its arrivals go to the action's waitable."""
 
     owner: ActionHandle
@@ -113,19 +113,19 @@ class Part(ReceiverHandle):
         return own or getattr(self.wrapper, "_execute_callback", None)
 
 
-class GoalService(Part, ServiceHandle):
+class ActionService(ActionEndpoint, ServiceHandle):
     """A server's end of one of the three services."""
 
     in_wait_sets = "service"
 
 
-class GoalClient(Part, ClientHandle):
+class ActionServiceClient(ActionEndpoint, ClientHandle):
     """A client's end of one of the three services."""
 
     in_wait_sets = "client"
 
 
-class ActionSubscriptionHandle(Part, SubscriptionHandle):
+class ActionSubscriptionHandle(ActionEndpoint, SubscriptionHandle):
     """A client's feedback or status subscription."""
 
     in_wait_sets = "subscription"
@@ -143,12 +143,12 @@ class ActionHandle(Handle):
         self._functions = FunctionRecorder(node.dispatcher)
         self.node = node
         self.name = node.resolve(name, service=False)
-        self.parts: list[Part] = []
+        self.parts: list[ActionEndpoint] = []
         self.publishers: list[PublisherHandle] = []
         self.action_type = action_type
         node.actions.append(self)
-        self._ready: Part | None = None
-        self._places: dict[Part, int] = {}
+        self._ready: ActionEndpoint | None = None
+        self._places: dict[ActionEndpoint, int] = {}
 
     @property
     def type_name(self) -> str:
@@ -167,7 +167,7 @@ class ActionHandle(Handle):
         for part in self.parts:
             self._places[part] = getattr(wait_set, f"add_{part.in_wait_sets}")(part)
 
-    def is_part_ready(self, wait_set: Any, part: Part) -> bool:
+    def is_part_ready(self, wait_set: Any, part: ActionEndpoint) -> bool:
         """Return whether an endpoint is being executed, or is ready in a wait set."""
         if wait_set is None:
             return part is self._ready
@@ -179,7 +179,7 @@ class ActionHandle(Handle):
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
         """Publish service events of its three services (ROS 2 Kilted and later)."""
         for part in self.parts:
-            if isinstance(part, GoalService | GoalClient):
+            if isinstance(part, ActionService | ActionServiceClient):
                 part.configure_introspection(clock, qos, state)
 
     def find_waitable(self) -> Any:
@@ -202,7 +202,7 @@ class ActionHandle(Handle):
                 return f"{answer}, of action {self.name} ({servers})"
         return ""
 
-    async def execute(self, part: Part) -> None:
+    async def execute(self, part: ActionEndpoint) -> None:
         """Run the waitable as rclpy's executors do when ``part`` is ready."""
         waitable = part.wrapper
         self._ready = part
@@ -217,7 +217,7 @@ class ActionHandle(Handle):
             future._set_executor(executor_of(self.stacks, part))
         await waitable.execute(data)
 
-    def _tell_feedback_callback(self, part: Part, message: Any) -> None:
+    def _tell_feedback_callback(self, part: ActionEndpoint, message: Any) -> None:
         callbacks = part.wrapper._feedback_callbacks
         callback = callbacks.get(bytes(message.goal_id.uuid))
         self._functions.run(part.entity_id, callback)

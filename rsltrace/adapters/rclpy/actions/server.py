@@ -8,7 +8,7 @@ from __future__ import annotations
 from functools import partialmethod
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, GoalHandle, GoalService
+from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, ActionService, GoalHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.adapters.rclpy.stacks.tasks import start_coroutine
@@ -52,9 +52,9 @@ class ActionServerHandle(ActionHandle):
         self._timeout_ns = int(result_timeout * 1_000_000_000) if result_timeout >= 0 else None
         self._expired = False
         impl = action_type.Impl
-        self._goal = self.own(GoalService, impl.SendGoalService, "send_goal", goal_qos)
-        self._cancel = self.own(GoalService, impl.CancelGoalService, "cancel_goal", cancel_qos)
-        self._result = self.own(GoalService, impl.GetResultService, "get_result", result_qos)
+        self._goal = self.own(ActionService, impl.SendGoalService, "send_goal", goal_qos)
+        self._cancel = self.own(ActionService, impl.CancelGoalService, "cancel_goal", cancel_qos)
+        self._result = self.own(ActionService, impl.GetResultService, "get_result", result_qos)
         self._feedback = PublisherHandle(
             node, impl.FeedbackMessage, self.path("feedback"), feedback_qos
         )

@@ -44,7 +44,7 @@ from rsltrace.simulation.middleware.qos.status import (
     LivelinessChangedStatus,
     MatchedStatus,
 )
-from rsltrace.simulation.middleware.services import RequestId, ServiceEnd, ServiceInfo
+from rsltrace.simulation.middleware.services import RequestId, ServiceEndpoint, ServiceInfo
 from rsltrace.simulation.middleware.subscription import Subscription
 
 _PASSED_THROUGH = (
@@ -397,7 +397,7 @@ HANDLES: dict[str, type] = {
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
 
 
-def _service_types(ends: Iterable[ServiceEnd]) -> list[tuple[str, list[str]]]:
+def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]]]:
     return names_and_types([(end.service, end.type_name) for end in ends])
 
 

@@ -299,7 +299,7 @@ def boundary() -> RclpyBoundary:
     return _installed
 
 
-def check_free() -> None:
+def check_no_simulation() -> None:
     """Raise UnsupportedError if a simulation is running in this process.
 
     :raises SetupError: if rclpy is not installed or cannot be loaded.

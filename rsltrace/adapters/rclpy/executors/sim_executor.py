@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.stacks.blocking_calls import EventSetter, SimEvent,
 from rsltrace.adapters.rclpy.stacks.coroutines import ResumeTask
 from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.texts import waiting_ns
 
 
 class SimExecutor(Executor):  # type: ignore[misc]
@@ -77,7 +77,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
         next_ns = loop.next_ns()
         limit_ns = None
         if timeout_sec is not None and timeout_sec >= 0:
-            limit_ns = patience_ns(timeout_sec)
+            limit_ns = waiting_ns(timeout_sec)
         if next_ns is not None:
             ahead_ns = max(next_ns - loop.now_ns, 0)
             limit_ns = ahead_ns if limit_ns is None else min(limit_ns, ahead_ns)

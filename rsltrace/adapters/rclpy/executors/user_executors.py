@@ -24,7 +24,7 @@ from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.stacks.tasks import create_task
 from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
-from rsltrace.simulation.middleware.interface import file_of
+from rsltrace.simulation.middleware.interface import imported_file
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
 # Monitoring libraries wrap the functions by which rclpy's executors run callbacks. The loop does
@@ -117,7 +117,7 @@ def _where(function: Any) -> str:
     code = getattr(function, "__code__", None)
     if code is None:
         return f"a {type(function).__qualname__}"
-    return f"{file_of(code, function.__globals__)}:{code.co_firstlineno}"
+    return f"{imported_file(code, function.__globals__)}:{code.co_firstlineno}"
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
-from rsltrace.guard.addresses import text_with_address
+from rsltrace.guard.addresses import report_address_in_text
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.qos.policies import (
     Durability,
@@ -114,7 +114,7 @@ class RosoutLogs:
         if not message.isascii():  # lone surrogates are escaped
             message = message.encode(errors="backslashreplace").decode()
         if " at 0x" in message:
-            text_with_address(message)
+            report_address_in_text(message)
         now_ns = self._domain.loop.now_ns
         severity = int(severity)
         if self.echo:

@@ -13,7 +13,7 @@ from rsltrace.adapters.rclpy.arguments import (
     RosArguments,
     UnknownArgumentsError,
 )
-from rsltrace.adapters.rclpy.entry import Entry
+from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
@@ -22,7 +22,7 @@ from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
 from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
 from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
-from rsltrace.simulation.middleware.events.event import Asker
+from rsltrace.simulation.middleware.events.event import NameRequester
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
 from rsltrace.simulation.middleware.participant import Participant, full_name
 
@@ -121,7 +121,7 @@ class NodeHandle(Destroyable, Participant):
             logs.attach(self, rosout_qos)
 
     @property
-    def entry(self) -> Entry | None:
+    def entry(self) -> JobEntry | None:
         return self._entry
 
     @property
@@ -179,7 +179,7 @@ class NodeHandle(Destroyable, Participant):
         expanded: str = real.rclpy_expand_topic_name(name, self.name, self.namespace)
         if not only_expand:
             if (census := self.dispatcher.entities.census) is not None:
-                asker = Asker(self.entry_key, self.name, self.namespace)
+                asker = NameRequester(self.entry_key, self.name, self.namespace)
                 census.asked.setdefault(asker, {})[expanded, service] = None
             expanded = self.arguments.remap_topic(
                 expanded, self.name, self.namespace, self._outer_names(), service=service

@@ -14,7 +14,7 @@ from rsltrace.guard.state.hashing import UNCHANGING, StateHasher
 from rsltrace.guard.state.snapshot import Snapshots
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 
 
 class NodeState:
@@ -103,7 +103,7 @@ class NodeStates:
     """The states of a run's nodes; ``policy`` is for nodes without their own."""
 
     def __init__(self) -> None:
-        self.policy = Policy()
+        self.policy = GuardPolicy()
         self.by_node: dict[str, NodeState] = {}
 
     def add(self, handle: Any) -> NodeState | None:

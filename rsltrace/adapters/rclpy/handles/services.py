@@ -26,7 +26,7 @@ from rsltrace.simulation.middleware.services import (
     Client,
     RequestId,
     Service,
-    ServiceEnd,
+    ServiceEndpoint,
     ServiceInfo,
 )
 
@@ -88,7 +88,7 @@ def updated_service_events(
     return events
 
 
-class ServiceEndHandle(ReceiverHandle, ServiceEnd):
+class ServiceEndHandle(ReceiverHandle, ServiceEndpoint):
     """Base class of the handles of services and clients."""
 
     def _prepare(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> tuple[Any, ...]:
@@ -109,7 +109,7 @@ class ServiceEndHandle(ReceiverHandle, ServiceEnd):
         if self._service_events is not None:
             self._service_events.publish(event_type, request_id, message)
 
-    trace_name = ServiceEnd.trace_name
+    trace_name = ServiceEndpoint.trace_name
 
     def _destroy(self) -> None:
         super()._destroy()

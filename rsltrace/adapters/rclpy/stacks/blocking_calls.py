@@ -28,9 +28,9 @@ from rsltrace.errors import UnsupportedError
 from rsltrace.guard.libraries import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of, replace_attribute
-from rsltrace.simulation.middleware.events.event import Event
+from rsltrace.simulation.middleware.events.event import CurrentEvent
 from rsltrace.trace.model.event import EventFlag, EventKind
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.texts import waiting_ns
 
 POLL_NS = 1_000_000
 """The time that a second poll at one instant takes (a loop of ``spin_once(timeout_sec=0)``)."""
@@ -203,7 +203,7 @@ def end_blocked(stacks: Runtime) -> None:
 
 
 class SimEvent:
-    """Stands in for ``threading.Event`` in rclpy."""
+    """Stands in for ``threading.CurrentEvent`` in rclpy."""
 
     def __init__(self, stacks: Runtime, what: str = "an event to be set") -> None:
         self._stacks = stacks
@@ -224,7 +224,7 @@ class SimEvent:
         self._set = False
 
     def wait(self, timeout: float | None = None) -> bool:
-        return self.wait_ns(None if timeout is None else patience_ns(timeout))
+        return self.wait_ns(None if timeout is None else waiting_ns(timeout))
 
     def wait_ns(self, timeout_ns: int | None) -> bool:
         """Wait with a timeout in nanoseconds."""
@@ -279,7 +279,7 @@ def _sleep(seconds: float) -> None:
     if frame.f_globals.get("__name__") == "subprocess":
         sleep_for_process(seconds, _real_sleep, frame)
         return
-    for_ns = patience_ns(seconds)
+    for_ns = waiting_ns(seconds)
     if stacks.ending.unwinding and stacks.ending.shutdown_ns < _SHUTDOWN_NS:
         # Time stands still, but destroy_node and ``finally`` may sleep as long as ros2 launch
         # waits between SIGINT and SIGKILL.
@@ -319,7 +319,7 @@ def simulated_waiting(stacks: Runtime, seed: int) -> Iterator[None]:
         yield
 
 
-def _goal_ids(event: Event, seed: int) -> Callable[[], uuid.UUID]:
+def _goal_ids(event: CurrentEvent, seed: int) -> Callable[[], uuid.UUID]:
     """Return a ``uuid4`` that draws goal ids from a random stream of the current node."""
     streams: dict[str, random.Random] = {}
 

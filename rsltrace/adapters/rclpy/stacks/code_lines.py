@@ -12,7 +12,7 @@ from typing import Any
 
 from rsltrace.guard.callers import is_user_file, user_frame
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
-from rsltrace.simulation.middleware.interface import file_of, function_of
+from rsltrace.simulation.middleware.interface import callback_code, imported_file
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
 
 _PLACES_MAX = 1000
@@ -95,7 +95,7 @@ class FunctionRecorder:
         if self._calls > _LOOKUPS_FIRST and self._calls % _STRIDE:
             return
         for one in (callback, *args):
-            found = function_of(one)
+            found = callback_code(one)
             if is_plain and len(self._known) < _PLACES_MAX:
                 # All functions of a decorator have the same code.
                 is_itself = found is not None and found[0] is plain.__code__
@@ -118,7 +118,7 @@ def _record_code(
 ) -> None:
     if code.co_filename[:1] != "<":
         name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
-        _record_line(dispatcher, entity, output, f"{file_of(code, names)}:{line}", name)
+        _record_line(dispatcher, entity, output, f"{imported_file(code, names)}:{line}", name)
 
 
 def _record_line(dispatcher: Dispatcher, entity: int, output: int, place: str, name: str) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
 from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
-from rsltrace.simulation.loop.ordered import OrderedLoop, Workers
+from rsltrace.simulation.loop.ordered import OrderedLoop, SimulatedExecutor
 from rsltrace.simulation.loop.policy import Candidate
 from rsltrace.simulation.middleware.entity import DomainEntity
-from rsltrace.simulation.middleware.events.event import Outcome
+from rsltrace.simulation.middleware.events.event import RunOutcome
 from rsltrace.trace.model.finding import EndlessWait
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
@@ -23,7 +23,7 @@ _LONG_NS = 1_000_000_000
 _NAMED_MAX = 4
 
 
-def note_waits(stacks: Runtime, outcome: Outcome) -> None:
+def note_waits(stacks: Runtime, outcome: RunOutcome) -> None:
     """Note the calls that wait without a timeout at the end, and the callbacks they hold back."""
     starved = _starved(stacks)
     blocked = [
@@ -53,22 +53,22 @@ def note_waits(stacks: Runtime, outcome: Outcome) -> None:
             outcome.notes.append(f"waited for {lasted}: {text}")
 
 
-def _starved(stacks: Runtime) -> dict[Workers | None, list[Candidate]]:
+def _starved(stacks: Runtime) -> dict[SimulatedExecutor | None, list[Candidate]]:
     """Return the ready callbacks without a worker, by simulated executor."""
-    found: dict[Workers | None, list[Candidate]] = {}
+    found: dict[SimulatedExecutor | None, list[Candidate]] = {}
     if isinstance(stacks.loop, OrderedLoop):
         for place in stacks.loop.starved():
             found.setdefault(place.workers, []).append(place.candidate)
     return found
 
 
-def _workers(stacks: Runtime, handle: Any) -> Workers | None:
+def _workers(stacks: Runtime, handle: Any) -> SimulatedExecutor | None:
     """Return the simulated executor of a handle's callbacks, if any."""
     loop, is_entity = stacks.loop, isinstance(handle, DomainEntity)
     return loop.place(handle).workers if is_entity and isinstance(loop, OrderedLoop) else None
 
 
-def _note_busy_groups(stacks: Runtime, outcome: Outcome) -> list[BlockedCall | TaskRun]:
+def _note_busy_groups(stacks: Runtime, outcome: RunOutcome) -> list[BlockedCall | TaskRun]:
     """Note the callbacks that wait for a group which has long been busy; return those that keep the
     groups busy."""
     holders = []

@@ -6,26 +6,26 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rsltrace.adapters.rclpy.entry import Entry, StartRule
+from rsltrace.adapters.rclpy.entry import JobEntry, StartRule
 from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.loop.loop import Release
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
-from rsltrace.simulation.middleware.events.event import Event, OutsideEvent
+from rsltrace.simulation.middleware.events.event import CurrentEvent, OutsideEvent
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.services import Service
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
-from rsltrace.trace.model.finding import Policy
+from rsltrace.trace.model.finding import GuardPolicy
 
 
 class ConstructionEvent(OutsideEvent):
     """Runs an entry's constructor, main or thread."""
 
-    def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
+    def __init__(self, describe: Callable[[], str], entry: JobEntry | None) -> None:
         super().__init__(describe)
         self.entry = entry
 
 
-def policy_of(event: Event) -> Policy | None:
+def policy_of(event: CurrentEvent) -> GuardPolicy | None:
     """Return the guard's policy of the running node or entry; None for the job's policy."""
     if event.node is not None:
         return getattr(event.node, "policy", None)
@@ -33,7 +33,7 @@ def policy_of(event: Event) -> Policy | None:
     return entry.policy if entry is not None else None
 
 
-def entry_of(event: Event) -> Entry | None:
+def entry_of(event: CurrentEvent) -> JobEntry | None:
     """Return the entry whose constructor runs and has made no node yet."""
     return getattr(event.handle, "entry", None)
 
@@ -41,7 +41,7 @@ def entry_of(event: Event) -> Entry | None:
 STARTS = 4
 """The operation of a TASK output that starts an entry."""
 
-ConstructEntry = Callable[[Entry, tuple[int, int]], bool]
+ConstructEntry = Callable[[JobEntry, tuple[int, int]], bool]
 """Constructs an entry, given its causing event and output; returns False if that ended the run."""
 
 
@@ -51,11 +51,11 @@ class EntryStarts:
     def __init__(self, stacks: Runtime, construct: ConstructEntry) -> None:
         self.stacks = stacks
         self.construct = construct
-        self.failed: Entry | None = None
+        self.failed: JobEntry | None = None
         self.start_ns: int | None = None
         self._waiting: list[DelayedStart] = []
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: JobEntry) -> None:
         """Register an entry with a start rule. Call it before the first construction."""
         rule = entry.start_after
         assert rule is not None
@@ -69,7 +69,7 @@ class EntryStarts:
             domain.graph.joined.append(later.joined)
         programs.listeners.append(later.entry_changed)
 
-    def add_at(self, entry: Entry, time_ns: int) -> None:
+    def add_at(self, entry: JobEntry, time_ns: int) -> None:
         """Start an entry at a time, whatever its rule says."""
         later = DelayedStart(self, entry, StartRule())
         self._waiting.append(later)
@@ -96,7 +96,7 @@ class EntryStarts:
 class DelayedStart:
     """An entry that waits for its start; the loop dispatches it once."""
 
-    def __init__(self, starts: EntryStarts, entry: Entry, rule: StartRule) -> None:
+    def __init__(self, starts: EntryStarts, entry: JobEntry, rule: StartRule) -> None:
         self.entry = entry
         self._starts = starts
         self._rule = rule

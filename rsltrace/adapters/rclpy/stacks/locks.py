@@ -21,7 +21,7 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, runtimes, wait
 from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.errors import UnsupportedError
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.texts import waiting_ns
 
 _real_rlock = _thread.RLock
 
@@ -84,7 +84,7 @@ class SimLock:
             )
         in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
         now_ns = stacks.loop.now_ns
-        until_ns = None if timeout == -1 else now_ns + patience_ns(timeout)
+        until_ns = None if timeout == -1 else now_ns + waiting_ns(timeout)
         overtaken = False
         while True:
             for_ns = None if until_ns is None else until_ns - stacks.loop.now_ns

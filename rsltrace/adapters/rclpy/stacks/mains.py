@@ -22,7 +22,7 @@ from rsltrace.adapters.rclpy.stacks.program import ExitHandler, SimulatedProgram
 from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, RunEnded, Runtime
 from rsltrace.adapters.rclpy.stacks.threads import SimThread
 from rsltrace.simulation.loop.stop import Stop
-from rsltrace.simulation.middleware.events.failure import text_of
+from rsltrace.simulation.middleware.events.failure import exception_text
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 
@@ -204,7 +204,7 @@ def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseExcept
         program.exit_code = exit_status(error) if isinstance(error, SystemExit) else _INTERRUPTED
         stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, program.exit_code)
         if program.exit_code:
-            said = text_of(error) if not isinstance(getattr(error, "code", 0), int) else ""
+            said = exception_text(error) if not isinstance(getattr(error, "code", 0), int) else ""
             said = f": {said}" if said else ""
             at = format_seconds(stacks.loop.now_ns)
             notes.append(f"{program.label} exited with {program.exit_code} at {at} s{said}")
@@ -212,7 +212,9 @@ def _note_main_end(stacks: Runtime, program: SimulatedProgram, error: BaseExcept
     if over:
         if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
             kind = type(error).__qualname__
-            notes.append(f"{program.label} raised {kind} at the end of the run: {text_of(error)}")
+            notes.append(
+                f"{program.label} raised {kind} at the end of the run: {exception_text(error)}"
+            )
         return False
     return True
 

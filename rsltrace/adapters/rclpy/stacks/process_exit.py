@@ -26,14 +26,14 @@ from rsltrace.adapters.rclpy.stacks.mains import end_program, interrupt, shut_do
 from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.callers import is_user_file
-from rsltrace.guard.process_ids import meant_id
+from rsltrace.guard.process_ids import real_id
 from rsltrace.guard.redirect import Redirected
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.domain import Domain
 from rsltrace.simulation.middleware.events.failure import (
-    Raised,
+    RaisedException,
+    exception_text,
     is_own_frame,
-    text_of,
     user_traceback,
 )
 from rsltrace.terminal import tell
@@ -64,7 +64,9 @@ class _SignalHandler:
             if _is_in_user_code(frame):
                 raise
             label = f"the handler of {signal.Signals(number).name} that a node has set"
-            said = Raised(error, label, "", loop.now_ns, user_traceback(error), text_of(error))
+            said = RaisedException(
+                error, label, "", loop.now_ns, user_traceback(error), exception_text(error)
+            )
             outcome.error = outcome.error or said.as_error()
             loop.stop(Stop(f"{label} raised {said.kind}", outcome.error.exit_code))
 
@@ -192,7 +194,7 @@ def _abort() -> None:
 
 
 def _kill(pid: int, number: int, /) -> None:
-    pid = meant_id(pid)
+    pid = real_id(pid)
     stacks = _calling_node_runtime()
     if stacks is None or pid != getpid() or not _signalled(stacks, number, "os.kill"):
         _real["kill"](pid, number)

@@ -17,9 +17,9 @@ from typing import Any, Protocol
 
 from greenlet import greenlet
 
-from rsltrace.adapters.rclpy.entry import Entry
-from rsltrace.simulation.middleware.events.failure import Raised
-from rsltrace.simulation.middleware.interface import source_of
+from rsltrace.adapters.rclpy.entry import JobEntry
+from rsltrace.simulation.middleware.events.failure import RaisedException
+from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 
 _FAILURES_MAX = 16
@@ -54,7 +54,7 @@ class SimulatedPrograms:
         self.host = SimulatedProgram(self)
         self.present = self.host
         self.all: list[SimulatedProgram] = []
-        self.constructing: Entry | None = None
+        self.constructing: JobEntry | None = None
         self.importing = False
         self.main_context: ProgramContext | None = None
         self.fed = False
@@ -88,7 +88,7 @@ class SimulatedPrograms:
 class SimulatedProgram:
     """A simulated process: a main, or the host of the nodes that a job constructs."""
 
-    def __init__(self, programs: SimulatedPrograms, entry: Entry | None = None) -> None:
+    def __init__(self, programs: SimulatedPrograms, entry: JobEntry | None = None) -> None:
         self._programs = programs
         self.entry = entry
         self.name = "the run" if entry is None else entry.name
@@ -103,7 +103,7 @@ class SimulatedProgram:
         self.begun_ns: int | None = None
         self.announced = True
         self.contexts: list[ProgramContext] = []
-        self.failures: deque[Raised] = deque(maxlen=_FAILURES_MAX)
+        self.failures: deque[RaisedException] = deque(maxlen=_FAILURES_MAX)
         """Exceptions of callbacks that left a spin of this program, the latest last."""
         self.exit_handlers: list[ExitHandler] = []
         self.signal_handlers: dict[int, object] = {}
@@ -167,7 +167,7 @@ class SimulatedProgram:
         return True
 
     def entity(self) -> Entity:
-        source = "" if self.entry is None else source_of(self.entry.make)
+        source = "" if self.entry is None else callback_source(self.entry.make)
         detail: dict[str, object] = {"source": source} if source else {}
         return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, detail)
 

@@ -24,7 +24,7 @@ from rsltrace.adapters.rclpy.stacks.coroutines import Coroutines
 from rsltrace.adapters.rclpy.stacks.mailbox import describe_service_call
 from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram, SimulatedPrograms
 from rsltrace.errors import EXIT_RUN
-from rsltrace.guard.callers import is_telling
+from rsltrace.guard.callers import is_user_or_library_file
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.domain import Domain
@@ -236,7 +236,7 @@ class BlockedCall:
     def waits_for(self) -> str:
         """Describe who waits for what, with the lines of user code."""
         frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
-        own = [frame for frame in frames if is_telling(frame.filename)]
+        own = [frame for frame in frames if is_user_or_library_file(frame.filename)]
         where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
         hint = ""
         if self._group is not None and self._runners.groups.waiting_for(self._group):

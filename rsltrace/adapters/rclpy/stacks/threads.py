@@ -36,11 +36,11 @@ from rsltrace.guard.libraries import present_import
 from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
-from rsltrace.simulation.middleware.interface import source_of
+from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.finding import Mode, Source
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
+from rsltrace.trace.model.texts import waiting_ns
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001
@@ -197,7 +197,7 @@ class SimThread:
     def join(self, timeout: float | None) -> None:
         """Wait in simulated time until the thread has ended."""
         if not self.ended:
-            for_ns = None if timeout is None else max(patience_ns(timeout), 0)
+            for_ns = None if timeout is None else max(waiting_ns(timeout), 0)
             what, until = f"thread {self.name} to end", self._joining.append
             wait(self.stacks, what, until=until, for_ns=for_ns, patient=self.is_patient)
             self._joining = [blocked for blocked in self._joining if blocked.waiting]
@@ -218,7 +218,7 @@ class SimThread:
     def entity(self) -> Entity:
         node = self.node.entity_id if self.node is not None else 0
         now_ns = self.stacks.loop.now_ns
-        source = source_of(
+        source = callback_source(
             getattr(self.thread, "_target", None) or getattr(self.thread, "run", None)
         )
         detail: dict[str, object] = {"source": source} if source else {}
@@ -249,9 +249,9 @@ def _start(self: Any) -> None:
 def _report_import_thread(thread: Any, frame: FrameType) -> None:
     """Report a thread that a library starts at import: the next import may start none."""
     guard = engaged()
-    if guard is not None and guard.mode(Source.THREAD, frame) is not Mode.ALLOW:
+    if guard is not None and guard.mode(NondeterminismSource.THREAD, frame) is not GuardMode.ALLOW:
         call = f"threading.Thread.start() while {module_of(frame)} is imported"
-        guard.report(Source.THREAD, Mode.WARN, call, thread.name, frame)
+        guard.report(NondeterminismSource.THREAD, GuardMode.WARN, call, thread.name, frame)
 
 
 def _start_late(timer: Any, frame: FrameType | None = None) -> None:

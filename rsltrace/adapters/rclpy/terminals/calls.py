@@ -17,9 +17,9 @@ from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
 from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
-from rsltrace.guard.frames import exchange
+from rsltrace.guard.frames import replace_member
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.trace.model.texts import patience_ns
+from rsltrace.trace.model.texts import waiting_ns
 
 _DEBUGGERS = ("bdb", "cmd", "code", "pdb", "IPython", "prompt_toolkit", "debugpy", "pydevd")
 
@@ -116,10 +116,10 @@ def simulated_curses(caller_terminal: TerminalOfCaller, show: ShowTerminal) -> I
     with ExitStack() as stack:
         for name in _READS:
             making = partial(_reading, caller_terminal, limits_ms, all_ms, limit)
-            exchange(stack, _curses.window, name, making)
-        exchange(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
-        exchange(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
-        exchange(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
+            replace_member(stack, _curses.window, name, making)
+        replace_member(stack, _curses.window, "refresh", partial(_drained, caller_terminal))
+        replace_member(stack, _curses.window, "nodelay", partial(_limiting, limits_ms, _of_nodelay))
+        replace_member(stack, _curses.window, "timeout", partial(_limiting, limits_ms, int))
         redirect(stack, _curses.doupdate, partial(_drained, caller_terminal))
         redirect(stack, _curses.halfdelay, partial(_halving, all_ms))
         for function in (_curses.setupterm, _curses.initscr):
@@ -375,7 +375,7 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
         kinds = [waited_for, list(writes), list(others)]
         alone = sum(map(len, kinds)) == 1
         stacks = terminals._stacks
-        until_ns = None if timeout is None else stacks.loop.now_ns + patience_ns(timeout)
+        until_ns = None if timeout is None else stacks.loop.now_ns + waiting_ns(timeout)
         while True:
             terminal.offer()
             found = real(*kinds, 0)

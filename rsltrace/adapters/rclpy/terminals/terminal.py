@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
-from rsltrace.adapters.rclpy.entry import Typed
+from rsltrace.adapters.rclpy.entry import TypedInput
 from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
 from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.redirect import copy_of
@@ -40,7 +40,7 @@ class Terminal:
     """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. With ``has_screen`` the
     main also prints there (curses)."""
 
-    def __init__(self, stacks: Runtime, typed: Sequence[Typed], start_ns: int) -> None:
+    def __init__(self, stacks: Runtime, typed: Sequence[TypedInput], start_ns: int) -> None:
         self._stacks = stacks
         self._typed = deque(typed)
         self._start_ns = start_ns

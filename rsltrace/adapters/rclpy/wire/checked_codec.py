@@ -18,13 +18,13 @@ import numpy as np
 from rsltrace.adapters.rclpy.wire.message_spec import (
     CHECK_SLOT,
     HEADER,
-    Array,
+    ArrayType,
     FieldType,
-    Item,
-    Message,
-    Primitive,
-    Sequence,
-    Text,
+    ItemType,
+    MessageSpec,
+    PrimitiveType,
+    SequenceType,
+    StringType,
     least_size,
 )
 
@@ -40,7 +40,7 @@ _OTHER_ENCODINGS = {
 }
 
 
-def decode(spec: Message, raw: bytes) -> Any:
+def decode(spec: MessageSpec, raw: bytes) -> Any:
     """Return the message in CDR bytes, with the Python types of rclpy.
 
     Bytes after the end are ignored if they pad to a multiple of 4, or if rclpy's
@@ -59,7 +59,7 @@ def decode(spec: Message, raw: bytes) -> Any:
 class _Decoder:
     """Reads ``raw`` from ``position``, which counts from after the header as alignment does."""
 
-    def __init__(self, spec: Message, raw: bytes) -> None:
+    def __init__(self, spec: MessageSpec, raw: bytes) -> None:
         self.spec = spec
         self.raw = raw
         self.position = 0
@@ -83,7 +83,7 @@ class _Decoder:
                 f"{len(self.raw)} bytes; they are of another type or of another version of it"
             )
 
-    def message(self, spec: Message, path: str) -> Any:
+    def message(self, spec: MessageSpec, path: str) -> Any:
         message: Any = object.__new__(spec.cls)
         if spec.check_fields is not None:
             setattr(message, CHECK_SLOT, spec.check_fields)
@@ -95,14 +95,14 @@ class _Decoder:
         return message
 
     def value(self, type_: FieldType, path: str) -> Any:
-        if isinstance(type_, Primitive):
+        if isinstance(type_, PrimitiveType):
             self.align(type_.size)
             return self.primitive(type_, self.take(type_.size, path), path)
-        if isinstance(type_, Text):
+        if isinstance(type_, StringType):
             return self.text(type_, path)
-        if isinstance(type_, Message):
+        if isinstance(type_, MessageSpec):
             return self.message(type_, path)
-        if isinstance(type_, Array):
+        if isinstance(type_, ArrayType):
             return self.array(type_, path)
         return self.sequence(type_, path)
 
@@ -130,14 +130,14 @@ class _Decoder:
 
     # -- values -------------------------------------------------------------------------------
 
-    def primitive(self, type_: Primitive, data: bytes, path: str) -> Any:
+    def primitive(self, type_: PrimitiveType, data: bytes, path: str) -> Any:
         if type_.name == "char":
             if data[0] > 127:
                 raise self.wrong(f"field {path!r} is char {data[0]}, which rclpy cannot convert")
             return chr(data[0])
         return struct.unpack(self.order + type_.code, data)[0]
 
-    def text(self, type_: Text, path: str) -> str:
+    def text(self, type_: StringType, path: str) -> str:
         number = self.count(path)
         if not type_.wide:
             # As rclpy: up to the first NUL, and invalid UTF-8 is replaced.
@@ -151,32 +151,32 @@ class _Decoder:
                 f"field {path!r} at offset {start} is not UTF-16 text: {error}"
             ) from error
 
-    def array(self, type_: Array, path: str) -> Any:
+    def array(self, type_: ArrayType, path: str) -> Any:
         item = type_.item
-        if isinstance(item, Primitive) and item.typecode:
+        if isinstance(item, PrimitiveType) and item.typecode:
             self.align(item.size)
             data = self.take(type_.length * item.size, path)
             return np.frombuffer(data, item.dtype.newbyteorder(self.order)).astype(item.dtype)
         return [self.value(item, f"{path}[{index}]") for index in range(type_.length)]
 
-    def sequence(self, type_: Sequence, path: str) -> Any:
+    def sequence(self, type_: SequenceType, path: str) -> Any:
         start = self.position + -self.position % 4
         number = self.count(path)
         item = type_.item
-        if number and isinstance(item, Primitive):
+        if number and isinstance(item, PrimitiveType):
             self.align(item.size)
-        elif isinstance(item, Primitive):
+        elif isinstance(item, PrimitiveType):
             # The estimate aligns an empty sequence, though no item is written.
             self.allotted += -self.allotted % item.size
         self.plausible(item, number, start, path)
-        if isinstance(item, Primitive) and item.typecode:
+        if isinstance(item, PrimitiveType) and item.typecode:
             values = array.array(item.typecode, self.take(number * item.size, path))
             if (self.order == "<") != (sys.byteorder == "little"):
                 values.byteswap()
             return values
         return [self.value(item, f"{path}[{index}]") for index in range(number)]
 
-    def plausible(self, item: Item, number: int, start: int, path: str) -> None:
+    def plausible(self, item: ItemType, number: int, start: int, path: str) -> None:
         """Refuse a count that exceeds the remaining bytes, before memory is allocated for it."""
         if number * least_size(item) > self.end - self.position:
             raise self.wrong(
@@ -204,7 +204,7 @@ _UINT32 = struct.Struct("<I")
 _LONG = 1 << 63
 
 
-def encode(spec: Message, message: Any, *, fill: int = 0) -> bytes:
+def encode(spec: MessageSpec, message: Any, *, fill: int = 0) -> bytes:
     """Return the CDR bytes of a message, with ``fill`` (0 to 255) as padding.
 
     Raises TypeError or ValueError naming message, field and value, if rclpy cannot serialize it
@@ -228,7 +228,7 @@ class _Encoder:
         self.fill = fill
         self.data = bytearray()
 
-    def message(self, spec: Message, message: Any, path: str) -> None:
+    def message(self, spec: MessageSpec, message: Any, path: str) -> None:
         if not spec.fields:
             self.data.append(0)  # CDR has no empty structs; rosidl puts one zero byte into them
         for field in spec.fields:
@@ -240,16 +240,16 @@ class _Encoder:
             self.value(field.type, value, where)
 
     def value(self, type_: FieldType, value: Any, path: str) -> None:
-        if isinstance(type_, Primitive):
+        if isinstance(type_, PrimitiveType):
             self.align(type_.size)
             self.data += self.primitive(type_, value, path)
-        elif isinstance(type_, Text):
+        elif isinstance(type_, StringType):
             self.text(type_, value, path)
-        elif isinstance(type_, Message):
+        elif isinstance(type_, MessageSpec):
             if not _is_instance(value, type_):
                 raise self.wrong_type(path, f"a {type_.type_name} message", value)
             self.message(type_, value, path)
-        elif isinstance(type_, Array):
+        elif isinstance(type_, ArrayType):
             self.array(type_, value, path)
         else:
             self.sequence(type_, value, path)
@@ -263,7 +263,7 @@ class _Encoder:
 
     # -- single values ------------------------------------------------------------------------
 
-    def primitive(self, type_: Primitive, value: Any, path: str) -> bytes:
+    def primitive(self, type_: PrimitiveType, value: Any, path: str) -> bytes:
         if type_.name == "boolean":
             # rclpy compares with Py_True: 1 and numpy.True_ would silently become False.
             if value is not True and value is not False:
@@ -281,7 +281,7 @@ class _Encoder:
             return self.real(type_, value, path)
         return self.integer(type_, value, path)
 
-    def real(self, type_: Primitive, value: Any, path: str) -> bytes:
+    def real(self, type_: PrimitiveType, value: Any, path: str) -> bytes:
         # PyFloat_AS_DOUBLE on anything else reads whatever bytes the object has there.
         if not isinstance(value, float):
             raise self.wrong_type(path, "a float (convert integers and numpy.float32)", value)
@@ -290,7 +290,7 @@ class _Encoder:
         except OverflowError:  # too large for float32: C's conversion gives infinity
             return struct.pack("<f", float("inf") if value > 0 else float("-inf"))
 
-    def integer(self, type_: Primitive, value: Any, path: str) -> bytes:
+    def integer(self, type_: PrimitiveType, value: Any, path: str) -> bytes:
         if not isinstance(value, int):
             raise self.wrong_type(path, "an int (numpy integers are not)", value)
         bits = 8 * type_.size
@@ -307,7 +307,7 @@ class _Encoder:
         except UnicodeEncodeError as error:
             raise self.wrong_value(path, f"cannot be encoded: {error}") from error
 
-    def text(self, type_: Text, value: Any, path: str) -> None:
+    def text(self, type_: StringType, value: Any, path: str) -> None:
         if not isinstance(value, str):
             raise self.wrong_type(path, "a str", value)
         if type_.wide:
@@ -325,8 +325,8 @@ class _Encoder:
 
     # -- many values --------------------------------------------------------------------------
 
-    def array(self, type_: Array, value: Any, path: str) -> None:
-        if isinstance(type_.item, Primitive) and type_.item.typecode:
+    def array(self, type_: ArrayType, value: Any, path: str) -> None:
+        if isinstance(type_.item, PrimitiveType) and type_.item.typecode:
             self.align(type_.item.size)
             self.data += self.numbers(type_.item, type_.length, value, path)
             return
@@ -336,7 +336,7 @@ class _Encoder:
         # rclpy takes the first ones and ignores the others.
         self.each(type_.item, items[: type_.length], path)
 
-    def numbers(self, item: Primitive, length: int, value: Any, path: str) -> bytes:
+    def numbers(self, item: PrimitiveType, length: int, value: Any, path: str) -> bytes:
         expected = f"a numpy array of {length} {item.dtype}"
         if type(value) is not np.ndarray:
             raise self.wrong_type(path, expected, value)
@@ -346,10 +346,10 @@ class _Encoder:
             )
         return value[:length].tobytes()
 
-    def sequence(self, type_: Sequence, value: Any, path: str) -> None:
+    def sequence(self, type_: SequenceType, value: Any, path: str) -> None:
         raw = self.raw_items(type_.item, value, path)
         if raw is not None:
-            assert isinstance(type_.item, Primitive)
+            assert isinstance(type_.item, PrimitiveType)
             number = len(raw) // type_.item.size
             self.bounded(type_, number, path)
             self.count(number)
@@ -364,9 +364,9 @@ class _Encoder:
         self.count(len(items))
         self.each(type_.item, items, path)
 
-    def raw_items(self, item: Item, value: Any, path: str) -> bytes | None:
+    def raw_items(self, item: ItemType, value: Any, path: str) -> bytes | None:
         """Return the bytes of a buffer, which rclpy copies; None if it is not one."""
-        if not isinstance(item, Primitive):
+        if not isinstance(item, PrimitiveType):
             return None
         try:
             view = memoryview(value)
@@ -389,11 +389,11 @@ class _Encoder:
         except TypeError:
             raise self.wrong_type(path, "a sequence", value) from None
 
-    def each(self, item: Item, items: list[Any], path: str) -> None:
+    def each(self, item: ItemType, items: list[Any], path: str) -> None:
         for index, value in enumerate(items):
             self.value(item, value, f"{path}[{index}]")
 
-    def bounded(self, type_: Sequence, number: int, path: str) -> None:
+    def bounded(self, type_: SequenceType, number: int, path: str) -> None:
         if type_.bound is not None and number > type_.bound:
             raise self.wrong_value(path, f"has {number} items, more than its bound {type_.bound}")
 
@@ -418,7 +418,7 @@ def pack_wide(value: str) -> bytes:
     return units.astype("<u4").tobytes()
 
 
-def _is_instance(value: Any, spec: Message) -> bool:
+def _is_instance(value: Any, spec: MessageSpec) -> bool:
     # rclpy's own test: the beginning of the class's name, so that no subclass passes.
     cls = type(value)
     return cls is spec.cls or f"{cls.__module__}.{cls.__name__}".startswith(spec.python_name)

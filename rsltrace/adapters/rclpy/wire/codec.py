@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     HEADER_PART,
     HEADER_PLACE,
     HEADER_VALUE,
-    Message,
+    MessageSpec,
     fixed_parts,
     lay_out,
     message_spec,
@@ -32,7 +32,7 @@ class Codec:
     a function that you call often.
     """
 
-    def __init__(self, spec: Message) -> None:
+    def __init__(self, spec: MessageSpec) -> None:
         self._spec = spec
         self.type_name: str = spec.type_name
 
@@ -69,7 +69,7 @@ def codec_for(message_class: type) -> Codec:
     return Codec(message_spec(message_class))
 
 
-def _make_canonical(spec: Message, codec: Codec) -> Callable[[bytes], bytes]:
+def _make_canonical(spec: MessageSpec, codec: Codec) -> Callable[[bytes], bytes]:
     def by_message(raw: bytes) -> bytes:
         return codec.serialize(codec.deserialize(raw))
 

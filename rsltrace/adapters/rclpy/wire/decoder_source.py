@@ -40,15 +40,15 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     HEADER_PLACE,
     HEADER_VALUE,
     START,
-    Array,
+    ArrayType,
     FieldType,
     FixedValue,
-    Item,
+    ItemType,
     KnownOffset,
-    Message,
-    Primitive,
-    Sequence,
-    Text,
+    MessageSpec,
+    PrimitiveType,
+    SequenceType,
+    StringType,
     after_items,
     fixed_parts,
     fixed_size,
@@ -63,7 +63,7 @@ _LARGE = 4096
 _OCTETS = tuple(bytes((value,)) for value in range(256))
 
 
-def make_deserializer(spec: Message) -> Callable[[bytes], Any]:
+def make_deserializer(spec: MessageSpec) -> Callable[[bytes], Any]:
     """Return a function from CDR bytes to a message, with the errors of `decode`."""
     return _Reader(spec).function()
 
@@ -78,7 +78,7 @@ class _Value(NamedTuple):
 class _Tree(NamedTuple):
     """A message to build once all its values have been read."""
 
-    spec: Message
+    spec: MessageSpec
     values: list[str | _Tree]
 
 
@@ -86,7 +86,7 @@ class _Reader:
     """Writes the source. The offset in ``raw`` is the variable named ``base`` (if any) plus
     ``ahead``; ``place`` is what is known of it, counted from after the header."""
 
-    def __init__(self, spec: Message) -> None:
+    def __init__(self, spec: MessageSpec) -> None:
         self.spec = spec
         self.source = FunctionSource(
             {
@@ -119,24 +119,24 @@ class _Reader:
 
     # -- values -------------------------------------------------------------------------------
 
-    def message(self, spec: Message) -> _Tree:
+    def message(self, spec: MessageSpec) -> _Tree:
         if not spec.fields:
             self.run.append(FixedValue("x", 1, 1))
         return _Tree(spec, [self.value(field.type) for field in spec.fields])
 
     def value(self, type_: FieldType) -> str | _Tree:
-        if isinstance(type_, Primitive):
+        if isinstance(type_, PrimitiveType):
             conversion = "{0} = {0}.decode('ascii')" if type_.name == "char" else ""
             return self.put(FixedValue(type_.code, type_.size, type_.size), conversion)
-        if isinstance(type_, Text):
+        if isinstance(type_, StringType):
             return self.text(type_)
-        if isinstance(type_, Message):
+        if isinstance(type_, MessageSpec):
             return self.message(type_)
-        if isinstance(type_, Array):
+        if isinstance(type_, ArrayType):
             return self.array(type_)
         return self.sequence(type_)
 
-    def text(self, type_: Text) -> str:
+    def text(self, type_: StringType) -> str:
         number = self.put(FixedValue("I", 4, 4))
         self.flush()
         value, end = self.source.variable("v"), self.source.variable("e")
@@ -153,9 +153,9 @@ class _Reader:
         self.jump(end, self.place.moved_by_multiple(1))
         return value
 
-    def array(self, type_: Array) -> str:
+    def array(self, type_: ArrayType) -> str:
         item, length = type_.item, type_.length
-        if not isinstance(item, Primitive):
+        if not isinstance(item, PrimitiveType):
             self.flush()
             return self.loop(item, str(length), steady(item, self.place))
         size = item.size * length
@@ -173,11 +173,11 @@ class _Reader:
         self.values.append(_Value(data, lines))
         return value
 
-    def sequence(self, type_: Sequence) -> str:
+    def sequence(self, type_: SequenceType) -> str:
         item = type_.item
         number = self.put(FixedValue("I", 4, 4))
         self.flush()
-        if isinstance(item, Primitive):
+        if isinstance(item, PrimitiveType):
             place = after_items(item, self.place)
             start, end = self.items(number, item.size, item.size)
             value = self.source.variable("v")
@@ -191,14 +191,14 @@ class _Reader:
             self.jump(end, place)
             return value
         parts = fixed_parts(item)
-        if parts is not None and isinstance(item, Message) and item.fields:
+        if parts is not None and isinstance(item, MessageSpec) and item.fields:
             widest = max(part.alignment for part in parts)
             _, size = lay_out(parts, 0)
             if parts[0].alignment == widest and size % widest == 0:
                 return self.strided(item, number, size, widest)
         return self.loop(item, number, steady(item, self.place))
 
-    def strided(self, item: Message, number: str, size: int, widest: int) -> str:
+    def strided(self, item: MessageSpec, number: str, size: int, widest: int) -> str:
         """Read items of the same layout, without padding between them."""
         place = after_items(item, self.place)
         start, end = self.items(number, size, widest)
@@ -227,7 +227,7 @@ class _Reader:
         self.source.line(f"{end} = {start} + {size}")
         self.source.line(f"if {end} > end: raise Unusual")
 
-    def loop(self, item: Item, number: str, place: KnownOffset) -> str:
+    def loop(self, item: ItemType, number: str, place: KnownOffset) -> str:
         """Read items one by one; ``place`` holds at the start of every turn."""
         values, add = self.new_list()
         self.settle(place)

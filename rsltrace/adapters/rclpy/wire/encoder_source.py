@@ -38,15 +38,15 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     HEADER_PART,
     HEADER_VALUE,
     START,
-    Array,
+    ArrayType,
     FieldType,
     FixedValue,
-    Item,
+    ItemType,
     KnownOffset,
-    Message,
-    Primitive,
-    Sequence,
-    Text,
+    MessageSpec,
+    PrimitiveType,
+    SequenceType,
+    StringType,
     first_alignment,
     lay_out,
     steady,
@@ -56,7 +56,7 @@ from rsltrace.adapters.rclpy.wire.source_text import FunctionSource, packer
 _ONLY_BOOL = frozenset({bool})
 
 
-def make_serializer(spec: Message) -> Callable[[Any], bytes]:
+def make_serializer(spec: MessageSpec) -> Callable[[Any], bytes]:
     """Return a function from a message to its CDR bytes, with the errors of `encode`."""
     return _Writer(spec).function()
 
@@ -65,7 +65,7 @@ class _Writer:
     """Writes the source. ``place`` is what is known of the position; the generated variable ``p``
     holds (position - ``ahead``) modulo 8 wherever ``place`` does not tell all of it."""
 
-    def __init__(self, spec: Message) -> None:
+    def __init__(self, spec: MessageSpec) -> None:
         self.spec = spec
         self.source = FunctionSource(
             {
@@ -105,7 +105,7 @@ class _Writer:
 
     # -- values -------------------------------------------------------------------------------
 
-    def message(self, spec: Message, name: str) -> None:
+    def message(self, spec: MessageSpec, name: str) -> None:
         if not spec.fields:
             self.put(FixedValue("x", 1, 1))
         for field in spec.fields:
@@ -114,19 +114,19 @@ class _Writer:
             self.value(field.type, value)
 
     def value(self, type_: FieldType, value: str) -> None:
-        if isinstance(type_, Primitive):
+        if isinstance(type_, PrimitiveType):
             self.primitive(type_, value)
-        elif isinstance(type_, Text):
+        elif isinstance(type_, StringType):
             self.text(type_, value)
-        elif isinstance(type_, Message):
+        elif isinstance(type_, MessageSpec):
             self.checks.append(f"type({value}) is {self.source.constant(type_.cls)}")
             self.message(type_, value)
-        elif isinstance(type_, Array):
+        elif isinstance(type_, ArrayType):
             self.array(type_, value)
         else:
             self.sequence(type_, value)
 
-    def primitive(self, type_: Primitive, value: str) -> None:
+    def primitive(self, type_: PrimitiveType, value: str) -> None:
         if type_.name == "char":
             self.checks.append("False")  # only IDL files can have it; no fast code
         elif type_.name == "boolean":
@@ -135,7 +135,7 @@ class _Writer:
             self.checks.append(f"isinstance({value}, {'float' if type_.code in 'fd' else 'int'})")
         self.put(FixedValue(type_.code, type_.size, type_.size), value)
 
-    def text(self, type_: Text, value: str) -> None:
+    def text(self, type_: StringType, value: str) -> None:
         data = self.source.variable("b")
         if type_.wide:
             self.source.line(f"{data} = pack_wide({value})")
@@ -152,9 +152,9 @@ class _Writer:
         self.move(f"len({data})", 1)
         self.put(FixedValue("x", 1, 1))  # the NUL; it joins what follows
 
-    def array(self, type_: Array, value: str) -> None:
+    def array(self, type_: ArrayType, value: str) -> None:
         item, length = type_.item, type_.length
-        if isinstance(item, Primitive) and item.typecode:
+        if isinstance(item, PrimitiveType) and item.typecode:
             dtype = self.source.constant(item.dtype)
             self.checks += [
                 f"{value}.dtype is {dtype}",
@@ -166,17 +166,17 @@ class _Writer:
             return
         self.need_list(value)
         self.source.line(f"if len({value}) != {length}: raise Unusual")
-        if isinstance(item, Primitive):
+        if isinstance(item, PrimitiveType):
             self.put(FixedValue(f"{length}s", length, 1), self.flags(item, value))
         else:
             self.flush()
             self.loop(item, value, steady(item, self.place))
 
-    def sequence(self, type_: Sequence, value: str) -> None:
+    def sequence(self, type_: SequenceType, value: str) -> None:
         item = type_.item
-        numbers = isinstance(item, Primitive) and bool(item.typecode)
+        numbers = isinstance(item, PrimitiveType) and bool(item.typecode)
         if numbers:
-            assert isinstance(item, Primitive)
+            assert isinstance(item, PrimitiveType)
             array_type = self.source.constant(array.array)
             self.checks += [
                 f"type({value}) is {array_type}",
@@ -188,10 +188,10 @@ class _Writer:
             self.checks.append(f"len({value}) <= {type_.bound}")
         self.put(FixedValue("I", 4, 4), f"len({value})")
         self.flush()
-        if isinstance(item, Primitive) and item.size < 8:
+        if isinstance(item, PrimitiveType) and item.size < 8:
             self.emit(value if numbers else self.flags(item, value), bulk=True)
             self.move(f"{item.size} * len({value})", item.size)
-        elif isinstance(item, Primitive):
+        elif isinstance(item, PrimitiveType):
             with self.aligned_if(value):
                 self.emit(value, bulk=True)
         elif first_alignment(item) == 8 and steady(item, START) == START:
@@ -225,7 +225,7 @@ class _Writer:
         self.ahead = 0
         self.place = place.joined(START)
 
-    def loop(self, item: Item, sequence: str, place: KnownOffset) -> None:
+    def loop(self, item: ItemType, sequence: str, place: KnownOffset) -> None:
         """Write a loop over items; ``place`` holds at every turn."""
         if not self.begun:
             self.emit(repr(HEADER))
@@ -237,7 +237,7 @@ class _Writer:
             self.flush()
             self.settle(place)
 
-    def flags(self, item: Primitive, value: str) -> str:
+    def flags(self, item: PrimitiveType, value: str) -> str:
         """Return the name of the bytes of a list of ``boolean``, ``octet`` or ``char``."""
         data = self.source.variable("b")
         if item.name == "boolean":
@@ -342,10 +342,10 @@ class _Writer:
 
 
 def _needs_loop(type_: FieldType) -> bool:
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return any(_needs_loop(field.type) for field in type_.fields)
-    if isinstance(type_, Array | Sequence):
-        return not isinstance(type_.item, Primitive)
+    if isinstance(type_, ArrayType | SequenceType):
+        return not isinstance(type_.item, PrimitiveType)
     return False
 
 

@@ -23,12 +23,12 @@ from rsltrace.adapters.rclpy.wire.interface_classes import (
     type_name,
 )
 from rsltrace.adapters.rclpy.wire.message_spec import (
-    Array,
+    ArrayType,
     FieldType,
-    Message,
-    Primitive,
-    Sequence,
-    Text,
+    MessageSpec,
+    PrimitiveType,
+    SequenceType,
+    StringType,
     message_spec,
 )
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
@@ -155,7 +155,7 @@ def service_type(cls: Any) -> ServiceType:
     return ServiceType(request.name.removesuffix("_Request"), request, response)
 
 
-def _definition(spec: Message) -> str:
+def _definition(spec: MessageSpec) -> str:
     text = installed_definition(spec.type_name)
     # Do not use a file of another version than the class.
     if text is not None and _field_names(text) == [field.name for field in spec.fields]:
@@ -163,7 +163,7 @@ def _definition(spec: Message) -> str:
     return "\n".join(f"{_written(field.type)} {field.name}" for field in spec.fields)
 
 
-def _with_full_types(text: str, spec: Message) -> str:
+def _with_full_types(text: str, spec: MessageSpec) -> str:
     """Add the package to types without one.
 
     In a ``.srv`` or ``.action`` file these are messages of the same package, but readers would take
@@ -172,7 +172,7 @@ def _with_full_types(text: str, spec: Message) -> str:
     packages = {
         field.name: _short_name(item).rpartition("/")[0] + "/"
         for field in spec.fields
-        if isinstance(item := getattr(field.type, "item", field.type), Message)
+        if isinstance(item := getattr(field.type, "item", field.type), MessageSpec)
     }
 
     def full(line: str) -> str:
@@ -190,14 +190,14 @@ def _field_names(text: str) -> list[str]:
     return [match["name"] for match in matches if match and not match["constant"]]
 
 
-def _dependencies(root: Message) -> list[Message]:
+def _dependencies(root: MessageSpec) -> list[MessageSpec]:
     """Return every message inside ``root`` once, in order of appearance."""
-    found: dict[str, Message] = {}
+    found: dict[str, MessageSpec] = {}
 
     def visit(type_: FieldType) -> None:
-        if isinstance(type_, Array | Sequence):
+        if isinstance(type_, ArrayType | SequenceType):
             visit(type_.item)
-        elif isinstance(type_, Message) and type_.type_name not in found:
+        elif isinstance(type_, MessageSpec) and type_.type_name not in found:
             found[type_.type_name] = type_
             for field in type_.fields:
                 visit(field.type)
@@ -207,21 +207,21 @@ def _dependencies(root: Message) -> list[Message]:
     return list(found.values())
 
 
-def _short_name(spec: Message) -> str:
+def _short_name(spec: MessageSpec) -> str:
     package, _, type_ = spec.type_name.split("/")
     return f"{package}/{type_}"
 
 
 def _written(type_: FieldType) -> str:
     """Return a type in the syntax of ``.msg`` files."""
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return _TEXT_NAMES.get(type_.name, type_.name)
-    if isinstance(type_, Text):
+    if isinstance(type_, StringType):
         bound = "" if type_.bound is None else f"<={type_.bound}"
         return f"{'wstring' if type_.wide else 'string'}{bound}"
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return _short_name(type_)
-    if isinstance(type_, Array):
+    if isinstance(type_, ArrayType):
         return f"{_written(type_.item)}[{type_.length}]"
     bound = "" if type_.bound is None else f"<={type_.bound}"
     return f"{_written(type_.item)}[{bound}]"

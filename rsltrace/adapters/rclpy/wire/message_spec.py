@@ -18,7 +18,7 @@ CHECK_SLOT = "_check_fields"
 
 
 @dataclass(frozen=True, slots=True)
-class Primitive:
+class PrimitiveType:
     """A value of fixed size. ``code`` is its letter in `struct`, ``size`` its bytes and alignment.
 
     ``typecode`` is its letter in `array.array`, which rclpy uses for sequences of numbers; empty
@@ -39,7 +39,7 @@ class Primitive:
 
 
 @dataclass(frozen=True, slots=True)
-class Text:
+class StringType:
     """A string, or wstring if ``wide``; rclpy does not enforce its ``bound``."""
 
     wide: bool
@@ -47,18 +47,18 @@ class Text:
 
 
 @dataclass(frozen=True, slots=True)
-class Array:
+class ArrayType:
     """Exactly ``length`` items."""
 
-    item: Item
+    item: ItemType
     length: int
 
 
 @dataclass(frozen=True, slots=True)
-class Sequence:
+class SequenceType:
     """Any number of items, or at most ``bound``."""
 
-    item: Item
+    item: ItemType
     bound: int | None
 
 
@@ -72,7 +72,7 @@ class FieldSpec:
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class MessageSpec:
     """A message class. ``python_name`` is ``module.Class``, by which rclpy recognises instances.
 
     ``check_fields`` is the default of the ``_check_fields`` slot; None if there is no such slot.
@@ -85,31 +85,31 @@ class Message:
     check_fields: bool | None
 
 
-Item: TypeAlias = Primitive | Text | Message
-FieldType: TypeAlias = Primitive | Text | Message | Array | Sequence
+ItemType: TypeAlias = PrimitiveType | StringType | MessageSpec
+FieldType: TypeAlias = PrimitiveType | StringType | MessageSpec | ArrayType | SequenceType
 
 PRIMITIVES = {
     primitive.name: primitive
     for primitive in (
-        Primitive("boolean", 1, "?", ""),
-        Primitive("octet", 1, "c", ""),
-        Primitive("char", 1, "c", ""),
-        Primitive("int8", 1, "b", "b"),
-        Primitive("uint8", 1, "B", "B"),
-        Primitive("int16", 2, "h", "h"),
-        Primitive("uint16", 2, "H", "H"),
-        Primitive("int32", 4, "i", "i"),
-        Primitive("uint32", 4, "I", "I"),
-        Primitive("int64", 8, "q", "q"),
-        Primitive("uint64", 8, "Q", "Q"),
-        Primitive("float", 4, "f", "f"),
-        Primitive("double", 8, "d", "d"),
+        PrimitiveType("boolean", 1, "?", ""),
+        PrimitiveType("octet", 1, "c", ""),
+        PrimitiveType("char", 1, "c", ""),
+        PrimitiveType("int8", 1, "b", "b"),
+        PrimitiveType("uint8", 1, "B", "B"),
+        PrimitiveType("int16", 2, "h", "h"),
+        PrimitiveType("uint16", 2, "H", "H"),
+        PrimitiveType("int32", 4, "i", "i"),
+        PrimitiveType("uint32", 4, "I", "I"),
+        PrimitiveType("int64", 8, "q", "q"),
+        PrimitiveType("uint64", 8, "Q", "Q"),
+        PrimitiveType("float", 4, "f", "f"),
+        PrimitiveType("double", 8, "d", "d"),
     )
 }
 
 
 @cache
-def message_spec(cls: type) -> Message:
+def message_spec(cls: type) -> MessageSpec:
     """Describe a message class.
 
     Raises TypeError if rosidl did not generate the class or rclpy cannot convert a field
@@ -126,7 +126,7 @@ def message_spec(cls: type) -> Message:
             fields.append(FieldSpec(field_name, f"_{field_name}", _field_type(slot_type)))
         except TypeError as error:
             raise TypeError(f"{name}: field {field_name!r}: {error}") from None
-    return Message(
+    return MessageSpec(
         type_name=name,
         python_name=f"{cls.__module__}.{cls.__qualname__}",
         cls=cls,
@@ -146,22 +146,22 @@ def _field_type(slot_type: Any) -> FieldType:
     from rosidl_parser import definition as idl
 
     if isinstance(slot_type, idl.Array):
-        return Array(_item(slot_type.value_type), slot_type.size)
+        return ArrayType(_item(slot_type.value_type), slot_type.size)
     if isinstance(slot_type, idl.BoundedSequence):
-        return Sequence(_item(slot_type.value_type), slot_type.maximum_size)
+        return SequenceType(_item(slot_type.value_type), slot_type.maximum_size)
     if isinstance(slot_type, idl.UnboundedSequence):
-        return Sequence(_item(slot_type.value_type), None)
+        return SequenceType(_item(slot_type.value_type), None)
     return _item(slot_type)
 
 
-def _item(slot_type: Any) -> Item:
+def _item(slot_type: Any) -> ItemType:
     from rosidl_parser import definition as idl
 
     if isinstance(slot_type, idl.BasicType) and slot_type.typename in PRIMITIVES:
         return PRIMITIVES[slot_type.typename]
     if isinstance(slot_type, idl.AbstractGenericString):
         bound = slot_type.maximum_size if slot_type.has_maximum_size() else None
-        return Text(isinstance(slot_type, idl.AbstractWString), bound)
+        return StringType(isinstance(slot_type, idl.AbstractWString), bound)
     if isinstance(slot_type, idl.NamespacedType):
         return message_spec(nested_class(list(slot_type.namespaces), slot_type.name))
     raise TypeError(f"type {getattr(slot_type, 'typename', slot_type)!s} is not supported by rclpy")
@@ -230,12 +230,12 @@ HEADER_PLACE = START.moved(-4)
 
 def fixed_parts(type_: FieldType) -> list[FixedValue] | None:
     """Return a type as one run; None if its size varies or it holds an array of messages."""
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return [FixedValue(type_.code, type_.size, type_.size)]
-    if isinstance(type_, Array) and isinstance(type_.item, Primitive):
+    if isinstance(type_, ArrayType) and isinstance(type_.item, PrimitiveType):
         size = type_.item.size * type_.length
         return [FixedValue(f"{size}s", size, type_.item.size)]
-    if not isinstance(type_, Message):
+    if not isinstance(type_, MessageSpec):
         return None
     if not type_.fields:
         return [FixedValue("x", 1, 1)]
@@ -248,7 +248,7 @@ def fixed_parts(type_: FieldType) -> list[FixedValue] | None:
     return parts
 
 
-def fixed_size(spec: Message) -> int | None:
+def fixed_size(spec: MessageSpec) -> int | None:
     """Return the size of a message with its header; None if it varies."""
     parts = fixed_parts(spec)
     return None if parts is None else lay_out([HEADER_PART, *parts], HEADER_PLACE.rest)[1]
@@ -256,18 +256,18 @@ def fixed_size(spec: Message) -> int | None:
 
 def after(type_: FieldType, place: KnownOffset) -> KnownOffset:
     """Return where a value ends that begins at ``place``."""
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return place.aligned(type_.size).moved(type_.size)
-    if isinstance(type_, Text):
+    if isinstance(type_, StringType):
         return place.aligned(4).moved(4).moved_by_multiple(4 if type_.wide else 1)
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         if not type_.fields:
             return place.moved(1)
         for field in type_.fields:
             place = after(field.type, place)
         return place
-    if isinstance(type_, Array):
-        if isinstance(type_.item, Primitive):
+    if isinstance(type_, ArrayType):
+        if isinstance(type_.item, PrimitiveType):
             size = type_.item.size
             return place.aligned(size).moved(size * type_.length)
         return steady(type_.item, after(type_.item, place))
@@ -276,7 +276,7 @@ def after(type_: FieldType, place: KnownOffset) -> KnownOffset:
 
 def after_items(item: FieldType, place: KnownOffset) -> KnownOffset:
     """Return where any number of items end that begin at ``place``."""
-    if isinstance(item, Primitive):
+    if isinstance(item, PrimitiveType):
         return place.joined(place.aligned(item.size).moved_by_multiple(item.size))
     return steady(item, place)
 
@@ -291,21 +291,21 @@ def steady(item: FieldType, place: KnownOffset) -> KnownOffset:
 
 
 def first_alignment(type_: FieldType) -> int:
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return type_.size
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return first_alignment(type_.fields[0].type) if type_.fields else 1
-    if isinstance(type_, Array):
+    if isinstance(type_, ArrayType):
         return first_alignment(type_.item)
     return 4
 
 
 def least_size(type_: FieldType) -> int:
     """Return the smallest size of a value, at least 1: it limits the number of items."""
-    if isinstance(type_, Primitive):
+    if isinstance(type_, PrimitiveType):
         return type_.size
-    if isinstance(type_, Message):
+    if isinstance(type_, MessageSpec):
         return sum(least_size(field.type) for field in type_.fields) or 1
-    if isinstance(type_, Array):
+    if isinstance(type_, ArrayType):
         return type_.length * least_size(type_.item)
     return 4

@@ -26,7 +26,7 @@ Value = float | str
 
 
 @dataclass(frozen=True, slots=True)
-class Reduced:
+class ReducedRun:
     """A reduced failing run: its folder, and the one difference that decides."""
 
     folder: str
@@ -49,7 +49,7 @@ class Exploration:
     coverage: Sequence[str] = ()
     wall_s: float = 0.0
     units: Mapping[str, str] = field(default_factory=dict)
-    reduced: Mapping[str, Reduced] = field(default_factory=dict)
+    reduced: Mapping[str, ReducedRun] = field(default_factory=dict)
     checks: int = 0
 
     @property
@@ -78,7 +78,7 @@ class FailureCause:
     key: str
     failure: Failure
     runs: Sequence[TrialResult]
-    reduced: Reduced | None = None
+    reduced: ReducedRun | None = None
 
     @property
     def first(self) -> TrialResult:

@@ -210,7 +210,7 @@ _CAUSES_MAX = 10
 
 
 @dataclass(frozen=True, slots=True)
-class SmallRun:
+class ReducedFailure:
     """A reduced cause of failures: its folder, and the one difference that decides (empty if there
     is none). ``trouble`` says why there is no folder."""
 
@@ -219,7 +219,7 @@ class SmallRun:
     trouble: str = ""
 
 
-def make_small(
+def reduce_failures(
     source: JobSource,
     first: Mapping[str, TrialResult],
     folder: Path,
@@ -227,7 +227,7 @@ def make_small(
     pins: bool = True,
     timeout_s: float | None = None,
     on_begin: Callable[[str], None] = lambda cause: None,
-) -> dict[str, SmallRun]:
+) -> dict[str, ReducedFailure]:
     """Reduce the first run of each cause, each to a folder in ``folder`` of the search.
 
     ``on_begin`` receives the key of the cause that is next.
@@ -246,9 +246,9 @@ def make_small(
                     source, result, worker, Path(scratch), timeout_s=timeout_s
                 ).reduce()
                 decides = write_small(source, reduced, place, timeout_s=timeout_s)
-            found[key] = SmallRun(place, decides)
+            found[key] = ReducedFailure(place, decides)
         except ExploreError as error:
-            found[key] = SmallRun(place, trouble=str(error))
+            found[key] = ReducedFailure(place, trouble=str(error))
         except OSError as error:
-            found[key] = SmallRun(place, trouble=f"{error.filename}: {error.strerror}")
+            found[key] = ReducedFailure(place, trouble=f"{error.filename}: {error.strerror}")
     return found

@@ -14,7 +14,7 @@ from rsltrace.run.plans.recorded_order import ATTACHMENT_CHOICES
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import ERROR, Failure, JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
-from rsltrace.simulation.loop.policy import decoded
+from rsltrace.simulation.loop.policy import decode_choices
 from rsltrace.trace.reader import Trace
 
 T = TypeVar("T")
@@ -208,7 +208,7 @@ class TrialReduction:
             choices = trace.attachment(ATTACHMENT_CHOICES)
             end_ns = trace.end_ns
         if "policy" in overlay or choices is not None:
-            made = enumerate(decoded(choices or b""))
+            made = enumerate(decode_choices(choices or b""))
             departures = tuple({"choice": number, "run": run} for number, run in made if run)
             parts = replace(parts, departures=departures)
         return replace(parts, until_ns=end_ns) if "until" in overlay else parts

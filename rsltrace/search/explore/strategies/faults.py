@@ -19,13 +19,13 @@ from rsltrace.run.plans.bags import PLAYER
 from rsltrace.search.explore.strategies.strategy import Proposal
 from rsltrace.search.explore.trial import TrialResult
 from rsltrace.simulation.chance.channel import QUIET_TOPICS
-from rsltrace.simulation.chance.stream import Stream
+from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.trace.leaves import Leaf
+    from rsltrace.trace.leaves import ValueField
 
 
 _KINDS = ("change", "change", "change", "change", "swap", "repeat")
@@ -40,10 +40,10 @@ class BagContents:
     the arrays of its first message, by name."""
 
     messages: range
-    leaves: Sequence[Leaf]
+    leaves: Sequence[ValueField]
     lengths: dict[str, int]
 
-    def fault(self, topic: str, draw: Stream) -> dict[str, Any]:
+    def fault(self, topic: str, draw: RandomStream) -> dict[str, Any]:
         """Draw a fault of one of the messages."""
         kind = _KINDS[draw.below(len(_KINDS))]
         number = self.messages[draw.below(len(self.messages))]
@@ -54,7 +54,7 @@ class BagContents:
         found = {kind: topic, "message": number}
         return {**found, **self._change(draw)} if kind == "change" else found
 
-    def _change(self, draw: Stream) -> dict[str, Any]:
+    def _change(self, draw: RandomStream) -> dict[str, Any]:
         leaf = self.leaves[draw.below(len(self.leaves))]
         name = ""
         *arrays, last = leaf.name.split("[]")
@@ -70,7 +70,7 @@ class BagContents:
         lengths = [0, 1, max(count - 1, 0), count + 1, 2 * count]
         return {"field": name, "length": min(lengths[draw.below(5)], leaf.length_max)}
 
-    def _place(self, array: str, draw: Stream) -> str:
+    def _place(self, array: str, draw: RandomStream) -> str:
         """Draw which elements of an array change."""
         count = max(self.lengths.get(array, 1), 1)
         return ("*", "0", "-1", str(draw.below(count)))[draw.below(4)]
@@ -82,7 +82,7 @@ def played_in(trace: Trace, messages: dict[str, range]) -> dict[str, BagContents
     found = {}
     for name in sorted({one.name for one in trace.entities.values() if is_played(trace, one)}):
         if name in messages:
-            leaves: list[Leaf] = []
+            leaves: list[ValueField] = []
             lengths: dict[str, int] = {}
             with suppress(TraceError):  # without payloads, messages can still be swapped
                 leaves = trace.leaves(name)
@@ -100,7 +100,7 @@ def is_played(trace: Trace, entity: Entity) -> bool:
     return is_publisher and trace.node_of(entity).name == f"/{PLAYER}"
 
 
-def _lengths(message: Any, leaves: Sequence[Leaf]) -> Iterator[tuple[str, int]]:
+def _lengths(message: Any, leaves: Sequence[ValueField]) -> Iterator[tuple[str, int]]:
     """Yield the lengths of a message's arrays; of nested ones, the first."""
     for leaf in leaves:
         value, name = message, ""
@@ -118,13 +118,13 @@ def _lengths(message: Any, leaves: Sequence[Leaf]) -> Iterator[tuple[str, int]]:
             yield name, len(value)
 
 
-def _is_there(leaf: Leaf, lengths: dict[str, int]) -> bool:
+def _is_there(leaf: ValueField, lengths: dict[str, int]) -> bool:
     """Whether none of the arrays that a field is in is empty."""
     arrays = leaf.name.split("[]")[:-1]
     return all(lengths.get("[]".join(arrays[: n + 1]), 1) for n in range(len(arrays)))
 
 
-def _another(kind: str, draw: Stream) -> dict[str, Any]:
+def _another(kind: str, draw: RandomStream) -> dict[str, Any]:
     """Draw a different value for a field of a type."""
     if kind == "string":
         return {"value": _TEXTS[draw.below(len(_TEXTS))]}
@@ -201,7 +201,7 @@ class FaultWalk:
             )
 
     def propose(self, number: int) -> Proposal | None:
-        draw = Stream(self._seed, f"faults\0{number}")
+        draw = RandomStream(self._seed, f"faults\0{number}")
         faults = [self._fault(draw) for _ in range(1 + draw.below(_MOST))]
         self._count(faults)
         why = "; ".join(", ".join(f"{k} {v}" for k, v in fault.items()) for fault in faults)
@@ -225,7 +225,7 @@ class FaultWalk:
         self._tried += 1
         self._kinds.update(next(iter(fault)) for fault in faults)
 
-    def _fault(self, draw: Stream) -> dict[str, Any]:
+    def _fault(self, draw: RandomStream) -> dict[str, Any]:
         if self._topics and (not self._nodes or draw.below(2)):
             topic = list(self._topics)[draw.below(len(self._topics))]
             if topic in self._played and draw.below(3):
@@ -240,7 +240,7 @@ class FaultWalk:
         fault = {kind: node, "event": self._events[draw.below(len(self._events))]}
         return fault if kind == "crash" else {**fault, "for": self._time(draw)}
 
-    def _time(self, draw: Stream) -> str:
+    def _time(self, draw: RandomStream) -> str:
         """Draw a duration, log-uniform, in whole milliseconds."""
         ratio = self._longest_ns / _SHORTEST_NS
         return f"{max(round(math.exp(draw.uniform() * math.log(ratio))), 1)}ms"

@@ -13,12 +13,12 @@ from typing import Any, Protocol
 from rsltrace.errors import OutputError
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.middleware.events.event import (
-    Door,
-    Event,
+    CurrentEvent,
     EventOwner,
+    ExceptionHandler,
     NameRegistry,
-    Outcome,
     OutsideEvent,
+    RunOutcome,
 )
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, overrides
 from rsltrace.trace.chain import hash64
@@ -93,12 +93,12 @@ class Dispatcher:
 
     def __init__(self, loop: EventLoop) -> None:
         self.loop = loop
-        self.event = Event()
+        self.event = CurrentEvent()
         self.entities = EntityRegistry()
-        self.outcome = Outcome()
+        self.outcome = RunOutcome()
         self.recorder: Recorder | None = None
         self.unrecorded = 0
-        self.door: Door
+        self.door: ExceptionHandler
         self._pending = self.entities.pending
         self._observers: list[EventObserver] = []
         self._before: tuple[EventObserver, ...] = ()
@@ -184,7 +184,7 @@ class Dispatcher:
         if isinstance(error, OutputError):
             raise error
         node = self.event.node
-        door: Door = self.door if node is None else node.door
+        door: ExceptionHandler = self.door if node is None else node.door
         door.raised(error, handle)
 
     def end_event(self) -> None:

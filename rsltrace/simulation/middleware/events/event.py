@@ -22,7 +22,7 @@ _RECEIVERS = (EntityKind.SUBSCRIPTION, *_ACTIONS)
 _SERVICES = (EntityKind.CLIENT, EntityKind.SERVICE)
 
 
-class Asker(NamedTuple):
+class NameRequester(NamedTuple):
     """A node that resolved a name; ``entry_key`` is the key of its job entry, or ""."""
 
     entry_key: str
@@ -44,7 +44,7 @@ class NameRegistry(EventObserver):
         self.subscriptions: dict[tuple[str, str], None] = {}
         self.entities: dict[tuple[str, str], None] = {}
         """(node, name) of all that may have a callback: topic, service, a timer's callback."""
-        self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
+        self.asked: dict[NameRequester, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
         self.described: dict[int, str] | None = None
         """Every entity as in ``entity_text``, by its id, if needed: a run may make a
@@ -84,7 +84,7 @@ class NameRegistry(EventObserver):
 
 
 @dataclass(slots=True)
-class Outcome:
+class RunOutcome:
     """How a run has gone. ``ended_after`` is the number of events when it ended; later ones are its
     shutdown. ``waits`` are the calls that still waited then. ``drops`` counts the drops of full
     queues by receiver, and by queue size of a publisher in an outage (else 0)."""
@@ -101,7 +101,7 @@ class Outcome:
             self.ended_after = events
 
 
-class Door(Protocol):
+class ExceptionHandler(Protocol):
     """Handles the exceptions of participants."""
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
@@ -121,11 +121,11 @@ class EventOwner(Protocol):
     entity_id: int
     fully_qualified_name: str
     state: ParticipantState | None
-    door: Door
+    door: ExceptionHandler
 
 
 @dataclass(eq=False, slots=True)
-class Event:
+class CurrentEvent:
     """The current event: one object that each event fills in anew.
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for

@@ -29,7 +29,7 @@ _OWN_FILES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Raised:
+class RaisedException:
     """An exception of an event.
 
     ``label`` names the event, ``node`` is the full name or "", ``stamp_ns`` simulated time,
@@ -61,23 +61,27 @@ class Raised:
         )
 
 
-def described(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
+def describe_exception(
+    dispatcher: Dispatcher, error: BaseException, handle: Dispatchable
+) -> RaisedException:
     node = dispatcher.event.node
-    return Raised(
+    return RaisedException(
         error,
         handle.describe(),
         node.fully_qualified_name if node is not None else "",
         dispatcher.loop.now_ns,
         user_traceback(error),
-        text_of(error),
+        exception_text(error),
     )
 
 
-def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
+def record_exception(
+    dispatcher: Dispatcher, error: BaseException, handle: Dispatchable
+) -> RaisedException:
     """Record that the current event raised, as one of its outputs; return the description."""
     event, recorder = dispatcher.event, dispatcher.recorder
     event.flags |= _RAISED
-    raised = described(dispatcher, error, handle)
+    raised = describe_exception(dispatcher, error, handle)
     if recorder is not None:
         content = hash64(f"{raised.kind}\0{raised.said}".encode())
         recorder.detail(
@@ -86,7 +90,7 @@ def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchab
     return raised
 
 
-def end_run(dispatcher: Dispatcher, raised: Raised, error: RunError) -> None:
+def end_run(dispatcher: Dispatcher, raised: RaisedException, error: RunError) -> None:
     """End the run because of an exception."""
     dispatcher.outcome.error = error
     error.__cause__ = raised.error
@@ -100,11 +104,11 @@ class RunEndingExceptionHandler:
         self._dispatcher = dispatcher
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
-        raised = note_raised(self._dispatcher, error, handle)
+        raised = record_exception(self._dispatcher, error, handle)
         end_run(self._dispatcher, raised, raised.as_error())
 
 
-def text_of(error: BaseException) -> str:
+def exception_text(error: BaseException) -> str:
     """Return an exception's text, in a form that can be written to any file."""
     try:
         return _writable(str(error))

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from rsltrace.diff.alignment.aligned_rows import AlignedRow
-from rsltrace.diff.alignment.rows import Run as DiffRun
+from rsltrace.diff.alignment.rows import ComparedTrace as DiffRun
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.facts.evidence import (
     CallDifference,
-    EventView,
+    EventSummary,
     FieldDifference,
     MessageDifference,
     Presence,
@@ -18,7 +18,7 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.report.differences import distance_text
 from rsltrace.diff.result import Divergence
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
@@ -37,7 +37,7 @@ _VALUE_MAX = 200
 
 def differing_state_lines(
     runs: tuple[DiffRun, DiffRun],
-    views: tuple[EventView | None, EventView | None],
+    views: tuple[EventSummary | None, EventSummary | None],
     divergence: Divergence | None,
     openness: Openness,
 ) -> Iterator[Line]:
@@ -85,12 +85,12 @@ def differing_call_lines(calls: Sequence[CallDifference]) -> Iterator[Line]:
 
 
 _SAYS = {
-    Sign.MATCH: "the same in both runs",
-    Sign.DIFFERS: "differs",
-    Sign.ONLY_A: "in run a only",
-    Sign.ONLY_B: "in run b only",
-    Sign.MOVED: "the same, at another time or place in the order",
-    Sign.UNKNOWN: "not compared (beyond what was matched)",
+    RowSign.MATCH: "the same in both runs",
+    RowSign.DIFFERS: "differs",
+    RowSign.ONLY_A: "in run a only",
+    RowSign.ONLY_B: "in run b only",
+    RowSign.MOVED: "the same, at another time or place in the order",
+    RowSign.UNKNOWN: "not compared (beyond what was matched)",
 }
 _FIRST_SHOWN = 3
 
@@ -107,23 +107,23 @@ def pair_lines(
         first = place == comparison.first_place
         if first:  # the reason comes first: in a small terminal little else fits
             lines += _why(comparison)
-        if sign not in (Sign.MATCH, Sign.UNKNOWN):
+        if sign not in (RowSign.MATCH, RowSign.UNKNOWN):
             lines += _difference_lines(comparison, a, b, openness, first=first)
         if first and comparison.diff is not None and comparison.diff.shown is not None:
             lines += chain_lines(comparison, comparison.diff.shown)
-        if sign not in (Sign.MATCH, Sign.UNKNOWN):
+        if sign not in (RowSign.MATCH, RowSign.UNKNOWN):
             lines += _cause_lines(comparison, a, b)
     except TraceError as error:
         lines.append(Line(0, "", printable(str(error)), Role.ERROR, "diff.error"))
     for run, index, name in ((comparison.run_a, a, "a"), (comparison.run_b, b, "b")):
-        if index is None or (name == "b" and a is not None and sign is Sign.MATCH):
+        if index is None or (name == "b" and a is not None and sign is RowSign.MATCH):
             continue
-        words = f"run {name}" if sign is not Sign.MATCH else "both runs"
+        words = f"run {name}" if sign is not RowSign.MATCH else "both runs"
         # Where they agree there is nothing better to show than the event itself.
-        is_open = openness.is_open(f"run{name}", sign is Sign.MATCH)
+        is_open = openness.is_open(f"run{name}", sign is RowSign.MATCH)
         lines.append(Line(0, words, f"event {index}", Role.SECTION, f"run{name}", is_open))
         if is_open:
-            said = {"event", "event.at"} if sign is Sign.MATCH else {"event"}
+            said = {"event", "event.at"} if sign is RowSign.MATCH else {"event"}
             own = name == "a" or a is None
             if not own:
                 said.add("effects")  # nobody looks for these; run a's are shown
@@ -154,7 +154,7 @@ def _title(comparison: Comparison, place: int, row: AlignedRow) -> Iterator[Line
     if a is not None and b is not None and a != b:
         number = f"{a} / {b}"
     yield Line(0, f"event {number}", printable(entity), Role.SECTION, "event")
-    role = Role.SAME if sign in (Sign.MATCH, Sign.UNKNOWN) else Role.DIFFERENCE
+    role = Role.SAME if sign in (RowSign.MATCH, RowSign.UNKNOWN) else Role.DIFFERENCE
     yield Line(1, sign.value, _SAYS[sign], role, "event.sign")
     if row.elsewhere is not None:
         other, there = row.b is None, comparison.place_of(row.elsewhere, other=row.b is None)

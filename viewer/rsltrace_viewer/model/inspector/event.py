@@ -17,14 +17,14 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import (
     NO_EVENT,
     NO_SEQUENCE,
-    Event,
     EventFlag,
     EventKind,
+    EventRecord,
     Output,
     OutputKind,
 )
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
-from rsltrace.trace.states import Leaf, state_after
+from rsltrace.trace.states import StateValue, state_after
 from rsltrace.trace.words.code import output_places, places_text
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.logs import LEVEL_WARN, log_record
@@ -102,7 +102,7 @@ _VALUE_MAX = 200
 _ELEMENTS_SHOWN = 8
 
 
-def state_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+def state_lines(run: Run, event: EventRecord, openness: Openness) -> Iterator[Line]:
     """Yield the attributes of the event's node after it; nothing if they were not recorded."""
     if not event.state_hash or not _has_states(run):
         return
@@ -128,7 +128,7 @@ def _has_states(run: Run) -> bool:
     return any(channel.topic == TOPIC_STATES for channel in run.trace.channels.values())
 
 
-def _shown(leaf: Leaf) -> str:
+def _shown(leaf: StateValue) -> str:
     if not isinstance(leaf, np.ndarray):
         return shortened(printable(leaf), _VALUE_MAX)
     first = ", ".join(repr(value.item()) for value in leaf.flat[:_ELEMENTS_SHOWN])
@@ -164,7 +164,7 @@ def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = 
     return lines
 
 
-def _title_lines(run: Run, event: Event, outputs: list[Output]) -> Iterator[Line]:
+def _title_lines(run: Run, event: EventRecord, outputs: list[Output]) -> Iterator[Line]:
     entity = entity_of(run, event) or event.kind.label
     title = f"{node_of(run, event)}  {event.kind.label} {entity}"
     yield Line(0, f"event {event.index}", title, Role.SECTION, "event")
@@ -181,7 +181,7 @@ def _title_lines(run: Run, event: Event, outputs: list[Output]) -> Iterator[Line
 
 
 def _input_lines(
-    run: Run, event: Event, outputs: list[Output], openness: Openness
+    run: Run, event: EventRecord, outputs: list[Output], openness: Openness
 ) -> Iterator[Line]:
     is_open = openness.is_open("in", True)
     source = run.input_of(event)
@@ -198,14 +198,14 @@ def _input_lines(
         yield from content_lines(run, source, "in", 1, openness)
 
 
-def _handed_on(run: Run, event: Event) -> Output | None:
+def _handed_on(run: Run, event: EventRecord) -> Output | None:
     """Return the message that a task was given by the event that made it (an action's goal)."""
     maker = run.event(event.cause_event)
     same = event.input_hash and maker.input_hash == event.input_hash
     return run.input_of(maker) if same else None
 
 
-def _plain_input(event: Event) -> str:
+def _plain_input(event: EventRecord) -> str:
     if event.kind is EventKind.TIMER:
         return "none (a timer's deadline)"
     if event.kind is EventKind.CONSTRUCT:
@@ -214,7 +214,7 @@ def _plain_input(event: Event) -> str:
 
 
 def _output_lines(
-    run: Run, event: Event, outputs: list[Output], openness: Openness
+    run: Run, event: EventRecord, outputs: list[Output], openness: Openness
 ) -> Iterator[Line]:
     if not outputs:
         yield Line(0, "outputs", "none", Role.SECTION, "out")
@@ -238,7 +238,7 @@ def _output_lines(
 
 
 def _finding_lines(
-    run: Run, event: Event, outputs: list[Output], openness: Openness
+    run: Run, event: EventRecord, outputs: list[Output], openness: Openness
 ) -> Iterator[Line]:
     """What the guard found in the event; nothing for nearly all events."""
     found = run.trace.findings.get(event.index, [])
@@ -307,7 +307,7 @@ def content_lines(
     yield from message_lines(message, path, depth, openness)
 
 
-def _cause_lines(run: Run, event: Event, effects: Effects | None) -> Iterator[Line]:
+def _cause_lines(run: Run, event: EventRecord, effects: Effects | None) -> Iterator[Line]:
     if event.cause_event == NO_EVENT:
         waited = event.kind is EventKind.RESUME
         text = "no other event: its wait was over" if waited else "no other event"
@@ -343,7 +343,7 @@ def event_link(run: Run, index: int, path: str, since_ns: int | None = None) -> 
     return Line(1, "→", text.rstrip(), Role.LINK, path, link=index)
 
 
-def _parameter_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+def _parameter_lines(run: Run, event: EventRecord, openness: Openness) -> Iterator[Line]:
     node = node_of(run, event)
     entity = run.entities.get(event.entity)
     if entity is None or entity.kind is EntityKind.SYSTEM or node == RUN_NAME:
@@ -364,7 +364,7 @@ def _parameter_lines(run: Run, event: Event, openness: Openness) -> Iterator[Lin
         yield Line(1, printable(name), preview(value), Role.FIELD, path)
 
 
-def _detail_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+def _detail_lines(run: Run, event: EventRecord, openness: Openness) -> Iterator[Line]:
     is_open = openness.is_open("details", False)
     yield Line(0, "details", "timing, hashes, entity", Role.SECTION, "details", is_open)
     if not is_open:
@@ -373,7 +373,7 @@ def _detail_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
         yield Line(1, label, printable(text), Role.FIELD, f"details.{label}")
 
 
-def _details(run: Run, event: Event) -> Sequence[tuple[str, str]]:
+def _details(run: Run, event: EventRecord) -> Sequence[tuple[str, str]]:
     rows = [("since start", format_duration(event.stamp_ns - run.start_ns))]
     if event.index:
         before = event.stamp_ns - run.stamp(event.index - 1)

@@ -107,7 +107,7 @@ class MessageText:
             return np.ones(len(sequences), dtype=np.bool_)
         bounds = int(sequences.min()), int(sequences.max())
         text = self._folded.encode()
-        hits = np.fromiter(run.trace.holding(channel.id, *bounds, text), np.uint32)
+        hits = np.fromiter(run.trace.messages_with_text(channel.id, *bounds, text), np.uint32)
         return np.isin(sequences, hits)
 
     def _is_in_bytes(self, schema: str) -> bool:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.topic_fields import OF_MESSAGE, plain
+from rsltrace.conditions.topic_fields import OF_MESSAGE, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError
@@ -206,7 +206,7 @@ def _level(token: Token) -> Condition:
 
 def _where(topics: list[str], token: Token) -> Condition:
     try:
-        found = OF_MESSAGE.match(plain(unquoted(token)))
+        found = OF_MESSAGE.match(with_topic_prefix(unquoted(token)))
         if found is None:
             raise QueryError("say /topic: EXPRESSION", token.start, token.end)
         if found[1] not in topics:

@@ -14,7 +14,7 @@ import xxhash
 
 from rsltrace.diff.bags.sequences import Keys, gaps_by_order
 from rsltrace.diff.bags.source import open_source
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.texts import NS_PER_S, printable
 
 _KEPT_BYTES = 256 << 20
@@ -173,12 +173,12 @@ class Pairs:
         rows = np.flatnonzero(there)
         return int(rows[0]) if len(rows) else None
 
-    def sign(self, row: int) -> Sign:
+    def sign(self, row: int) -> RowSign:
         """Return how a row compares, as far as its bytes tell."""
         a, b = self.at(row)
         if a is None or b is None:
-            return Sign.ONLY_B if a is None else Sign.ONLY_A
-        return Sign.DIFFERS if self.differs[row] else Sign.MATCH
+            return RowSign.ONLY_B if a is None else RowSign.ONLY_A
+        return RowSign.DIFFERS if self.differs[row] else RowSign.MATCH
 
     def next_difference(self, row: int, step: int) -> int | None:
         """Return the row after (or before) this one where rows begin to differ."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.result import BagDiff
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import RsltraceError
 from rsltrace.job.values.times import START, TimeInRun
 from rsltrace.trace.decode import to_plain
@@ -247,7 +247,7 @@ class RecordingSession:
         a, b = self.pairs.at(row)
         return a if a is not None else b or 0
 
-    def message_text(self, row: int) -> tuple[str, Sign | None, list[str]]:
+    def message_text(self, row: int) -> tuple[str, RowSign | None, list[str]]:
         """Return the time of a row, how it compares, and the values in each recording."""
         pairs, topics = self.pairs, self.topics(self.keys[self.place])
         places = pairs.at(row)
@@ -262,10 +262,10 @@ class RecordingSession:
         if not self.two:
             return time, None, texts
         sign = pairs.sign(row)
-        if sign is Sign.DIFFERS:
+        if sign is RowSign.DIFFERS:
             told = self._differing(topics, places)
             if told == ("", ""):  # nothing but padding, which recorders do not write
-                sign = Sign.MATCH
+                sign = RowSign.MATCH
             elif told is not None:
                 texts = list(told)
         return time, sign, texts

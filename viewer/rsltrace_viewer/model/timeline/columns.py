@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from rich.cells import set_cell_size
 
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace_viewer.model.timeline.events import EventText
 from rsltrace_viewer.model.view import cells, fit
 
@@ -25,7 +25,7 @@ class EventRow:
     """A row of the event list: the event, how it compares with the other run, and its marks."""
 
     event: EventText
-    sign: Sign | None = None
+    sign: RowSign | None = None
     marked: bool = False
     related: str = ""
     """``cause`` or ``effect`` of the selected event."""

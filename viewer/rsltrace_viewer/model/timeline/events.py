@@ -8,13 +8,13 @@ from functools import lru_cache
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import (
-    Draw,
-    Event,
     EventFlag,
     EventKind,
+    EventRecord,
     Output,
     OutputKind,
-    duration_of,
+    RandomDecision,
+    decision_duration,
 )
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.entities import RUN_NAME
@@ -94,13 +94,13 @@ class EventTexts:
         )
 
 
-def node_of(run: Run, event: Event) -> str:
+def node_of(run: Run, event: EventRecord) -> str:
     """Return the node of an event; the node that a constructor made."""
     outputs = run.outputs(event.index) if event.kind is EventKind.CONSTRUCT else ()
     return run.words.node(event, outputs) or RUN_NAME
 
 
-def entity_of(run: Run, event: Event) -> str:
+def entity_of(run: Run, event: EventRecord) -> str:
     """Return the name of what ran, without what the kind says already."""
     if event.entity == 0:
         return "constructor" if event.kind is EventKind.CONSTRUCT else ""
@@ -112,7 +112,7 @@ def _short(name: str) -> str:
     return name.rpartition(".")[2] if "." in name and not name.startswith("/") else name
 
 
-def event_text(run: Run, event: Event) -> str:
+def event_text(run: Run, event: EventRecord) -> str:
     """Return an event in a few words: ``17  /ekf sub /odom``."""
     kind = SHORT_KINDS[event.kind]
     return f"{event.index}  {node_of(run, event)} {kind} {entity_of(run, event)}".rstrip()
@@ -120,7 +120,7 @@ def event_text(run: Run, event: Event) -> str:
 
 def _is_execution_time(output: Output) -> bool:
     is_draw = output.kind is OutputKind.DRAW
-    return is_draw and duration_of(output.hash, Draw.EXECUTION) is not None
+    return is_draw and decision_duration(output.hash, RandomDecision.EXECUTION) is not None
 
 
 def outputs_text(

@@ -18,7 +18,7 @@ from rsltrace.trace.model.texts import NS_PER_S, printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.entities import RUN_NAME
-from rsltrace.trace.words.events import counted, output_text
+from rsltrace.trace.words.events import group_equal, output_text
 from rsltrace.trace.words.kinds import flag_names, kind_label
 from rsltrace_viewer.rerun_export.columns import (
     EVENT,
@@ -141,7 +141,7 @@ def hashes(values: npt.NDArray[Any]) -> pa.Array:
 
 def _listed(texts: Iterable[str]) -> str:
     """Return texts in one line: equal ones that follow each other are counted."""
-    parts = list(counted(texts))
+    parts = list(group_equal(texts))
     more = len(parts) - _NAMES_MAX
     return ", ".join(parts[:_NAMES_MAX]) + (f", {more} more" if more > 0 else "")
 

@@ -10,7 +10,7 @@ from textual.containers import Container
 from textual.content import Content
 from textual.widgets import Static
 
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.recordings.session import RecordingSession
@@ -26,10 +26,10 @@ _WIDE = 110
 _WIDE_OF_TWO = 170
 _TIME = 12
 _STYLES = {
-    Sign.MATCH: "muted",
-    Sign.DIFFERS: "error",
-    Sign.ONLY_A: "warning",
-    Sign.ONLY_B: "good",
+    RowSign.MATCH: "muted",
+    RowSign.DIFFERS: "error",
+    RowSign.ONLY_A: "warning",
+    RowSign.ONLY_B: "good",
 }
 
 
@@ -182,7 +182,7 @@ class RecordingShell(App[None]):
             return (head, (texts[0], "plain"))
         style = _STYLES[sign]
         room = max((self.messages.size.width - _TIME - 15) // 2, 8)
-        both = [(fit(text, room), "plain" if sign is Sign.MATCH else style) for text in texts]
+        both = [(fit(text, room), "plain" if sign is RowSign.MATCH else style) for text in texts]
         return (head, (f"{sign.value} ", style), both[0], (" │ ", "muted"), both[1])
 
     def _show_footer(self) -> None:

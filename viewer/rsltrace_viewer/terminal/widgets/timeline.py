@@ -13,7 +13,7 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace.diff.row_sign import Sign
+from rsltrace.diff.row_sign import RowSign
 from rsltrace_viewer.model.timeline.columns import ColumnLayout, EventRow
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
@@ -24,12 +24,12 @@ _DRAWN_MAX = 1000
 
 
 _SIGN_STYLES = {
-    Sign.MATCH: "muted",
-    Sign.DIFFERS: "differs",
-    Sign.ONLY_A: "only-a",
-    Sign.ONLY_B: "only-b",
-    Sign.MOVED: "moved",
-    Sign.UNKNOWN: "muted",
+    RowSign.MATCH: "muted",
+    RowSign.DIFFERS: "differs",
+    RowSign.ONLY_A: "only-a",
+    RowSign.ONLY_B: "only-b",
+    RowSign.MOVED: "moved",
+    RowSign.UNKNOWN: "muted",
 }
 
 
@@ -238,7 +238,7 @@ def _style_of(style: str, row: EventRow) -> str:
     sign, event = row.sign, row.event
     if style == "sign":
         return "muted" if sign is None else _SIGN_STYLES[sign]
-    if sign in (Sign.ONLY_A, Sign.ONLY_B, Sign.DIFFERS) and style != "time":
+    if sign in (RowSign.ONLY_A, RowSign.ONLY_B, RowSign.DIFFERS) and style != "time":
         return _SIGN_STYLES[sign] if style in ("hash", "outputs") else "plain"
     if style == "mark":
         return {"!": "error", "w": "warning"}.get(row.mark, "mark")
