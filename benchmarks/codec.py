@@ -38,8 +38,8 @@ from sensor_msgs.msg import (
 from std_msgs.msg import Header, String, UInt64
 from std_srvs.srv import Trigger
 
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import schema_text
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interfaces import schema_text
 
 ROUNDS = 7
 ROUND_S = 0.02

@@ -214,14 +214,14 @@ def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
 
 _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/boundary/installation.py", "publish"): "of rclpy's Publisher",
-    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "__init__"): "of asyncio's loops",
-    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "_watcher"): "of asyncio's policies",
-    ("rsltrace/adapters/rclpy/stacks/asyncio_loops.py", "step"): "a slot of RecordedPoll",
+    ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "__init__"): "of asyncio's loops",
+    ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "_watcher"): "of asyncio's policies",
+    ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "step"): "a slot of RecordedPoll",
     ("rsltrace/adapters/rclpy/handles/logs.py", "_line"): "a field of a message",
     ("rsltrace/search/explore/report/page.py", "tail"): "the text after an element of XML",
-    ("rsltrace/adapters/rclpy/stacks/mains.py", "register"): "of the module atexit",
-    ("rsltrace/adapters/rclpy/stacks/mains.py", "unregister"): "of the module atexit",
-    ("rsltrace/adapters/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
+    ("rsltrace/adapters/rclpy/concurrency/mains.py", "register"): "of the module atexit",
+    ("rsltrace/adapters/rclpy/concurrency/mains.py", "unregister"): "of the module atexit",
+    ("rsltrace/adapters/rclpy/concurrency/threads.py", "__init__"): "of the user's thread classes",
     ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
     ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
 }
@@ -265,8 +265,8 @@ RUNS_CODE = {
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
     "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # setup.py
     # What a run, and only a run, does with code that its job names.
-    "rsltrace/adapters/rclpy/wire/interface_classes.py": "import_module",  # classes of messages
-    "rsltrace/adapters/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
+    "rsltrace/adapters/rclpy/messages/interface_classes.py": "import_module",  # classes of messages
+    "rsltrace/adapters/rclpy/messages/source_text.py": "compile exec",  # codecs
     "rsltrace/search/explore/worker.py": "import_module",  # what the last run has imported
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/user_modules.py": "compile exec_module",  # the same, with our calls
@@ -282,7 +282,7 @@ RUNS_CODE = {
     "rsltrace/adapters/launch/api/description_sources.py": "exec_module",  # a Python launch file
     "rsltrace/adapters/launch/expand.py": "pickle",  # the answer of that process
     # Between processes of one command, on a socket or pipe that nobody else has.
-    "rsltrace/native/apart/wire.py": "pickle",  # of user code: plain values only
+    "rsltrace/native/processes/wire.py": "pickle",  # of user code: plain values only
     "rsltrace/run/forked.py": "pickle",  # what a copy of the simulation returns
     # Who sits at the prompt of a session, in a run whose code they have agreed to run.
     "rsltrace/debug/inspection.py": "compile eval",

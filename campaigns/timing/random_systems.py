@@ -13,9 +13,9 @@ from std_msgs.msg import Empty
 
 from rsltrace.job import Job
 from rsltrace.native.timing.bounds import ResponseBound, bounds
+from rsltrace.native.timing.chains import ChainPath as Chain
+from rsltrace.native.timing.chains import ObservedChains
 from rsltrace.native.timing.model import ProcessorModel, longest_times, system_of
-from rsltrace.native.timing.observed import ChainPath as Chain
-from rsltrace.native.timing.observed import ObservedChains
 from rsltrace.run import record
 from rsltrace.trace.reader import Trace
 

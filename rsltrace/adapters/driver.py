@@ -12,7 +12,7 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.trace.chain import hash64
@@ -126,7 +126,7 @@ class Outside:
     def call(self, function: Callable[[], Any]) -> Call:
         """Call ``function`` as one event and return how it went; it may be waiting by now."""
         self.leave()
-        runners, event = self._world.stacks.runners, self._domain.event
+        runners, event = self._world.runtime.runners, self._domain.event
         call = Call(function)
         name = f"{getattr(function, '__qualname__', 'a function')}, called from outside"
 

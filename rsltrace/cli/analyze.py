@@ -22,8 +22,8 @@ from rsltrace.trace.model.texts import printable
 if TYPE_CHECKING:
     from rsltrace.job import Job
     from rsltrace.native.timing.analysis import TimingAnalysis
+    from rsltrace.native.timing.chains import ObservedChains
     from rsltrace.native.timing.curves import Supply
-    from rsltrace.native.timing.observed import ObservedChains
 
 
 @click.command()
@@ -175,7 +175,7 @@ def _opened(
 
     :raises TraceError: there are several simulated ones, or one is damaged.
     """
-    from rsltrace.native.timing.observed import ObservedChains
+    from rsltrace.native.timing.chains import ObservedChains
     from rsltrace.trace.native import is_native
     from rsltrace.trace.reader import Trace
 
@@ -197,7 +197,7 @@ def _simulated(job: Job, stack: ExitStack) -> ObservedChains:
 
     :raises RunError: the run fails.
     """
-    from rsltrace.native.timing.observed import ObservedChains
+    from rsltrace.native.timing.chains import ObservedChains
     from rsltrace.run import record
     from rsltrace.trace.reader import Trace
 

@@ -107,10 +107,9 @@ def bisect(
     """
     from rsltrace.child_processes import Processes
     from rsltrace.cli.output.search_text import line_of
-    from rsltrace.search.bisect.repository import GitRepository
+    from rsltrace.search.bisect.repository import GitRepository, Worktree
     from rsltrace.search.bisect.runs import RevisionRunner
     from rsltrace.search.bisect.search import BisectSearch
-    from rsltrace.search.bisect.worktree import Worktree
 
     if expression is not None and shell is not None:
         raise click.UsageError("give --check or --run, not both")

@@ -217,7 +217,7 @@ def _diff(
 def _which(a: str, others: Sequence[str], again: str) -> int:
     """Print which of two traces a third one follows."""
     from rsltrace.diff.file_kind import is_recording
-    from rsltrace.diff.traces.reproduction import reproduction
+    from rsltrace.diff.traces.diff import reproduction
     from rsltrace.trace.words.phrases import as_sentence
 
     if len(others) != 1 or any(map(is_recording, (a, *others, again))):

@@ -25,7 +25,7 @@ from rsltrace.trace.reader import Trace
 if TYPE_CHECKING:
     from rsltrace.job import Job
     from rsltrace.native.fit.comparison import Chains
-    from rsltrace.native.fit.parts import Fit
+    from rsltrace.native.fit.fitted_job import Fit
 
 
 @click.command()
@@ -93,9 +93,9 @@ def fit(
     comparison of the two native runs shows how much the robot itself varies.
     """
     from rsltrace.native.fit.comparison import check_latencies
-    from rsltrace.native.fit.measured import measure_times
-    from rsltrace.native.fit.parts import fit as fitted_to
-    from rsltrace.native.fit.parts import notes
+    from rsltrace.native.fit.fitted_job import fit as fitted_to
+    from rsltrace.native.fit.fitted_job import notes
+    from rsltrace.native.fit.measurement import measure_times
 
     if simulated is not None and second is None:
         raise click.UsageError("--simulated needs --check")
@@ -194,7 +194,7 @@ def _write(
     settings: Mapping[str, Any],
 ) -> None:
     """Write the fitted job, and check that it loads."""
-    from rsltrace.native.fit.parts import fitted_job, with_files
+    from rsltrace.native.fit.fitted_job import fitted_job, with_files
 
     if output.exists() and job_file.exists() and output.samefile(job_file):
         raise OutputError(f"{output} is the job that the fitted one extends: name another file")

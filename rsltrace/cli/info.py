@@ -20,10 +20,9 @@ from rsltrace.trace.format import (
     METADATA_GUARD,
     METADATA_NATIVE,
 )
-from rsltrace.trace.model.drop import decode_drops
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.finding import decode_waits
+from rsltrace.trace.model.finding import decode_drops, decode_waits
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import (
     NS_PER_S,

@@ -28,7 +28,7 @@ class RosArgsCommand(click.Command):
         own, ctx.meta[_META] = split_ros_arguments(args)
         left = super().parse_args(ctx, own)
         if ctx.params.get("launch") is not None and not ctx.resilient_parsing:
-            from rsltrace.adapters.launch.find import launch_file
+            from rsltrace.adapters.launch.file_lookup import launch_file
 
             launch, words = launch_file(ctx.params["launch"], ctx.params["words"])
             ctx.params.update(launch=launch, words=tuple(words))

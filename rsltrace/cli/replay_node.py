@@ -111,7 +111,7 @@ def replay_from_job(path: Path, ways: NodeReplayOptions, *, no_pin: bool) -> int
 
 
 def _shown(go: Callable[[bool, RunCallbacks], NodeReplayResult], ways: NodeReplayOptions) -> int:
-    from rsltrace.replay.one_node import report
+    from rsltrace.replay.one_node import result as report
     from rsltrace.run import RunCallbacks
 
     silent = ways.quiet or ways.as_json

@@ -11,9 +11,9 @@ from functools import cache, partial
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rsltrace.adapters.rclpy.stacks.coroutines import TaskRun
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
+from rsltrace.adapters.rclpy.concurrency.coroutines import TaskRun
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.conditions.view import SentOutput
 from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind

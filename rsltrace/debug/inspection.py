@@ -322,7 +322,7 @@ def _timers_of(node: Any) -> list[Any]:
 
 
 def stacks(run: StoppedRun) -> list[str]:
-    stacks = run.session.world.stacks
+    stacks = run.session.world.runtime
     waits = [one.waits_for() for one in stacks.coroutines.suspended]
     return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
 

@@ -25,9 +25,9 @@ as an installed package, a library, or the import system."""
 _ADAPTER = os.path.join(_HERE, "adapters", "rclpy")
 _CALLS_BACK = os.path.join(_HERE, "simulation", "middleware", "events", "dispatcher.py")
 """The only file of rsltrace that calls callbacks; rclpy's own files do, too."""
-_THREADS = os.path.join(_ADAPTER, "stacks", "threads.py")
+_THREADS = os.path.join(_ADAPTER, "concurrency", "threads.py")
 _REPLACEMENTS = (
-    os.path.join(_ADAPTER, "stacks", "asyncio_loops.py"),
+    os.path.join(_ADAPTER, "concurrency", "asyncio_loops.py"),
     os.path.join(_ADAPTER, "terminals", "calls.py"),
 )
 """Replacements of parts of asyncio, os and select: their callers count."""

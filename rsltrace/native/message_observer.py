@@ -15,7 +15,7 @@ from itertools import count
 from typing import Any
 
 from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
-from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.span_recorder import (
     CallbackSpan,

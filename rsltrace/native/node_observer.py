@@ -12,8 +12,8 @@ from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.logs import QOS_ROSOUT
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import message_type, service_type
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interfaces import message_type, service_type
 from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.support import patched
 from rsltrace.simulation.middleware.entity import callback_name

@@ -12,13 +12,9 @@ from rsltrace.adapters.rclpy.boundary.installation import boundary, check_no_sim
 from rsltrace.errors import JobError, NodeError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support
-from rsltrace.native.apart.run import MultiProcessRun
 from rsltrace.native.callback_observer import EXECUTORS, CallbackObserver
 from rsltrace.native.message_observer import MessageObserver
-from rsltrace.native.node_observer import NodeObserver
-from rsltrace.native.observed_entities import ObservedEntities
-from rsltrace.native.priorities import Priorities
-from rsltrace.native.recording import (
+from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
     LOOK_EVERY_S,
     NativeResult,
@@ -26,6 +22,10 @@ from rsltrace.native.recording import (
     ProcessorTime,
     rclpy_running,
 )
+from rsltrace.native.node_observer import NodeObserver
+from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.priorities import Priorities
+from rsltrace.native.processes.run import MultiProcessRun
 from rsltrace.native.running_entry import RunningEntry, destroy
 from rsltrace.native.span_recorder import SpanRecorder
 from rsltrace.native.support import domain

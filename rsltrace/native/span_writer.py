@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.native.message_observer import channel_of
 from rsltrace.native.observed_entities import ObservedEntity
 from rsltrace.native.span_recorder import (

@@ -43,8 +43,8 @@ def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
 
     :raises EditError: there is no such field, or the value does not fit.
     """
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
-    from rsltrace.adapters.rclpy.wire.interfaces import class_of
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.interfaces import class_of
 
     return _recoded(codec_for(class_of(endpoint)), edit, data)
 
@@ -54,7 +54,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 
     :raises EditError: it receives none, or the edit does not fit.
     """
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
 
     handle, kind, args = call.handle, call.kind, call.args
     is_coroutine = hasattr(handle, "task")
@@ -80,7 +80,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
 def arrived_for_action(handle: Any, kind: int) -> Any:
     """Return the part of an action (goal, response, feedback) whose arrival a coroutine is about to
     take, or None."""
-    from rsltrace.adapters.rclpy.actions.parts import ActionEndpoint
+    from rsltrace.adapters.rclpy.actions.action_handle import ActionEndpoint
 
     parts = (
         one for one in _begun_with(handle, kind) if isinstance(one, ActionEndpoint) and one.queue
@@ -97,8 +97,8 @@ def _begun_with(run: Any, kind: int) -> list[Any]:
 
 def _change_arrival(part: Any, edit: Edit) -> int:
     """Change the first arrival in a queue; return its hash."""
-    from rsltrace.adapters.rclpy.actions.parts import ActionService, ActionServiceClient
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.actions.action_handle import ActionService, ActionServiceClient
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
 
     if isinstance(part, ActionService):
         codec = codec_for(part.srv_type.Request)
@@ -419,7 +419,7 @@ class _LaterEvent:
         if getattr(handle, "destroyed", False):
             return
         wrapper = getattr(handle, "wrapper", None)
-        if wrapper is not None and handle.stacks.groups.must_wait(self, wrapper):
+        if wrapper is not None and handle.runtime.groups.must_wait(self, wrapper):
             return
         self._dispatcher.execute(*self._event)
 

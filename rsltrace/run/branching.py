@@ -21,7 +21,7 @@ from rsltrace.trace.model.texts import format_seconds
 
 def run_up_to(session: Session, time_ns: int) -> bool:
     """Run up to and including a simulated time; return whether anything follows."""
-    loop, runners = session.loop, session.world.stacks.runners
+    loop, runners = session.loop, session.world.runtime.runners
 
     def gate(next_ns: int | None) -> bool:
         coming_ns = next_step_ns(loop, next_ns)

@@ -137,7 +137,7 @@ class Driver:
             self._counted = self.loop.events
             if self._steps != 0 and self._may_advance(next_ns):
                 return False
-        runners = self.session.world.stacks.runners
+        runners = self.session.world.runtime.runners
         runners.waiting.append(getcurrent())
         assert runners.main is not None
         runners.main.switch()
@@ -178,7 +178,7 @@ class Driver:
 
     def check_outside(self) -> None:
         """Raise RunError if a node, or another thread, calls."""
-        if threading.get_ident() != self.session.world.stacks.runners.thread:
+        if threading.get_ident() != self.session.world.runtime.runners.thread:
             raise RunError("a simulation is driven by the thread that has entered it")
         if self._who is _ActiveCode.RUN:
             raise RunError("a node cannot drive the simulation that it is part of")

@@ -16,7 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
+from rsltrace.adapters.rclpy.messages.interface_classes import forget_interfaces
 from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.guard.callers import is_rsltrace_module
 from rsltrace.guard.guard import engage

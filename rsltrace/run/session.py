@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from rsltrace.adapters.processes.door import ProcessAdapter
+from rsltrace.adapters.processes.adapter import ProcessAdapter
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job
 from rsltrace.run.inputs import check_output, expand_launch_files
@@ -82,8 +82,7 @@ from rsltrace.simulation.middleware.events.event import NameRegistry
 from rsltrace.simulation.middleware.interface import AllTopicFaults
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_STATES
 from rsltrace.trace.mcap.sink import unfinished_path
-from rsltrace.trace.model.drop import encode_drops
-from rsltrace.trace.model.finding import EndlessWait, GuardCount, encode_waits
+from rsltrace.trace.model.finding import EndlessWait, GuardCount, encode_drops, encode_waits
 from rsltrace.trace.model.texts import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -205,7 +204,7 @@ class Session:
 
     def changes_process(self, pid: int, pairs: Sequence[tuple[int, int]]) -> None:
         """Continue in a copy of the process, which has new ``pairs`` of descriptors."""
-        self.world.stacks.runners.process = pid
+        self.world.runtime.runners.process = pid
         guard = self._guarded.guard
         if guard is not None:
             guard.continue_in(pid)
@@ -246,7 +245,7 @@ class Session:
         with self._guarded.engaged():
             self._import_targets()
         check_bag_types(self.job, self._bags)
-        self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
+        self._watchdog = Watchdog(self.world.domain, self.world.runtime.runners.thread)
         if self._observer.interrupt is not None:  # from here on there is a file to be closed
             self._observer.interrupt(self._interrupt)
         if self._output is not None:
@@ -405,7 +404,7 @@ class Session:
             if not self.whole_graph:
                 self._faults = arm_node_faults(self.job, self.world, self.start_ns)
             stop_with(self.world, self._entries)
-            self.world.stacks.programs.fed = bool(self._bags)
+            self.world.runtime.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
             for entry in later:
                 self.world.starts.add(entry)

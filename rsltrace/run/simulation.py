@@ -391,8 +391,8 @@ class Simulation:
             taps.remove(tap)
 
     def _watcher(self, taps: list[TopicTap]) -> Callable[[Any, bytes], None]:
-        from rsltrace.adapters.rclpy.wire.codec import codec_for
-        from rsltrace.adapters.rclpy.wire.interfaces import class_of
+        from rsltrace.adapters.rclpy.messages.codec import codec_for
+        from rsltrace.adapters.rclpy.messages.interfaces import class_of
 
         driver = self._driver
 

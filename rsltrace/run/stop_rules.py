@@ -288,8 +288,8 @@ def watch_messages(
 
 
 def _watcher(rule: StopRule, stop: Callable[[Stop], None]) -> Callable[[Any, bytes], None]:
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
-    from rsltrace.adapters.rclpy.wire.interfaces import class_of
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.interfaces import class_of
 
     def watcher(publisher: Any, data: bytes) -> None:
         found = rule.on_message(lambda: codec_for(class_of(publisher)).deserialize(data))

@@ -20,7 +20,7 @@ from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.event import NameRegistry, NameRequester
-from rsltrace.trace.model.drop import QueueDrops
+from rsltrace.trace.model.finding import QueueDrops
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
 

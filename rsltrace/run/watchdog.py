@@ -125,10 +125,10 @@ def _frames(frame: FrameType | None) -> Iterator[FrameType]:
 
 def _process_asked(frames: Iterable[FrameType]) -> str:
     """Name the process that the run waits for, or ""."""
-    door = sys.modules.get("rsltrace.adapters.processes.process")  # not loaded: there is none
-    if door is None:
+    adapter = sys.modules.get("rsltrace.adapters.processes.process")  # not loaded: there is none
+    if adapter is None:
         return ""
-    asks = door.Process._converse.__code__
+    asks = adapter.Process._converse.__code__
     asked = next((f.f_locals["self"] for f in frames if f.f_code is asks), None)
     return "" if asked is None else f"process {asked.name} (pid {asked.child.pid})"
 

@@ -36,7 +36,7 @@ def assert_node_unchanged(
     """
     __tracebackhide__ = True
     from rsltrace.replay import replay_trace
-    from rsltrace.replay.one_node.report import as_text
+    from rsltrace.replay.one_node.result import as_text
 
     bags = [bag] if isinstance(bag, (str, os.PathLike)) else bag or ()
     result = replay_trace(

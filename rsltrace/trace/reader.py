@@ -42,7 +42,6 @@ from rsltrace.trace.format import (
     TOPIC_OUTPUTS,
     TOPIC_ROSOUT,
 )
-from rsltrace.trace.guarded import parse_counts
 from rsltrace.trace.index import (
     ChannelInfo,
     TraceIndex,
@@ -63,7 +62,7 @@ from rsltrace.trace.mcap.records import (
 from rsltrace.trace.mcap.source import ByteSource, open_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, EventRecord, Output, OutputKind
-from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode
+from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, parse_counts
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.segments import SegmentReader, event_of, output_of

@@ -279,7 +279,7 @@ def test_goal_ids_come_from_the_seed(simulate: Any) -> None:
 def test_statuses_are_the_bytes_that_the_codec_makes_of_them(simulate: Any) -> None:
     from action_msgs.msg import GoalStatusArray
 
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
 
     log: list[Any] = []
     clients = [type(f"Client{n}", (Client,), {}) for n in range(4)]

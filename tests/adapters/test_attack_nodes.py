@@ -303,7 +303,7 @@ def test_a_module_that_keeps_sleep_sleeps_in_every_run(
 
 
 def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
-    from rsltrace.adapters.rclpy.stacks.runtime import Runtime
+    from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 
     class Waits(Ticker):
         def act(self) -> None:

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 from std_srvs.srv import SetBool, Trigger
 
-from rsltrace.adapters.rclpy.stacks import blocking_calls as simulated_waiting
+from rsltrace.adapters.rclpy.concurrency import blocking_calls as simulated_waiting
 from rsltrace.errors import DeadlockError, NodeError
 
 pytestmark = pytest.mark.ros

@@ -52,12 +52,12 @@ from test_msgs.msg import (  # noqa: E402
     WStrings,
 )
 
-from rsltrace.adapters.rclpy.wire import decoder_source as codec_read  # noqa: E402
-from rsltrace.adapters.rclpy.wire import encoder_source as codec_write  # noqa: E402
-from rsltrace.adapters.rclpy.wire.checked_codec import decode, encode  # noqa: E402
-from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
-from rsltrace.adapters.rclpy.wire.interfaces import schema_text, type_name  # noqa: E402
-from rsltrace.adapters.rclpy.wire.message_spec import (  # noqa: E402  # noqa: E402
+from rsltrace.adapters.rclpy.messages import decoder_source as codec_read  # noqa: E402
+from rsltrace.adapters.rclpy.messages import encoder_source as codec_write  # noqa: E402
+from rsltrace.adapters.rclpy.messages.checked_codec import decode, encode  # noqa: E402
+from rsltrace.adapters.rclpy.messages.codec import codec_for  # noqa: E402
+from rsltrace.adapters.rclpy.messages.interfaces import schema_text, type_name  # noqa: E402
+from rsltrace.adapters.rclpy.messages.message_spec import (  # noqa: E402  # noqa: E402
     HEADER,
     START,
     ArrayType,

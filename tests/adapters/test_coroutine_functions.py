@@ -10,7 +10,7 @@ from unittest.mock import AsyncMock, Mock
 
 import pytest
 
-from rsltrace.adapters.rclpy.stacks.tasks import is_coroutine_function
+from rsltrace.adapters.rclpy.concurrency.tasks import is_coroutine_function
 
 
 def plain() -> None: ...

@@ -19,9 +19,9 @@ from std_srvs.srv import Trigger
 from test_msgs.action import Fibonacci, NestedMessage
 from test_msgs.msg import BoundedSequences, Strings
 
-from rsltrace.adapters.rclpy.wire import interfaces as interface_files
-from rsltrace.adapters.rclpy.wire import interfaces as interface_schema
-from rsltrace.adapters.rclpy.wire.interfaces import (
+from rsltrace.adapters.rclpy.messages import interfaces as interface_files
+from rsltrace.adapters.rclpy.messages import interfaces as interface_schema
+from rsltrace.adapters.rclpy.messages.interfaces import (
     get_message_class,
     get_service_class,
     schema_text,
@@ -187,7 +187,8 @@ def test_a_class_that_rosidl_did_not_make_has_no_name() -> None:
 
 def test_importing_the_module_imports_nothing_of_ros() -> None:
     code = (
-        "import sys, rsltrace.adapters.rclpy.wire.interfaces, rsltrace.adapters.rclpy.wire.codec; "
+        "import sys, rsltrace.adapters.rclpy.messages.interfaces; "
+        "import rsltrace.adapters.rclpy.messages.codec; "
         "print([m for m in sys.modules if m.split('.')[0] in "
         "('rclpy', 'rosidl_parser', 'std_msgs', 'builtin_interfaces')])"
     )

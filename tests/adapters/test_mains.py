@@ -568,7 +568,7 @@ def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
 
 @pytest.mark.long
 def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
-    from rsltrace.adapters.rclpy.stacks.program import _FAILURES_MAX, SimulatedProgram
+    from rsltrace.adapters.rclpy.concurrency.program import _FAILURES_MAX, SimulatedProgram
 
     kept: list[int] = []
 

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy")
 
 from rsltrace import NodeSpec
-from rsltrace.adapters.rclpy.stacks.coroutines import _run_oldest_first
+from rsltrace.adapters.rclpy.concurrency.coroutines import _run_oldest_first
 from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
 from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from tests.adapters.rounds_program import Busy, Shared, nodes_of

@@ -588,7 +588,7 @@ def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
 
         def tick(self) -> None:
             threading.Timer(0.015, lambda: None).start()
-            alive.append(len(self.handle.stacks.threads.alive))
+            alive.append(len(self.handle.runtime.threads.alive))
 
     simulate(Short, duration=1)
     assert len(alive) == 100

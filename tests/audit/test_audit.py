@@ -13,7 +13,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.audit import audit_job, audit_path
-from rsltrace.guard.audit.rules import AuditFinding
+from rsltrace.guard.audit.report import AuditFinding
 from rsltrace.job import load_job
 
 ROOT = Path(__file__).parents[2]

@@ -19,9 +19,8 @@ from rsltrace.cli.bisect import _same_everywhere
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
-from rsltrace.search.bisect.repository import GitRepository
+from rsltrace.search.bisect.repository import GitRepository, Worktree
 from rsltrace.search.bisect.runs import python_folders
-from rsltrace.search.bisect.worktree import Worktree
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

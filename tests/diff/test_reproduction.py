@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import rsltrace
-from rsltrace.diff.traces.reproduction import Repeats, Reproduction, reproduction
+from rsltrace.diff.traces.diff import Repeats, Reproduction, reproduction
 from rsltrace.errors import TraceError
 from rsltrace.trace.reader import Trace
 

@@ -15,7 +15,7 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Image, LaserScan  # noqa: E402
 
 from campaigns.explore.suite import BUGS  # noqa: E402
-from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
+from rsltrace.adapters.rclpy.messages.codec import codec_for  # noqa: E402
 from rsltrace.errors import BagError  # noqa: E402
 from rsltrace.job import Job, NodeSpec, StopSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402

@@ -17,7 +17,7 @@ from rsltrace import Trace, record
 from rsltrace.checks.latency.measure import measure_latencies
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
-from rsltrace.native.fit.measured import NativeTimes, measure_times
+from rsltrace.native.fit.measurement import NativeTimes, measure_times
 from rsltrace.native.fit.models import ks_distance
 from rsltrace.run.plans.network import make_distribution
 from rsltrace.simulation.chance.stream import RandomStream

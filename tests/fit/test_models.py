@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.native.fit.comparison import compare_samples
-from rsltrace.native.fit.measured import clock_steps
+from rsltrace.native.fit.measurement import clock_steps
 from rsltrace.native.fit.models import ks_distance, model_of, table_of
 from rsltrace.simulation.chance.distribution import Empirical, Gamma, Lognormal, Normal, Uniform
 from rsltrace.simulation.chance.stream import RandomStream

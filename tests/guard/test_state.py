@@ -401,11 +401,11 @@ def test_state_hashes_are_off_by_default_and_listed_in_info(tmp_path: Path) -> N
         assert len(set(hashes)) > 10
         assert (
             trace.metadata("rsltrace:guard")["left_out"]
-            == '{"/planted": {"lock": "rsltrace.adapters.rclpy.stacks.locks.SimLock"}}'
+            == '{"/planted": {"lock": "rsltrace.adapters.rclpy.concurrency.locks.SimLock"}}'
         )
     shown = CliRunner().invoke(info, [str(on)]).output
     assert (
-        'state hashes leave out: {"/planted": {"lock": "rsltrace.adapters.rclpy.stacks.locks.SimLock"}}'  # noqa: E501
+        'state hashes leave out: {"/planted": {"lock": "rsltrace.adapters.rclpy.concurrency.locks.SimLock"}}'  # noqa: E501
         in shown
     )
 

@@ -13,8 +13,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rsltrace.cli.main import cli
 from rsltrace.job import load_job
 from rsltrace.run import RunResult, run
-from rsltrace.trace.model.drop import QueueDrops, decode_drops
 from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.finding import QueueDrops, decode_drops
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros

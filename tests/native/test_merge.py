@@ -11,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.native.apart import run as merging
-from rsltrace.native.apart.run import SpanMerger
-from rsltrace.native.apart.wire import Link, LinkError, SpanDecoder, SpanEncoder
 from rsltrace.native.observed_entities import ObservedEntities
+from rsltrace.native.processes import run as merging
+from rsltrace.native.processes.run import SpanMerger
+from rsltrace.native.processes.wire import Link, LinkError, SpanDecoder, SpanEncoder
 from rsltrace.native.span_recorder import (
     CallbackError,
     CallbackSpan,

@@ -18,7 +18,7 @@ from rosidl_parser.definition import BasicType
 
 import rsltrace
 from rsltrace.adapters.processes.build import find_ros
-from rsltrace.adapters.rclpy.wire.interface_classes import forget_interfaces
+from rsltrace.adapters.rclpy.messages.interface_classes import forget_interfaces
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run, watchdog

@@ -19,7 +19,7 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import LaserScan, Range  # noqa: E402
 from std_msgs.msg import Bool, Int8, String, UInt64  # noqa: E402
 
-from rsltrace.adapters.rclpy.wire.codec import codec_for  # noqa: E402
+from rsltrace.adapters.rclpy.messages.codec import codec_for  # noqa: E402
 from rsltrace.diff import diff_files  # noqa: E402
 from rsltrace.errors import JobError, RsltraceError  # noqa: E402
 from rsltrace.job import Job, NodeSpec  # noqa: E402

@@ -223,7 +223,7 @@ def test_classes_and_hashes_are_those_that_a_build_makes(
 def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
     from std_srvs.srv import SetBool
 
-    from rsltrace.adapters.rclpy.wire.type_descriptions import _from_file, type_description
+    from rsltrace.adapters.rclpy.messages.type_descriptions import _from_file, type_description
 
     built, read = type_description(SetBool), _from_file("std_srvs/srv/SetBool")
     assert built is not None

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.adapters.processes.door import ProcessProgram
+from rsltrace.adapters.processes.adapter import ProcessProgram
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError

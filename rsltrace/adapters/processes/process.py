@@ -80,9 +80,9 @@ class Process:
     ``things`` are its nodes, endpoints and timers.
     """
 
-    def __init__(self, door: ProcessRun, name: str, key: str, *, log_failure: bool) -> None:
-        self.door = door
-        self.dispatcher = door.domain.dispatcher
+    def __init__(self, adapter: ProcessRun, name: str, key: str, *, log_failure: bool) -> None:
+        self.adapter = adapter
+        self.dispatcher = adapter.domain.dispatcher
         self.name = name
         self.key = key
         self.log_failure = log_failure
@@ -91,7 +91,7 @@ class Process:
         self.begun_ns = 0
         self.child: ProcessHandle
         self.ended: ProcessEnd | None = None
-        self.things = ProcessEntities(door, self)
+        self.things = ProcessEntities(adapter, self)
         self._wanted: dict[int, int] = {}
         """Which thread waits for a thing."""
         self._waits: tuple[tuple[int, int], ...] = ()
@@ -105,7 +105,7 @@ class Process:
         self._last: WaitableEntity | None = None
         self._is_stopping = False
         self._graph = GraphChange(self)
-        door.domain.graph.changed.append(self._graph.note)
+        adapter.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
             RecordKind.HELLO: self._hello,
             RecordKind.TAKE: self._take,
@@ -113,10 +113,12 @@ class Process:
             RecordKind.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
             RecordKind.QOS: self._qos,
             RecordKind.MATCHED: self._matched,
-            RecordKind.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_name)),
+            RecordKind.FOLLOWS: lambda fields: HEAD.pack(
+                adapter.follows_clock(self.things.last_name)
+            ),
             RecordKind.CLOCK: self._clock,
             RecordKind.CLOCK_OWNER: self._owner_of_new_clock,
-            RecordKind.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
+            RecordKind.GRAPH: lambda fields: graph_answers.answer(adapter.domain.graph, fields),
         }
         self._records: dict[int, Callable[[RecordReader], None]] = {
             **self.things.records,
@@ -319,7 +321,7 @@ class Process:
             self._take_batch(self.child.left())
         self.ended = ProcessEnd(ended.status, broken_link or ended.broken_link)
         self.vanish()
-        self.door.has_ended(self)
+        self.adapter.has_ended(self)
         if not self.ended.failed or self._is_stopping:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)
@@ -327,7 +329,7 @@ class Process:
         happened = f"process {self.name} {self.ended.said} at {at} s"
         text = f"{happened}; the last that it ran was {last}"
         if self.log_failure:
-            self.door.log(40, self.name, text)
+            self.adapter.log(40, self.name, text)
         else:
             now_ns = self.dispatcher.loop.now_ns
             raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
@@ -359,15 +361,15 @@ class Process:
     # -- what it asks ----------------------------------------------------------------------------
 
     def _hello(self, fields: RecordReader) -> bytes:
-        door, now_ns = self.door, self.dispatcher.loop.now_ns
-        return _HELLO.pack(now_ns, door.seed_of(self.key), door.clock is not None)
+        adapter, now_ns = self.adapter, self.dispatcher.loop.now_ns
+        return _HELLO.pack(now_ns, adapter.seed_of(self.key), adapter.clock is not None)
 
     def _clock(self, fields: RecordReader) -> bytes:
         """Answer what a clock shows: that of a node, or of the running one."""
         node = self.things.get(fields.number()) or self._running_node()
-        assert self.door.clock is not None, "it asks where there are such clocks"
+        assert self.adapter.clock is not None, "it asks where there are such clocks"
         name = None if node is None else node.fully_qualified_name
-        return _SHOWN.pack(*self.door.clock(name, bool(fields.number())))
+        return _SHOWN.pack(*self.adapter.clock(name, bool(fields.number())))
 
     def _running_node(self) -> Participant | None:
         """Return the node whose callback runs, else the one that was made last."""
@@ -415,10 +417,10 @@ class Process:
         self.things[number].answer(gid, sequence, fields.rest())
 
     def _log(self, fields: RecordReader) -> None:
-        self.door.log(fields.number(), fields.text(), fields.text())
+        self.adapter.log(fields.number(), fields.text(), fields.text())
 
     def _report(self, fields: RecordReader) -> None:
-        self.door.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
+        self.adapter.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
 
     def _timer_passed(self, fields: RecordReader) -> None:
         self.things[fields.number()].is_callback = False

@@ -207,9 +207,9 @@ class EntityFactory(ExceptionHandler, Protocol):
 class ProcessEntities(dict[int, Any]):
     """What a process has made and not given up; ``records`` are those by which it says so."""
 
-    def __init__(self, door: EntityFactory, process: HostProcess) -> None:
+    def __init__(self, adapter: EntityFactory, process: HostProcess) -> None:
         super().__init__()
-        self._door = door
+        self._adapter = adapter
         self._process = process
         self._nodes: list[Participant] = []
         self._timers_named = 0
@@ -228,9 +228,9 @@ class ProcessEntities(dict[int, Any]):
 
     def _node(self, fields: RecordReader) -> None:
         number, name, namespace = fields.number(), fields.text(), fields.text()
-        domain = self._door.domain
+        domain = self._adapter.domain
         taken = {other.number for other in domain.graph.nodes_named(full_name(namespace, name))}
-        node = domain.join(name, namespace, self._door)
+        node = domain.join(name, namespace, self._adapter)
         node.number = next(count for count in itertools.count(1) if count not in taken)
         node.process = self._process
         self[number] = node
@@ -241,34 +241,34 @@ class ProcessEntities(dict[int, Any]):
         number, node = fields.number(), self[fields.number()]
         topic, type_name, qos = fields.text(), fields.text(), fields.qos()
         kind = RosoutPublisher if topic == TOPIC_ROSOUT else Publisher
-        domain = self._door.domain
+        domain = self._adapter.domain
         self[number] = end = kind(
-            domain.transport, node, topic, self._door.message_type(type_name), qos
+            domain.transport, node, topic, self._adapter.message_type(type_name), qos
         )
         domain.graph.add_publisher(end)
 
     def _subscription(self, fields: RecordReader) -> None:
         number, node = fields.number(), self[fields.number()]
         topic, type_name, qos = fields.text(), fields.text(), fields.qos()
-        graph = self._door.domain.graph
+        graph = self._adapter.domain.graph
         settled = graph.settled_request(topic, qos)
-        type = self._door.message_type(type_name)
+        type = self._adapter.message_type(type_name)
         end = ProcessSubscription(self._process, number, node, topic, type, settled)
         self[number] = end
         graph.add_subscription(end)
 
     def _service(self, fields: RecordReader) -> None:
-        domain = self._door.domain
+        domain = self._adapter.domain
         number, node = fields.number(), self[fields.number()]
-        name, type, qos = fields.text(), self._door.service_type(fields.text()), fields.qos()
+        name, type, qos = fields.text(), self._adapter.service_type(fields.text()), fields.qos()
         end = ProcessService(self._process, number, domain.transport, node, name, type, qos)
         self[number] = end
         domain.graph.add_service(end)
 
     def _client(self, fields: RecordReader) -> None:
-        domain = self._door.domain
+        domain = self._adapter.domain
         number, node = fields.number(), self[fields.number()]
-        name, type, qos = fields.text(), self._door.service_type(fields.text()), fields.qos()
+        name, type, qos = fields.text(), self._adapter.service_type(fields.text()), fields.qos()
         end = ProcessClient(self._process, number, domain.transport, node, name, type, qos)
         self[number] = end
         domain.graph.add_client(end)

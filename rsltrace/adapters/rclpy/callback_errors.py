@@ -7,11 +7,11 @@ import os
 import sys
 from typing import NoReturn
 
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox, mailbox_of
+from rsltrace.adapters.rclpy.concurrency.runtime import RunEnded, Runtime
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.hints import hint_for
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, mailbox_of
-from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.errors import RsltraceError, RunError
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop
@@ -56,22 +56,22 @@ _ERROR = 40
 class RclpyExceptionHandler:
     """Handles exceptions of rclpy's nodes, and of everything that the job constructs."""
 
-    def __init__(self, stacks: Runtime, logs: RosoutLogs) -> None:
-        self._stacks = stacks
+    def __init__(self, runtime: Runtime, logs: RosoutLogs) -> None:
+        self._runtime = runtime
         self._logs = logs
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
         """Record an exception of the current event, and decide how the run goes on."""
-        stacks = self._stacks
+        runtime = self._runtime
         if isinstance(error, RunEnded):
-            if not (stacks.ending.closing and isinstance(error.__context__, KeyboardInterrupt)):
+            if not (runtime.ending.closing and isinstance(error.__context__, KeyboardInterrupt)):
                 return
             error = error.__context__  # interrupted, and cut off while it cleaned up
-        if os.getpid() != stacks.runners.process:
+        if os.getpid() != runtime.runners.process:
             end_child(error)
-        is_ending = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
+        is_ending = runtime.ending.closing and isinstance(error, KeyboardInterrupt)
         note = describe_exception if is_ending else record_exception
-        raised = note(stacks.dispatcher, error, handle)
+        raised = note(runtime.dispatcher, error, handle)
         mailbox = None if isinstance(handle, OutsideEvent) else mailbox_of(handle)
         node = self._logging_node(error)
         if mailbox is not None and node is None:
@@ -80,22 +80,22 @@ class RclpyExceptionHandler:
             reason = f"{raised.label} raised SystemExit"
             if error.code is not None and not isinstance(error.code, int):
                 reason += f": {raised.said}"  # as Python prints it
-            stacks.loop.stop(Stop(reason, exit_status(error)))
+            runtime.loop.stop(Stop(reason, exit_status(error)))
         elif isinstance(error, KeyboardInterrupt):
-            stacks.loop.stop(Stop("interrupted", 130))
+            runtime.loop.stop(Stop("interrupted", 130))
         elif node is not None:
             message = f"{raised.label} raised {raised.kind}: {raised.said}"
             self._logs.log(_ERROR, node.logger_name(), message, "", "", 0)
         else:
-            end_run(stacks.dispatcher, raised, self._run_error(raised))
+            end_run(runtime.dispatcher, raised, self._run_error(raised))
 
     def _hand_on(self, mailbox: Mailbox, raised: RaisedException) -> None:
         """Raise an exception out of the spin that runs the callback."""
         mailbox.raised = raised.error
-        self._stacks.programs.present.failures.append(raised)
+        self._runtime.programs.present.failures.append(raised)
 
     def _run_error(self, raised: RaisedException) -> RunError:
-        failures = self._stacks.programs.present.failures
+        failures = self._runtime.programs.present.failures
         earlier = next((one for one in failures if one.error is raised.error), None)
         if earlier is not None:
             return earlier.as_error(hint_for(earlier.error))  # its main raised it again
@@ -113,7 +113,7 @@ class RclpyExceptionHandler:
 
         rsltrace's own errors and exceptions of constructors always end the run.
         """
-        event = self._stacks.event
+        event = self._runtime.event
         node = event.node
         if not isinstance(node, NodeHandle) or not node.log_exceptions or event.kind in _LIFE:
             return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
-from rsltrace.adapters.rclpy.wire.interfaces import get_service_class
+from rsltrace.adapters.rclpy.messages.interfaces import get_service_class
 from rsltrace.errors import JobError, RunError, SetupError
 from rsltrace.simulation.middleware.participant import full_name
 

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, cast
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import abandon
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox, SpinningExecutor
+from rsltrace.adapters.rclpy.concurrency.mains import crash_program
+from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
+from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.blocking_calls import abandon
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, SpinningExecutor
-from rsltrace.adapters.rclpy.stacks.mains import crash_program
-from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
-from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
@@ -38,11 +38,11 @@ class FaultedNodes:
     """
 
     def __init__(
-        self, stacks: Runtime, nodes: list[Any], program: SimulatedProgram, entry: JobEntry | None
+        self, runtime: Runtime, nodes: list[Any], program: SimulatedProgram, entry: JobEntry | None
     ) -> None:
-        self._stacks = stacks
+        self._runtime = runtime
         self._nodes = nodes
-        self._program = None if program is stacks.programs.host else program
+        self._program = None if program is runtime.programs.host else program
         self._entry = entry
         self._running: list[Any] = []
         self._spinning: list[tuple[Mailbox, SpinningExecutor]] = []
@@ -61,17 +61,17 @@ class FaultedNodes:
                     node.mailbox.driver = None
             elif node.wrapper is not None:
                 self._running.append(node.wrapper)
-                self._stacks.executor.remove_node(node.wrapper)
+                self._runtime.executor.remove_node(node.wrapper)
 
     def release(self) -> None:
         """Let them go on: kept items are ready now."""
         for node in self._running:
             if not node.handle.destroyed:
-                self._stacks.executor.add_node(node)
+                self._runtime.executor.add_node(node)
         holders = self._nodes if self._program is None else [self._program, *self._nodes]
         for holder in holders:
             held, holder.held = holder.held, None
-            self._stacks.loop.tasks.extend(held or ())
+            self._runtime.loop.tasks.extend(held or ())
         for mailbox, driver in self._spinning:
             if not mailbox.closed:
                 mailbox.driver = driver
@@ -80,22 +80,22 @@ class FaultedNodes:
     def crash(self) -> None:
         """Remove them from the run, as a killed process."""
         self._keep_what_comes()
-        stacks = self._stacks
-        for blocked in [one for one in stacks.runners.blocked if self._is_ours(one)]:
-            del stacks.runners.blocked[blocked]
+        runtime = self._runtime
+        for blocked in [one for one in runtime.runners.blocked if self._is_ours(one)]:
+            del runtime.runners.blocked[blocked]
             abandon(blocked.stack)
             blocked.stop_waiting()
-        for run in [one for one in stacks.coroutines.suspended if one.node in self._nodes]:
-            del stacks.coroutines.suspended[run]
-        for thread in list(stacks.threads.alive):
+        for run in [one for one in runtime.coroutines.suspended if one.node in self._nodes]:
+            del runtime.coroutines.suspended[run]
+        for thread in list(runtime.threads.alive):
             if thread.node in self._nodes or thread.program is self._program:
                 thread.end()
         for node in self._nodes:
             if node.wrapper is not None and node.mailbox is None:
-                stacks.executor.remove_node(node.wrapper)
+                runtime.executor.remove_node(node.wrapper)
             if node.mailbox is not None:
                 node.mailbox.close()
-            for endpoint in stacks.domain.graph.endpoints_of(node):
+            for endpoint in runtime.domain.graph.endpoints_of(node):
                 endpoint.destroy()
             node.destroy()
 
@@ -255,7 +255,7 @@ class _ScheduledFault:
                 raise self._cannot("it is in a process of its own; crash and restart are possible")
             cast("RealProcess", node.process).crash()
             return
-        faulted = FaultedNodes(world.stacks, self._nodes(node, entry), node.process, entry)
+        faulted = FaultedNodes(world.runtime, self._nodes(node, entry), node.process, entry)
         if fault.kind == "hang":
             faulted.hold()
             if fault.for_ns is not None:
@@ -263,12 +263,12 @@ class _ScheduledFault:
                 world.domain.loop.schedule(world.domain.loop.now_ns + fault.for_ns, self.come)
             return
         faulted.crash()
-        if node.process is not world.stacks.programs.host:
-            crash_program(world.stacks, node.process)
+        if node.process is not world.runtime.programs.host:
+            crash_program(world.runtime, node.process)
             if fault.kind == "restart":
                 world.renew(node.process)
         elif entry is not None:
-            world.stacks.programs.tell("ended", entry.key)
+            world.runtime.programs.tell("ended", entry.key)
 
     def _nodes(self, node: NodeHandle, entry: JobEntry | None) -> list[Any]:
         """Return the nodes of a node's process."""

@@ -14,6 +14,19 @@ from greenlet import getcurrent, greenlet
 from rsltrace.adapters.rclpy.boundary.boundary import BoundaryContext, RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.installation import installed
 from rsltrace.adapters.rclpy.callback_errors import RclpyExceptionHandler
+from rsltrace.adapters.rclpy.concurrency.asyncio_loops import simulated_event_loops
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import end_blocked, simulated_waiting
+from rsltrace.adapters.rclpy.concurrency.endless_waits import note_waits
+from rsltrace.adapters.rclpy.concurrency.entry_starts import ConstructionEvent, EntryStarts
+from rsltrace.adapters.rclpy.concurrency.line_switches import switches_at_lines
+from rsltrace.adapters.rclpy.concurrency.mains import begin_program, end_programs, own_exit_handlers
+from rsltrace.adapters.rclpy.concurrency.process_exit import (
+    own_process_ends,
+    own_signal_handlers,
+)
+from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
+from rsltrace.adapters.rclpy.concurrency.threads import cooperative_threads
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.executors.user_executors import note_replaced_functions, own_executors
 from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
@@ -21,19 +34,6 @@ from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.hints import constructor_of, is_unmade
 from rsltrace.adapters.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.adapters.rclpy.parameters import Parameters, parameters_of
-from rsltrace.adapters.rclpy.stacks.asyncio_loops import simulated_event_loops
-from rsltrace.adapters.rclpy.stacks.blocking_calls import end_blocked, simulated_waiting
-from rsltrace.adapters.rclpy.stacks.endless_waits import note_waits
-from rsltrace.adapters.rclpy.stacks.entry_starts import ConstructionEvent, EntryStarts
-from rsltrace.adapters.rclpy.stacks.line_switches import switches_at_lines
-from rsltrace.adapters.rclpy.stacks.mains import begin_program, end_programs, own_exit_handlers
-from rsltrace.adapters.rclpy.stacks.process_exit import (
-    own_process_ends,
-    own_signal_handlers,
-)
-from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
-from rsltrace.adapters.rclpy.stacks.threads import cooperative_threads
 from rsltrace.adapters.rclpy.terminals.calls import Terminals, simulated_terminals
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.guard.redirect import replace_attribute
@@ -50,7 +50,7 @@ from rsltrace.trace.model.event import NO_EVENT, EventKind
 class World:
     """Nodes in an event loop. Within its ``with`` block, rclpy is simulated.
 
-    ``domain`` is shared by all participants, ``stacks`` is the runtime of user code, ``states``
+    ``domain`` is shared by all participants, ``runtime`` is the runtime of user code, ``states``
     holds the hashed states of nodes. ``clocks`` is None if all clocks show simulated time.
 
     :param base_dir: the job's folder; source paths in logs are relative to it.
@@ -61,48 +61,48 @@ class World:
         self, loop: EventLoop, *, base_dir: Path, seed: int = 0, echo: bool = True
     ) -> None:
         self.domain = Domain(loop)
-        self.stacks = Runtime(self.domain)
+        self.runtime = Runtime(self.domain)
         self.states = NodeStates()
         self.clocks: NodeClocks | None = None
         self.nodes: list[Any] = []
         self.parameters: dict[str, Parameters] = {}
         self._seed = seed
         self._logs = RosoutLogs(self.domain, base_dir=base_dir, echo=echo)
-        self.domain.dispatcher.door = RclpyExceptionHandler(self.stacks, self._logs)
-        self._surroundings = BoundaryContext(self.stacks, self._logs, self.states)
+        self.domain.dispatcher.exception_handler = RclpyExceptionHandler(self.runtime, self._logs)
+        self._surroundings = BoundaryContext(self.runtime, self._logs, self.states)
         self._boundary: RclpyBoundary
         self._terminals: Terminals
         self._stack = ExitStack()
         self.constructed: list[JobEntry] = []
         """The entries in the order of their construction."""
-        self.starts = EntryStarts(self.stacks, self.construct)
+        self.starts = EntryStarts(self.runtime, self.construct)
         self.start_process: Callable[[JobEntry, tuple[int, int]], None]
         """EntryStarts an entry that runs as a process of its own, as one event."""
 
     def __enter__(self) -> World:
-        stacks = self.stacks
+        runtime = self.runtime
         with ExitStack() as stack:
             self._boundary = stack.enter_context(installed())
             stack.enter_context(_fresh_rclpy(self._boundary))
-            stack.callback(stacks.programs.leave)
+            stack.callback(runtime.programs.leave)
             self._boundary.enter(self._surroundings)
             stack.callback(self._boundary.leave)
             import rclpy
 
             from rsltrace.adapters.rclpy.executors.sim_executor import SimExecutor
 
-            stack.enter_context(simulated_waiting(stacks, self._seed))
-            stack.enter_context(own_executors(stacks))
-            stack.enter_context(cooperative_threads(stacks))
-            stack.enter_context(simulated_event_loops(stacks))
-            stack.enter_context(own_exit_handlers(stacks))
-            stack.enter_context(own_process_ends(stacks))
-            stack.enter_context(own_signal_handlers(stacks))
-            self._terminals = stack.enter_context(simulated_terminals(stacks))
+            stack.enter_context(simulated_waiting(runtime, self._seed))
+            stack.enter_context(own_executors(runtime))
+            stack.enter_context(cooperative_threads(runtime))
+            stack.enter_context(simulated_event_loops(runtime))
+            stack.enter_context(own_exit_handlers(runtime))
+            stack.enter_context(own_process_ends(runtime))
+            stack.enter_context(own_signal_handlers(runtime))
+            self._terminals = stack.enter_context(simulated_terminals(runtime))
             rclpy.init(args=[])
-            stacks.runners.main = getcurrent()
-            stacks.executor = SimExecutor(stacks, rclpy.get_default_context())
-            setattr(rclpy, "__executor", stacks.executor)  # what rclpy.spin* use
+            runtime.runners.main = getcurrent()
+            runtime.executor = SimExecutor(runtime, rclpy.get_default_context())
+            setattr(rclpy, "__executor", runtime.executor)  # what rclpy.spin* use
             stack.callback(self._close)
             # The executor's own guard conditions are no entities.
             self.domain.entities.pending.clear()
@@ -115,11 +115,11 @@ class World:
     def _close(self) -> None:
         import rclpy
 
-        programs, error = self.stacks.programs, self.error
+        programs, error = self.runtime.programs, self.error
         programs.main_context = None  # from here on a shutdown is ours
         self.domain.event.handle = None
-        self.stacks.runners.close()
-        self.stacks.executor.shutdown()
+        self.runtime.runners.close()
+        self.runtime.executor.shutdown()
         for node in self.nodes:  # has been destroyed, as far as it could be
             untrack = getattr(node.context, "untrack_node", None)
             if untrack is not None:  # from ROS 2 Kilted on, a shutdown destroys nodes once more
@@ -139,7 +139,7 @@ class World:
 
     def plan(self, entries: Sequence[JobEntry], start_ns: int) -> None:
         """Register the mains before the first begins: one that ends must know of later ones."""
-        programs = self.stacks.programs
+        programs = self.runtime.programs
         programs.all = [
             SimulatedProgram(programs, entry)
             for entry in entries
@@ -150,7 +150,7 @@ class World:
     @contextmanager
     def importing(self) -> Iterator[None]:
         """Let objects that modules make at import (locks, threads) belong to the run."""
-        programs = self.stacks.programs
+        programs = self.runtime.programs
         programs.importing = True
         try:
             yield
@@ -172,7 +172,7 @@ class World:
 
     def switch_at_lines(self, loop: OrderedLoop, packages: frozenset[str]) -> None:
         """Switch threads at lines of user code; ``packages`` count as user code, too."""
-        self._stack.enter_context(switches_at_lines(self.stacks, loop, packages))
+        self._stack.enter_context(switches_at_lines(self.runtime, loop, packages))
 
     def show_log(self, severity: int, name: str, text: str) -> None:
         self._logs.show(severity, name, text)
@@ -187,34 +187,34 @@ class World:
 
         ``cause``: the event and output that it follows from.
         """
-        stacks = self.stacks
+        runtime = self.runtime
         self.constructed.append(entry)
         if entry.program is not None:
             self.start_process(entry, cause)
-            return stacks.loop.stopped is None
+            return runtime.loop.stopped is None
         if entry.argv is not None:
-            program = next(one for one in stacks.programs.all if one.entry is entry)
-            begin_program(stacks, program, cause)
-            return stacks.loop.stopped is None
+            program = next(one for one in runtime.programs.all if one.entry is entry)
+            begin_program(runtime, program, cause)
+            return runtime.loop.stopped is None
 
         def build() -> None:
             made = entry.make()
             for node in made if isinstance(made, (list, tuple)) else [made]:
                 self._adopt(node, entry.name)
-            stacks.programs.tell("started", entry.key)
+            runtime.programs.tell("started", entry.key)
 
         def construct() -> None:
             event = ConstructionEvent(lambda: f"constructing {entry.name}", entry)
-            stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build, cause)
+            runtime.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build, cause)
             # The stack that switched here goes on: this function, or the loop after a wait.
-            stacks.runners.step_aside()
+            runtime.runners.step_aside()
 
         # If a constructor blocks (on a service, say), the others are constructed meanwhile.
-        stacks.programs.constructing = entry
-        stacks.runners.waiting.append(getcurrent())
+        runtime.programs.constructing = entry
+        runtime.runners.waiting.append(getcurrent())
         greenlet(construct).switch()
-        stacks.programs.constructing = None
-        return stacks.loop.stopped is None
+        runtime.programs.constructing = None
+        return runtime.loop.stopped is None
 
     def run_outside(self, name: str, kind: EventKind, body: Callable[[], object]) -> None:
         """Run ``body`` as one event that is no entity's callback."""
@@ -231,7 +231,7 @@ class World:
         if is_unmade(node):
             raise RunError(f"{constructor_of(node)} has not called super().__init__(name)")
         self.nodes.append(node)
-        self.stacks.executor.add_node(node)
+        self.runtime.executor.add_node(node)
 
     def all_nodes(self) -> list[Any]:
         """Return the rclpy nodes, in the order of their construction."""
@@ -244,7 +244,7 @@ class World:
 
     def renew(self, program: SimulatedProgram) -> None:
         """Prepare a crashed main to be started again."""
-        programs = self.stacks.programs
+        programs = self.runtime.programs
         new = SimulatedProgram(programs, program.entry)
         programs.all[programs.all.index(program)] = new
         self._terminals.hand_over(program, new)
@@ -267,19 +267,19 @@ class World:
         The loop never runs on this stack, so no callback can block it. If the loop runs out of
         events while a call still waits, that is a deadlock.
         """
-        stacks, outcome = self.stacks, self.domain.outcome
-        runners, ending = stacks.runners, stacks.ending
+        runtime, outcome = self.runtime, self.domain.outcome
+        runners, ending = runtime.runners, runtime.ending
         runners.next().switch()
-        stacks.programs.leave()  # it may have ended between two programs
-        if stacks.loop.stopped is None and runners.error is None:
+        runtime.programs.leave()  # it may have ended between two programs
+        if runtime.loop.stopped is None and runners.error is None:
             return  # paused
-        outcome.note_end(stacks.loop.events)
+        outcome.note_end(runtime.loop.events)
         if outcome.error is None:
-            note_waits(stacks, outcome)
-        note_replaced_functions(stacks, hosted=bool(self.nodes))
+            note_waits(runtime, outcome)
+        note_replaced_functions(runtime, hosted=bool(self.nodes))
         self.parameters = parameters_of(self.domain.graph)
-        end_programs(stacks)
-        end_blocked(stacks)
+        end_programs(runtime)
+        end_blocked(runtime)
         if runners.error is not None:
             raise runners.error
         if ending.stuck and outcome.error is None:
@@ -287,32 +287,32 @@ class World:
 
     def waiting(self) -> str:
         """Describe the deadlock: which call waits for what."""
-        return _deadlock(self.stacks.who_waits())
+        return _deadlock(self.runtime.who_waits())
 
     def blocked(self) -> list[str]:
         """Describe the blocked calls that may not wait for ever."""
-        return [one.waits_for() for one in self.stacks.runners.blocked if not one.is_patient()]
+        return [one.waits_for() for one in self.runtime.runners.blocked if not one.is_patient()]
 
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
-        stacks, outcome = self.stacks, self.domain.outcome
-        outcome.note_end(stacks.loop.events)
-        end_programs(stacks)
-        end_blocked(stacks)  # constructors that still wait, if the run never began
+        runtime, outcome = self.runtime, self.domain.outcome
+        outcome.note_end(runtime.loop.events)
+        end_programs(runtime)
+        end_blocked(runtime)  # constructors that still wait, if the run never began
         for node in self.nodes:
-            stacks.ending.shutdown_ns = 0
+            runtime.ending.shutdown_ns = 0
             handle = node.handle
             if handle.destroyed or outcome.error is not None:
                 continue
             event = OutsideEvent(handle.describe)
-            stacks.dispatcher.run_outside(
+            runtime.dispatcher.run_outside(
                 event, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node
             )
 
     @property
     def exit_code(self) -> int:
         """The first exit status other than 0 with which a main ended."""
-        return next((p.exit_code for p in self.stacks.programs.all if p.exit_code), 0)
+        return next((p.exit_code for p in self.runtime.programs.all if p.exit_code), 0)
 
     @property
     def error(self) -> RunError | None:

@@ -16,8 +16,8 @@ from rsltrace.native.fit.comparison import (
     SampleComparison,
     mismatched_percentiles,
 )
+from rsltrace.native.fit.fitted_job import Fit, time_text
 from rsltrace.native.fit.models import DurationModel, as_job_has_it
-from rsltrace.native.fit.parts import Fit, time_text
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.words.phrases import table
 

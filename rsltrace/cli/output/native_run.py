@@ -18,7 +18,7 @@ from rsltrace.trace.model.texts import format_duration, format_seconds
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
-    from rsltrace.native.recording import NativeResult
+    from rsltrace.native.native_run import NativeResult
     from rsltrace.simulation.loop.stop import Stop
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.calls import CallSite, find_calls
 from rsltrace.guard.audit.names import NameResolver
-from rsltrace.guard.audit.rules import AuditFinding, AuditReport
+from rsltrace.guard.audit.report import AuditFinding, AuditReport
 from rsltrace.guard.audit.scopes import ModuleSource, NameScope, parse_scopes
 from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of

@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.checks.latency.instances import Durations
+from rsltrace.native.fit.fitted_job import Fit
 from rsltrace.native.fit.models import DurationModel
-from rsltrace.native.fit.parts import Fit
 from rsltrace.trace.model.texts import printable
 
 Numbers = npt.NDArray[np.float64]

@@ -11,8 +11,8 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.parts.scheduling import EntityExecutionSpec, ExecutionSpec
 from rsltrace.native.timing.bounds import bounds, utilization
+from rsltrace.native.timing.chains import ChainKey, ObservedChains
 from rsltrace.native.timing.model import ProcessorModel, longest_times, system_of
-from rsltrace.native.timing.observed import ChainKey, ObservedChains
 from rsltrace.native.timing.system import ONCE_NS, CallbackKey
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
+from rsltrace.native.timing.chains import ChainPath, ObservedChains
 from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
-from rsltrace.native.timing.observed import ChainPath, ObservedChains
 from rsltrace.native.timing.system import (
     ONCE_NS,
     CallbackKey,

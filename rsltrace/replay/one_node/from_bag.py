@@ -223,7 +223,7 @@ def _sides(trace: Trace, ends: NodeTopics, bags: Sequence[Path]) -> tuple[NodeOu
 
 
 def _read(path: Path, topics: list[str], side: BagOutputs, headers: dict[str, bool]) -> None:
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
 
     counts: dict[Key, int] = {}
     with open_bag(path, topics=topics, recover=True, skip=never_plays) as bag:

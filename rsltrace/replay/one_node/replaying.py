@@ -211,7 +211,7 @@ class NodeReplaySession(Session):
         last = 0
         with self._failures(), self._engaged():
             world.plan(self._entries, self.start_ns)
-            world.stacks.programs.fed = True
+            world.runtime.programs.fed = True
             for place, event in enumerate(self._columns.constructions):
                 entry = entries.get(unit.entry_of(place))
                 if self._starts_later(unit.entry_of(place)):

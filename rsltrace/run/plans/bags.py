@@ -194,7 +194,7 @@ def check_type(bag: str, topic: BagTopic) -> type:
 
     :raises BagError: if its type is not installed.
     """
-    from rsltrace.adapters.rclpy.wire.interfaces import get_message_class
+    from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 
     try:
         return get_message_class(topic.type_name)
@@ -222,8 +222,8 @@ def start_players(
     from rclpy.node import Node
 
     from rsltrace.adapters.player import Player, make_publisher
-    from rsltrace.adapters.rclpy.wire.codec import codec_for
-    from rsltrace.adapters.rclpy.wire.interfaces import get_message_class, message_type
+    from rsltrace.adapters.rclpy.messages.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.interfaces import get_message_class, message_type
 
     domain = world.domain
     faults = BagFaults(job, is_open=is_open)

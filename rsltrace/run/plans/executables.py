@@ -20,7 +20,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 from rsltrace.adapters.processes.build import is_compiled, is_python, why_not_run
-from rsltrace.adapters.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
+from rsltrace.adapters.rclpy.boundary.boundary import NeedsItsProcess, before_its_process
 from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.hints import cannot_import, import_raised
 from rsltrace.adapters.workspace.imports import (

@@ -10,9 +10,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interface_classes import class_of
-from rsltrace.adapters.rclpy.wire.message_spec import (
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interface_classes import class_of
+from rsltrace.adapters.rclpy.messages.message_spec import (
     ArrayType,
     FieldType,
     ItemType,
@@ -21,7 +21,7 @@ from rsltrace.adapters.rclpy.wire.message_spec import (
     StringType,
     message_spec,
 )
-from rsltrace.adapters.rclpy.wire.message_spec import (
+from rsltrace.adapters.rclpy.messages.message_spec import (
     SequenceType as SequenceType,
 )
 from rsltrace.errors import BagError, did_you_mean

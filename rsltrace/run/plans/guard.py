@@ -36,8 +36,13 @@ from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.simulation.middleware.events.event import CurrentEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.trace.format import METADATA_GUARD
-from rsltrace.trace.guarded import counts_text
-from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, NondeterminismSource
+from rsltrace.trace.model.finding import (
+    Finding,
+    GuardCount,
+    GuardMode,
+    NondeterminismSource,
+    counts_text,
+)
 from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
@@ -102,7 +107,7 @@ class RunGuard:
         job = self._job
         if job.guard.enabled:
             self.guard = Guard(
-                GuardContext(world.stacks, world.clocks),
+                GuardContext(world.runtime, world.clocks),
                 policy=policy_of(job.guard),
                 seed=job.seed,
                 packages=node_packages(job.nodes),

@@ -11,6 +11,7 @@ from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 
+from rsltrace.adapters.processes.adapter import ProcessAdapter, ProcessProgram, TypeLookup
 from rsltrace.adapters.processes.build import (
     PreloadLibrary,
     interpreter,
@@ -20,10 +21,9 @@ from rsltrace.adapters.processes.build import (
     program,
     why_not_run,
 )
-from rsltrace.adapters.processes.door import ProcessAdapter, ProcessProgram, TypeLookup
 from rsltrace.adapters.rclpy.arguments import RosArguments
 from rsltrace.adapters.rclpy.entry import JobEntry
-from rsltrace.adapters.rclpy.wire.interfaces import (
+from rsltrace.adapters.rclpy.messages.interfaces import (
     get_message_class,
     message_type,
 )
@@ -206,8 +206,8 @@ def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
 def make_process_adapter(job: Job, world: World) -> ProcessAdapter:
     """Return the adapter through which a job's processes take part in its world."""
     interfaces = TypeLookup(_message_type, _service_type)
-    door = ProcessAdapter(world.domain, interfaces, seed=job.seed, log=world.show_log)
-    programs = world.stacks.programs
+    adapter = ProcessAdapter(world.domain, interfaces, seed=job.seed, log=world.show_log)
+    programs = world.runtime.programs
     restarts: Counter[str] = Counter()
 
     def ended(key: str) -> None:
@@ -220,15 +220,15 @@ def make_process_adapter(job: Job, world: World) -> ProcessAdapter:
             restarts[key] += 1
             world.starts.add_at(entry, world.domain.loop.now_ns + delay_ns)
 
-    door.on_end = ended
-    door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
+    adapter.on_end = ended
+    adapter.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
 
     if any(rule.advances or rule.model != ClockModel() for rule in clock_rules(job)):
-        door.clock = lambda node, looks: _shown(world, node, looks)
+        adapter.clock = lambda node, looks: _shown(world, node, looks)
 
     def start(entry: JobEntry, cause: tuple[int, int]) -> None:
         assert isinstance(entry.program, ProcessProgram)
-        door.start(
+        adapter.start(
             entry.program,
             name=entry.name,
             key=entry.key,
@@ -238,4 +238,4 @@ def make_process_adapter(job: Job, world: World) -> ProcessAdapter:
         )
 
     world.start_process = start
-    return door
+    return adapter

@@ -206,4 +206,4 @@ def stop_with(world: World, entries: Sequence[JobEntry]) -> None:
             loop.stop(Stop(f"{key} has ended, which the run requires"))
 
     if required:
-        world.stacks.programs.listeners.append(told)
+        world.runtime.programs.listeners.append(told)

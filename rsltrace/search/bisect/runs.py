@@ -12,8 +12,7 @@ from pathlib import Path
 from rsltrace.child_processes import OWN_FOLDER, Processes, rsltrace_command
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import BisectError, ConditionError
-from rsltrace.search.bisect.repository import GitRepository
-from rsltrace.search.bisect.worktree import Worktree
+from rsltrace.search.bisect.repository import GitRepository, Worktree
 from rsltrace.search.perturb import (
     Perturbation,
     PerturbedRun,

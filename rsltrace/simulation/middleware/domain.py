@@ -40,8 +40,8 @@ class Domain:
         self.outcome = self.dispatcher.outcome
         self.transport = Transport(self.dispatcher)
         self.graph = Graph()
-        self._door = RunEndingExceptionHandler(self.dispatcher)
-        self.dispatcher.door = self._door
+        self._exception_handler = RunEndingExceptionHandler(self.dispatcher)
+        self.dispatcher.exception_handler = self._exception_handler
 
     def watch(self, topic: str, watcher: Watcher) -> None:
         """Call ``watcher(publisher, canonical bytes)`` for every message on a topic."""
@@ -60,10 +60,12 @@ class Domain:
         return found
 
     def join(
-        self, name: str, namespace: str = "/", door: ExceptionHandler | None = None
+        self, name: str, namespace: str = "/", exception_handler: ExceptionHandler | None = None
     ) -> Participant:
-        """Make a participant. Without a ``door`` of its own, an exception ends the run."""
-        participant = Participant(self.dispatcher, name, namespace, door or self._door)
+        """Make a participant. An exception ends the run unless ``exception_handler`` handles it."""
+        participant = Participant(
+            self.dispatcher, name, namespace, exception_handler or self._exception_handler
+        )
         self.graph.add_node(participant)
         return participant
 

@@ -78,7 +78,8 @@ _ENTITIES_PER_NODE_MAX = 1 << 20
 class Participant(DomainEntity):
     """A node.
 
-    ``door`` handles its exceptions. ``process`` is set if its process may end before the run.
+    ``exception_handler`` handles its exceptions. ``process`` is set if its process may end before
+    the run.
     ``number`` distinguishes nodes of the same name, in order of creation.
     """
 
@@ -89,14 +90,14 @@ class Participant(DomainEntity):
     number = 1
 
     def __init__(
-        self, dispatcher: Dispatcher, name: str, namespace: str, door: ExceptionHandler
+        self, dispatcher: Dispatcher, name: str, namespace: str, exception_handler: ExceptionHandler
     ) -> None:
         super().__init__(dispatcher, None)
         self.node = self
         self.name = name
         self.namespace = namespace
         self.fully_qualified_name = full_name(namespace, name)
-        self.door = door
+        self.exception_handler = exception_handler
         self.state: ParticipantState | None = None
         self.actions: list[ActionEndpoint] = []
         self.timers: list[Timer] = []

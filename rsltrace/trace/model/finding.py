@@ -4,10 +4,66 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from enum import Enum
 
+from rsltrace.errors import TraceError
 from rsltrace.trace.model.texts import printable
+
+# Messages that full queues dropped in a run, as a trace records them.
+
+_DROP_KEPT = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class QueueDrops:
+    """How many messages a full queue of ``depth`` dropped: that of the receiving entity or,
+    ``in_outage``, that of a publisher that could not reach it."""
+
+    entity: int
+    depth: int
+    count: int
+    in_outage: bool = False
+
+
+def encode_drops(drops: Iterable[QueueDrops]) -> dict[str, str]:
+    """Return the entry of a run's result for its drops."""
+    kept = [astuple(one) for one in drops][:_DROP_KEPT]
+    return {"drops": json.dumps(kept)} if kept else {}
+
+
+def decode_drops(result: Mapping[str, str]) -> list[QueueDrops]:
+    """Return the drops of a result; none if another program wrote them."""
+    try:
+        return [
+            QueueDrops(int(entity), int(depth), int(count), bool(in_outage))
+            for entity, depth, count, in_outage in json.loads(result.get("drops", "[]"))
+        ]
+    except (ValueError, TypeError):
+        return []
+
+
+# The guard's call counts, as in the metadata ``rsltrace:guard``.
+
+
+def counts_text(counts: Iterable[GuardCount]) -> str:
+    """Return the counts as sorted JSON."""
+    rows = [[c.source.value, c.mode.value, c.node, c.call, c.count] for c in counts]
+    return json.dumps(sorted(rows), ensure_ascii=False)
+
+
+def parse_counts(text: str) -> tuple[GuardCount, ...]:
+    """Return the counts of ``counts_text``. Raises TraceError for anything else."""
+    try:
+        return tuple(
+            GuardCount(
+                NondeterminismSource(source), GuardMode(mode), str(node), str(call), int(count)
+            )
+            for source, mode, node, call, count in json.loads(text)
+        )
+    except (ValueError, TypeError, RecursionError) as error:
+        raise TraceError(f"the guard's summary in the trace cannot be read: {error}") from error
+
 
 # Functions of rclpy that no simulation calls, because the loop does their work. Code that replaces
 # one (a monitoring library) is never called; ``record`` and ``audit`` report it.

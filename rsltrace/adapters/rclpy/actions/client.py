@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partialmethod
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.parts import (
+from rsltrace.adapters.rclpy.actions.action_handle import (
     ActionHandle,
     ActionServiceClient,
     ActionSubscriptionHandle,

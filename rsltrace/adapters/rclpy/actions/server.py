@@ -8,11 +8,16 @@ from __future__ import annotations
 from functools import partialmethod
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.parts import ACTION, ActionHandle, ActionService, GoalHandle
+from rsltrace.adapters.rclpy.actions.action_handle import (
+    ACTION,
+    ActionHandle,
+    ActionService,
+    GoalHandle,
+)
+from rsltrace.adapters.rclpy.concurrency.tasks import start_coroutine
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
-from rsltrace.adapters.rclpy.stacks.tasks import start_coroutine
-from rsltrace.adapters.rclpy.wire.codec import codec_for
+from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.simulation.middleware.services import RequestId
 from rsltrace.trace.model.event import NO_EVENT
@@ -147,19 +152,19 @@ class ActionServerHandle(ActionHandle):
 
     def notify_goal_done(self) -> None:
         """Schedule the expiry of the results of finished goals."""
-        now_ns = self.stacks.loop.now_ns
+        now_ns = self.runtime.loop.now_ns
         for goal in self.goals.values():
             if not goal.is_active() and goal.done_ns is None:
                 goal.done_ns = now_ns
                 if self._timeout_ns is not None:
-                    self.stacks.loop.schedule(now_ns + self._timeout_ns, self._expiry.wake)
+                    self.runtime.loop.schedule(now_ns + self._timeout_ns, self._expiry.wake)
 
     def expire_goals(self, most: int) -> tuple[Any, ...]:
         """Forget expired goals; return their infos."""
         timeout_ns = self._timeout_ns
         if timeout_ns is None:
             return ()
-        oldest_ns = self.stacks.loop.now_ns - timeout_ns
+        oldest_ns = self.runtime.loop.now_ns - timeout_ns
         gone = [
             goal_id
             for goal_id, goal in self.goals.items()
@@ -196,7 +201,7 @@ class _Expiry:
 
     def wake(self) -> None:
         if not self._server.destroyed:
-            self._server.stacks.loop.ready.append(self)
+            self._server.runtime.loop.ready.append(self)
 
     def dispatch(self) -> None:
         server = self._server
@@ -204,10 +209,10 @@ class _Expiry:
         if mailbox is not None and mailbox.keeps(self):
             return
         self.wrapper = server.find_waitable()
-        if self.wrapper is None or server.stacks.groups.must_wait(self, self.wrapper):
+        if self.wrapper is None or server.runtime.groups.must_wait(self, self.wrapper):
             return
         handle: Any = self  # has what start_coroutine needs, but no place in the trace of its own
-        start_coroutine(server.stacks, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
+        start_coroutine(server.runtime, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
 
     def runnable(self) -> Runnable:
         told = self.node.mailbox is not None

@@ -7,15 +7,16 @@ exceptions, name validation, QoS structures, time points, log levels.
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from rsltrace.adapters.rclpy.actions.action_handle import GoalHandle
 from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
-from rsltrace.adapters.rclpy.actions.parts import GoalHandle
 from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
-from rsltrace.adapters.rclpy.boundary.early_init import check_process
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable, set_invalid_handle
@@ -32,9 +33,8 @@ from rsltrace.adapters.rclpy.handles.services import (
 )
 from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
+from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
-from rsltrace.adapters.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
@@ -46,6 +46,49 @@ from rsltrace.simulation.middleware.qos.status import (
 )
 from rsltrace.simulation.middleware.services import RequestId, ServiceEndpoint, ServiceInfo
 from rsltrace.simulation.middleware.subscription import Subscription
+
+# Mains whose module calls ``rclpy.init()`` at import.
+#
+# The modules of mains are imported before the run, so that errors in a job name its line. They
+# have no simulated process then, and so no context to initialize: such a module is imported again
+# by its program.
+
+
+class NeedsItsProcess(BaseException):
+    """A module uses rclpy's contexts at import. No ``Exception``, so that user code does not catch
+    it."""
+
+
+_without_process = False
+
+
+@contextmanager
+def before_its_process() -> Iterator[None]:
+    """Import the module of a main before its program begins.
+
+    :raises NeedsItsProcess: if the module initializes a context, or uses the default one.
+    """
+    global _without_process
+    import rclpy.utilities
+
+    values = vars(rclpy.utilities)
+    context, values["g_default_context"] = values["g_default_context"], None
+    _without_process = True
+    try:
+        yield
+        has_asked = values["g_default_context"] is not None
+    finally:
+        _without_process = False
+        values["g_default_context"] = context
+    if has_asked:
+        raise NeedsItsProcess
+
+
+def check_process() -> None:
+    """Raise ``NeedsItsProcess`` if there is no simulated process to initialize yet."""
+    if _without_process:
+        raise NeedsItsProcess
+
 
 _PASSED_THROUGH = (
     # enums and structures
@@ -76,7 +119,7 @@ _PASSED_THROUGH = (
 class BoundaryContext:
     """What the boundary needs from a world; ``clocks`` is None if all show simulated time."""
 
-    stacks: Runtime
+    runtime: Runtime
     logs: RosoutLogs
     states: NodeStates
     clocks: NodeClocks | None = None
@@ -117,8 +160,8 @@ class RclpyBoundary:
         return self._world
 
     @property
-    def stacks(self) -> Runtime:
-        return self.world.stacks
+    def runtime(self) -> Runtime:
+        return self.world.runtime
 
     @property
     def is_free(self) -> bool:
@@ -127,14 +170,14 @@ class RclpyBoundary:
 
     def now_ns(self) -> int:
         """Return simulated time, or the last one between runs."""
-        return self._last_now_ns if self._world is None else self._world.stacks.loop.now_ns
+        return self._last_now_ns if self._world is None else self._world.runtime.loop.now_ns
 
     def shown_ns(self, owner: str | None) -> int:
         """Return what the clock of a node shows (None: of the node that runs)."""
         world = self._world
         if world is None or world.clocks is None:
             return self.now_ns()
-        return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
+        return world.clocks.shows(owner or self.current_node_name(), world.runtime.loop.now_ns)
 
     def follows(self, owner: str | None) -> bool:
         """Return whether /clock drives the ROS time of a node."""
@@ -146,11 +189,11 @@ class RclpyBoundary:
         world = self._world
         if world is None or world.clocks is None:
             return self.now_ns()
-        return world.clocks.look(owner or self.current_node_name(), world.stacks.loop.now_ns)
+        return world.clocks.look(owner or self.current_node_name(), world.runtime.loop.now_ns)
 
     def current_node_name(self) -> str | None:
         """Return the name of the node whose callback or constructor runs."""
-        node = self._world.stacks.event.node if self._world is not None else None
+        node = self._world.runtime.event.node if self._world is not None else None
         return None if node is None else str(node.fully_qualified_name)
 
     def enter(self, world: BoundaryContext) -> None:
@@ -176,12 +219,12 @@ class RclpyBoundary:
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         check_process()
         try:
-            context = ContextHandle(self.real, self.stacks, arguments, domain_id)
+            context = ContextHandle(self.real, self.runtime, arguments, domain_id)
         except UnknownArgumentsError as error:
             raise self.real.UnknownROSArgsError(str(error)) from error
         except InvalidArgumentsError as error:
             raise self.real.RCLInvalidROSArgsError(str(error)) from error
-        programs = self.stacks.programs
+        programs = self.runtime.programs
         if programs.main_context is None:
             programs.main_context = context
         return context
@@ -199,7 +242,7 @@ class RclpyBoundary:
         world = self.world
         return NodeHandle(
             self.real,
-            world.stacks,
+            world.runtime,
             world.logs,
             world.states,
             name,
@@ -235,12 +278,12 @@ class RclpyBoundary:
     ) -> TimerHandle:
         context.require("failed to create timer")
         if clock.follows:
-            return RosTimerHandle(self.real, context.stacks, clock, period_ns, autostart)
-        return TimerHandle(self.real, context.stacks, period_ns, autostart)
+            return RosTimerHandle(self.real, context.runtime, clock, period_ns, autostart)
+        return TimerHandle(self.real, context.runtime, period_ns, autostart)
 
     def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
         context.require("failed to create guard_condition")
-        return GuardConditionHandle(context.stacks)
+        return GuardConditionHandle(context.runtime)
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
         return EventHandle(parent, event_type)

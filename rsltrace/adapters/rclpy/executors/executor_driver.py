@@ -11,17 +11,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from rsltrace.adapters.rclpy.executors.standby import FinishedTask, Standby, standby_of
-from rsltrace.adapters.rclpy.handles.wait_set import activate_node
-from rsltrace.adapters.rclpy.stacks.blocking_calls import (
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import (
     POLL_NS,
     count_refused_wait,
     suspended_event,
     wait,
 )
-from rsltrace.adapters.rclpy.stacks.callback_groups import begin, is_busy, is_custom
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox, describe_awaited
-from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
+from rsltrace.adapters.rclpy.concurrency.callback_groups import begin, is_busy, is_custom
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox, describe_awaited
+from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
+from rsltrace.adapters.rclpy.executors.standby import FinishedTask, Standby, standby_of
+from rsltrace.adapters.rclpy.handles.wait_set import activate_node
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.middleware.graph import Graph
@@ -32,16 +32,16 @@ _WORK = "work for its executor"
 class ExecutorDriver:
     """Feeds one executor of user code with the callbacks that are ready."""
 
-    def __init__(self, stacks: Runtime, executor: Any) -> None:
+    def __init__(self, runtime: Runtime, executor: Any) -> None:
         from rclpy import executors
         from rclpy.utilities import timeout_sec_to_nsec
 
-        self.stacks = stacks
+        self.runtime = runtime
         self.executor = executor
         self._rclpy: Any = executors
         self._in_ns: Any = timeout_sec_to_nsec
         self.nodes: dict[Any, Mailbox] = {}
-        self.tasks = Mailbox(stacks.loop)
+        self.tasks = Mailbox(runtime.loop)
         self.tasks.driver = self
         self.waits: list[BlockedCall] = []
         self.standby: Standby | None = None
@@ -49,14 +49,14 @@ class ExecutorDriver:
         self.woken = False
         """Whether there was a reason to look again."""
         self._looked_ns = -1
-        self._name = f"executor {stacks.loop.next_place()}"
+        self._name = f"executor {runtime.loop.next_place()}"
         self._asked: tuple[Any, ...] = ()
 
     def add(self, node: Any) -> None:
         """Run a node's callbacks whenever the executor spins."""
         handle = node.handle
         if handle.mailbox is None:
-            handle.mailbox = Mailbox(self.stacks.loop)
+            handle.mailbox = Mailbox(self.runtime.loop)
         handle.mailbox.driver = self
         self.nodes[node] = handle.mailbox
         if handle.wrapper is not node:
@@ -96,9 +96,9 @@ class ExecutorDriver:
         :raises: rclpy's exceptions for a timeout, a shutdown, or a condition that is met.
         """
         executors = self._rclpy
-        self.stacks.programs.present.spun = True
+        self.runtime.programs.present.spun = True
         timeout_ns: int = self._in_ns(getattr(timeout, "timeout", timeout))
-        loop = self.stacks.loop
+        loop = self.runtime.loop
         until_ns = None if timeout_ns < 0 else loop.now_ns + timeout_ns
         looked = False
         if isinstance(loop, OrderedLoop) and loop.polls:
@@ -111,17 +111,17 @@ class ExecutorDriver:
             if condition():
                 raise executors.ConditionReachedException
             if not self.executor.context.ok():
-                if self.stacks.ending.closing:
-                    count_refused_wait(self.stacks)
+                if self.runtime.ending.closing:
+                    count_refused_wait(self.runtime)
                 raise executors.ExternalShutdownException
             taken = self._take(nodes)
             if taken is not None:
                 return self._handler(*taken)
             has_limit = until_ns is not None
-            standby = standby_of(self.stacks, self, nodes, condition, has_limit=has_limit)
+            standby = standby_of(self.runtime, self, nodes, condition, has_limit=has_limit)
             if until_ns is None:
-                patient = _is_always(condition) and not self.stacks.dispatcher.in_callback()
-                graph = self.stacks.domain.graph
+                patient = _is_always(condition) and not self.runtime.dispatcher.in_callback()
+                graph = self.runtime.domain.graph
                 what = _WORK if _is_always(condition) else _AwaitedFuture(graph, condition)
                 self._wait(None, what=what, patient=patient, standby=standby)
             elif loop.now_ns < until_ns:
@@ -136,7 +136,7 @@ class ExecutorDriver:
 
     def _look_ns(self) -> int:
         """Return how long a poll takes: 0 for the first one at an instant."""
-        now_ns = self.stacks.loop.now_ns
+        now_ns = self.runtime.loop.now_ns
         again, self._looked_ns = self._looked_ns == now_ns, now_ns
         return POLL_NS if again else 0
 
@@ -151,17 +151,17 @@ class ExecutorDriver:
         self.woken = True
         until = self.waits.append if standby is None else standby.begin
         serve = None if standby is None else standby.serve
-        stacks = self.stacks
-        wait(stacks, what, until=until, for_ns=for_ns, quiet=True, patient=patient, serve=serve)
+        runtime = self.runtime
+        wait(runtime, what, until=until, for_ns=for_ns, quiet=True, patient=patient, serve=serve)
         if standby is not None and self.standby is standby:
             self.standby = None
-        self.waits = [blocked for blocked in self.waits if blocked in self.stacks.runners.blocked]
+        self.waits = [blocked for blocked in self.waits if blocked in self.runtime.runners.blocked]
 
     def _take(self, nodes: list[Any] | None) -> tuple[Any, Mailbox, Dispatchable] | None:
         """Take the next item: tasks first, as in rclpy, then in order of arrival; or the policy's
         choice, if the policy polls."""
-        if isinstance(self.stacks.loop, OrderedLoop) and self.stacks.loop.polls:
-            return self._choose(self.stacks.loop, nodes)
+        if isinstance(self.runtime.loop, OrderedLoop) and self.runtime.loop.polls:
+            return self._choose(self.runtime.loop, nodes)
         if self.tasks.entries:
             return None, self.tasks, self.tasks.entries.popleft()[1]
         while True:
@@ -215,7 +215,7 @@ class ExecutorDriver:
             if mailbox.driver is not None:
                 mailbox.driver.wake()
 
-        self.stacks.groups.park(group, item, retry)
+        self.runtime.groups.park(group, item, retry)
         return True
 
     def _handler(self, node: Any, mailbox: Mailbox, item: Any) -> tuple[Any, Any, Any]:
@@ -224,13 +224,13 @@ class ExecutorDriver:
 
     def _run(self, mailbox: Mailbox, item: Dispatchable) -> None:
         """Run one callback as an event, on the spinning stack."""
-        stacks = self.stacks
-        stacks.event.took_ns = 0
-        with suspended_event(stacks):
+        runtime = self.runtime
+        runtime.event.took_ns = 0
+        with suspended_event(runtime):
             mailbox.run(item)
         failure, mailbox.raised = mailbox.raised, None
-        if stacks.event.took_ns:
-            self._be_busy(item, stacks.event.took_ns)
+        if runtime.event.took_ns:
+            self._be_busy(item, runtime.event.took_ns)
         if failure is not None:
             raise failure
 
@@ -242,10 +242,10 @@ class ExecutorDriver:
         if held:
             begin(group, wrapper)
         try:
-            wait(self.stacks, "a callback to be over", for_ns=for_ns, quiet=True)
+            wait(self.runtime, "a callback to be over", for_ns=for_ns, quiet=True)
         finally:
             if held:
-                self.stacks.groups.end(group, wrapper)
+                self.runtime.groups.end(group, wrapper)
 
 
 class _AwaitedFuture:
@@ -269,8 +269,8 @@ def _is_always(condition: Callable[[], bool]) -> bool:
     return getattr(condition, "__name__", "") == "<lambda>"
 
 
-def driver_of(stacks: Runtime, executor: Any) -> ExecutorDriver:
+def driver_of(runtime: Runtime, executor: Any) -> ExecutorDriver:
     driver: ExecutorDriver | None = executor.__dict__.get("_rsltrace_driver")
-    if driver is None or driver.stacks is not stacks:
-        driver = executor.__dict__["_rsltrace_driver"] = ExecutorDriver(stacks, executor)
+    if driver is None or driver.runtime is not runtime:
+        driver = executor.__dict__["_rsltrace_driver"] = ExecutorDriver(runtime, executor)
     return driver

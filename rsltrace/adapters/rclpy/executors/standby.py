@@ -18,10 +18,10 @@ from typing import Any, NamedTuple, Protocol
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy, is_custom
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
+from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
-from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy, is_custom
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.simulation.loop.loop import Dispatchable, EventLoop
 from rsltrace.simulation.loop.timer_queue import CreationOrderQueue
 from rsltrace.simulation.middleware.events.event import OutsideEvent
@@ -40,15 +40,15 @@ class Standby:
     """One spinning stack. ``future`` is what it spins for (None: for ever). With ``once`` the spin
     goes on after each callback."""
 
-    def __init__(self, stacks: Runtime, driver: StandbyOwner, future: Any, *, once: bool) -> None:
-        self._stacks = stacks
-        self._loop = stacks.loop
-        self._dispatcher = stacks.dispatcher
-        self._event = stacks.event
-        self._programs = stacks.programs
-        self._runners = stacks.runners
-        self._waiting = stacks.runners.waiting
-        self._all_blocked = stacks.runners.blocked
+    def __init__(self, runtime: Runtime, driver: StandbyOwner, future: Any, *, once: bool) -> None:
+        self._runtime = runtime
+        self._loop = runtime.loop
+        self._dispatcher = runtime.dispatcher
+        self._event = runtime.event
+        self._programs = runtime.programs
+        self._runners = runtime.runners
+        self._waiting = runtime.runners.waiting
+        self._all_blocked = runtime.runners.blocked
         self._driver = driver
         self._context = driver.executor.context.handle
         self._future = future
@@ -179,7 +179,7 @@ def _is_free(item: Any) -> bool:
 
 
 def standby_of(
-    stacks: Runtime,
+    runtime: Runtime,
     driver: StandbyOwner,
     nodes: object,
     condition: Callable[[], bool],
@@ -190,14 +190,14 @@ def standby_of(
 
     ``has_limit``: the spin waits with a timeout.
     """
-    event = stacks.event
+    event = runtime.event
     if (
         nodes is not None
         or driver.waits
         or driver.standby is not None
-        or type(stacks.loop) is not EventLoop
-        or type(stacks.loop.timers) is not CreationOrderQueue
-        or stacks.dispatcher.resume_observers
+        or type(runtime.loop) is not EventLoop
+        or type(runtime.loop.timers) is not CreationOrderQueue
+        or runtime.dispatcher.resume_observers
         or event.on_end is not None
         or not isinstance(event.handle, OutsideEvent)
         or _get_running_loop() is not None
@@ -215,7 +215,7 @@ def standby_of(
     while frame is not None and frame.f_code in own.turns:
         frame = frame.f_back
     is_endless = not has_limit and frame is not None and frame.f_code in own.spins
-    return Standby(stacks, driver, future, once=not is_endless)
+    return Standby(runtime, driver, future, once=not is_endless)
 
 
 class _RclpyCode(NamedTuple):

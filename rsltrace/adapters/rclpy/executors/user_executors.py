@@ -16,12 +16,12 @@ from pathlib import PurePath
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import count_refused_wait
+from rsltrace.adapters.rclpy.concurrency.coroutines import ResumeTask
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
+from rsltrace.adapters.rclpy.concurrency.tasks import create_task
 from rsltrace.adapters.rclpy.executors.executor_driver import driver_of
 from rsltrace.adapters.rclpy.handles.wait_set import sync_woken
-from rsltrace.adapters.rclpy.stacks.blocking_calls import count_refused_wait
-from rsltrace.adapters.rclpy.stacks.coroutines import ResumeTask
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
-from rsltrace.adapters.rclpy.stacks.tasks import create_task
 from rsltrace.guard.redirect import replace_attribute
 from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.simulation.middleware.interface import imported_file
@@ -40,14 +40,14 @@ _OWN = (
 
 
 @contextmanager
-def replaced_function_called(stacks: Runtime) -> Iterator[None]:
+def replaced_function_called(runtime: Runtime) -> Iterator[None]:
     """Run callbacks through the function that user code puts in place of ``await_or_execute``."""
     from rclpy import executors
 
     def look() -> None:
         through = getattr(executors, _THROUGH)
-        stacks.runs_callbacks = None if _is_rclpys(through) else through
-        for node in stacks.domain.graph.nodes:
+        runtime.runs_callbacks = None if _is_rclpys(through) else through
+        for node in runtime.domain.graph.nodes:
             wrapper = getattr(node, "wrapper", None)
             for one in [*wrapper.subscriptions, *wrapper.timers] if wrapper is not None else ():
                 one.handle.forget_callback()
@@ -68,13 +68,13 @@ def replaced_function_called(stacks: Runtime) -> Iterator[None]:
 
 
 def note_replaced_functions(
-    stacks: Runtime, executor: type | None = None, *, hosted: bool = False
+    runtime: Runtime, executor: type | None = None, *, hosted: bool = False
 ) -> None:
     """Report functions that user code replaced and that are never called.
 
     The bases of the class ``executor`` are checked, too. ``hosted``: the job constructs nodes.
     """
-    notes = stacks.domain.outcome.notes
+    notes = runtime.domain.outcome.notes
     found = [
         f"{_where(function)}: {kind.__qualname__}.{name} is never called, because rsltrace runs "
         "callbacks itself; replace rclpy.executors.await_or_execute instead, or wrap the callbacks"
@@ -121,27 +121,27 @@ def _where(function: Any) -> str:
 
 
 @contextmanager
-def own_executors(stacks: Runtime) -> Iterator[None]:
+def own_executors(runtime: Runtime) -> Iterator[None]:
     """Have rclpy's executors wait in simulated time within the ``with`` block."""
     from rclpy import executors
     from rclpy.executors import Executor
 
     made: list[weakref.ref[Executor]] = []
-    real = {name: getattr(Executor, name) for name in _methods(stacks, {}, made)}
+    real = {name: getattr(Executor, name) for name in _methods(runtime, {}, made)}
     modules = {
         "os": SimpleNamespace(
             sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
         ),
-        "time": SimpleNamespace(monotonic=lambda: stacks.loop.now_ns / 1_000_000_000),
+        "time": SimpleNamespace(monotonic=lambda: runtime.loop.now_ns / 1_000_000_000),
     }
     with ExitStack() as stack:
         stack.callback(_release, made)
         for name, value in modules.items():
             if hasattr(executors, name):
                 replace_attribute(stack, executors, name, value)
-        for name, method in _methods(stacks, real, made).items():
+        for name, method in _methods(runtime, real, made).items():
             replace_attribute(stack, Executor, name, method)
-        stack.enter_context(replaced_function_called(stacks))
+        stack.enter_context(replaced_function_called(runtime))
         yield
 
 
@@ -157,7 +157,7 @@ def _release(made: list[weakref.ref[Any]]) -> None:
 
 
 def _methods(
-    stacks: Runtime, real: dict[str, Any], made: list[weakref.ref[Any]]
+    runtime: Runtime, real: dict[str, Any], made: list[weakref.ref[Any]]
 ) -> dict[str, Callable[..., Any]]:
     """Return the replacements of ``Executor`` methods. ``real`` are the originals; executors that
     are made are added to ``made``."""
@@ -165,45 +165,47 @@ def _methods(
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real["__init__"](self, *args, **kwargs)
         made.append(weakref.ref(self))
-        note_replaced_functions(stacks, type(self))
+        note_replaced_functions(runtime, type(self))
         for guard in (self._guard, getattr(self, "_sigint_gc", None)):
-            pending = stacks.domain.entities.pending
+            pending = runtime.domain.entities.pending
             if getattr(guard, "handle", None) in pending:  # they are no entities
                 pending.remove(guard.handle)  # type: ignore[union-attr]
 
     def add_node(self: Any, node: Any) -> bool:
-        if stacks.ending.closing:  # ``while True: rclpy.spin(node)`` does nothing else from then on
-            count_refused_wait(stacks)
+        if (
+            runtime.ending.closing
+        ):  # ``while True: rclpy.spin(node)`` does nothing else from then on
+            count_refused_wait(runtime)
         added: bool = real["add_node"](self, node)
         if added:
             if node.handle.mailbox is None:  # the first time: ``spin_once`` adds it again and again
-                note_replaced_functions(stacks, type(self))
-            driver_of(stacks, self).add(node)
+                note_replaced_functions(runtime, type(self))
+            driver_of(runtime, self).add(node)
         return added
 
     def remove_node(self: Any, node: Any) -> None:
         real["remove_node"](self, node)
-        driver_of(stacks, self).remove(node)
+        driver_of(runtime, self).remove(node)
 
     def get_nodes(self: Any) -> list[Any]:
-        return list(driver_of(stacks, self).nodes)
+        return list(driver_of(runtime, self).nodes)
 
     def wake(self: Any) -> None:
-        driver = driver_of(stacks, self)
+        driver = driver_of(runtime, self)
         sync_woken(driver.nodes, sys._getframe(1))
         driver.wake()
 
     def shutdown(self: Any, timeout_sec: float | None = None) -> bool:
         done: bool = real["shutdown"](self, timeout_sec)
-        driver_of(stacks, self).close()
+        driver_of(runtime, self).close()
         return done
 
     def make_task(self: Any, callback: Any, *args: Any, **kwargs: Any) -> Any:
         if type(callback) is ResumeTask or is_bookkeeping(callback):
             callback(*args)  # rclpy's own, not an event
             return None
-        tasks = driver_of(stacks, self).tasks
-        return create_task(stacks, callback, args, kwargs, executor=self, mailbox=tasks)
+        tasks = driver_of(runtime, self).tasks
+        return create_task(runtime, callback, args, kwargs, executor=self, mailbox=tasks)
 
     def wait_for_ready_callbacks(
         self: Any,
@@ -211,7 +213,7 @@ def _methods(
         nodes: list[Any] | None = None,
         condition: Callable[[], bool] = lambda: False,
     ) -> tuple[Any, Any, Any]:
-        return driver_of(stacks, self).next(timeout_sec, nodes, condition)
+        return driver_of(runtime, self).next(timeout_sec, nodes, condition)
 
     return {
         "__init__": __init__,

@@ -9,8 +9,8 @@ import weakref
 from functools import partial
 from typing import Any, Protocol
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
 
 
 class _TimePoint:
@@ -145,7 +145,7 @@ class ClockEventHandle:
     boundary: Any
 
     def __init__(self) -> None:
-        self._event = SimEvent(self.boundary.stacks, "a time to come (Clock.sleep_until)")
+        self._event = SimEvent(self.boundary.runtime, "a time to come (Clock.sleep_until)")
 
     def set(self) -> None:
         self._event.set()

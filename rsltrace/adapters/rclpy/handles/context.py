@@ -12,8 +12,8 @@ from typing import Any, NoReturn
 from greenlet import getcurrent
 
 from rsltrace.adapters.rclpy.arguments import RosArguments
+from rsltrace.adapters.rclpy.concurrency.runtime import RunEnded, Runtime
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.stacks.runtime import RunEnded, Runtime
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.event import OutputKind
 
@@ -27,14 +27,14 @@ class ContextHandle(Handle):
     """Stands in for ``_rclpy.Context``."""
 
     def __init__(
-        self, real: Any, stacks: Runtime, arguments: Sequence[str], domain_id: int
+        self, real: Any, runtime: Runtime, arguments: Sequence[str], domain_id: int
     ) -> None:
         super().__init__()
         self._real = real
-        self.stacks = stacks
+        self.runtime = runtime
         for argument in arguments:
             argument.encode()  # raises what rclpy raises for invalid text
-        self.program = stacks.programs.present
+        self.program = runtime.programs.present
         self.program.contexts.append(self)
         self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
         self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
@@ -53,19 +53,19 @@ class ContextHandle(Handle):
             text = "failed to shutdown: rcl_shutdown already called on the given context"
             raise self._real.RCLError(text)
         self.end()
-        stacks = self.stacks
-        if self.program is not stacks.programs.host:
-            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
+        runtime = self.runtime
+        if self.program is not runtime.programs.host:
+            runtime.dispatcher.note(OutputKind.SHUTDOWN, runtime.event.entity)
             return
-        if stacks.event.node is not None and self is stacks.programs.main_context:
-            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
-            name = stacks.event.node.fully_qualified_name
-            stacks.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
+        if runtime.event.node is not None and self is runtime.programs.main_context:
+            runtime.dispatcher.note(OutputKind.SHUTDOWN, runtime.event.entity)
+            name = runtime.event.node.fully_qualified_name
+            runtime.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
 
     def end(self) -> None:
         """Shut down as a signal does."""
         self.is_up = False
-        graph = self.stacks.domain.graph
+        graph = self.runtime.domain.graph
         for node in graph.nodes:
             if getattr(node, "context", None) is self:
                 for publisher in graph.publishers_of(node):
@@ -88,10 +88,10 @@ class ContextHandle(Handle):
 
         The end of the run is no error of theirs. The main itself goes on, as it would natively.
         """
-        stacks, main = self.stacks, self.program.stack
-        if not stacks.ending.closing or main is None:
+        runtime, main = self.runtime, self.program.stack
+        if not runtime.ending.closing or main is None:
             return
-        if stacks.dispatcher.in_callback() or main is not getcurrent():
+        if runtime.dispatcher.in_callback() or main is not getcurrent():
             raise RunEnded
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.adapters.rclpy.concurrency.callback_groups import exclusive_group, is_custom
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.callback_groups import exclusive_group, is_custom
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, Runnable, callback_name
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class EntityHandle(Destroyable, DomainEntity):
     lists: str
     """Name of the rclpy Node attribute that lists the wrappers."""
     begins_active = False
-    stacks: Runtime
+    runtime: Runtime
     wrapper: Any
     own_group: bool
     """Whether its callback group is of a custom class."""
@@ -110,8 +110,8 @@ class EntityHandle(Destroyable, DomainEntity):
             if self.node.wrapper is not None:
                 yield self.node
             return
-        nodes = self.stacks.domain.graph.nodes
-        hint = self.stacks.event.node
+        nodes = self.runtime.domain.graph.nodes
+        hint = self.runtime.event.node
         if isinstance(hint, NodeHandle) and hint.wrapper is not None and not hint.destroyed:
             yield hint
         for node in nodes:
@@ -185,7 +185,7 @@ class ReceiverHandle(EntityHandle, Receiver):
         group = wrapper.callback_group
         if getattr(group, "_active_entity", group) is None and not self.own_group:  # nearly always
             return True
-        return not self.stacks.groups.must_wait(self, wrapper)
+        return not self.runtime.groups.must_wait(self, wrapper)
 
     def settle(self) -> bool:
         self.find_wrapper()

@@ -13,14 +13,14 @@ from rsltrace.adapters.rclpy.arguments import (
     RosArguments,
     UnknownArgumentsError,
 )
+from rsltrace.adapters.rclpy.concurrency.entry_starts import policy_of
+from rsltrace.adapters.rclpy.concurrency.mailbox import Mailbox
+from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Destroyable
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
-from rsltrace.adapters.rclpy.stacks.entry_starts import policy_of
-from rsltrace.adapters.rclpy.stacks.mailbox import Mailbox
-from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.event import NameRequester
 from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, names_and_types
@@ -62,7 +62,7 @@ class NodeHandle(Destroyable, Participant):
     def __init__(
         self,
         real: Any,
-        stacks: Runtime,
+        runtime: Runtime,
         logs: LogSink,
         states: NodeStates,
         node_name: str,
@@ -87,7 +87,7 @@ class NodeHandle(Destroyable, Participant):
             message = f"Failed to parse ROS arguments: {error}"
             raise real.RCLInvalidROSArgsError(message) from error
         # The job's arguments for this node are those that ``ros2 run`` gives to a process.
-        programs = stacks.programs
+        programs = runtime.programs
         program = programs.present
         entry = programs.constructing if programs.is_hosted else program.entry
         given = entry.arguments if entry is not None else []
@@ -96,15 +96,17 @@ class NodeHandle(Destroyable, Participant):
         self._entry = entry
         self.wrapper: Any = None
         self.process = program
-        self.stacks = stacks
+        self.runtime = runtime
         self.real = real
         self.context = context
         self._logs = logs
         name, namespace = self._renamed(node_name, namespace)
-        domain = stacks.domain
-        Participant.__init__(self, domain.dispatcher, name, namespace, domain.dispatcher.door)
+        domain = runtime.domain
+        Participant.__init__(
+            self, domain.dispatcher, name, namespace, domain.dispatcher.exception_handler
+        )
         self._number_among_others()
-        self.policy = policy_of(stacks.event)
+        self.policy = policy_of(runtime.event)
         self.state = states.add(self)
         self.mailbox: Mailbox | None = None
         self.rosout: DomainEntity | None = None
@@ -135,12 +137,12 @@ class NodeHandle(Destroyable, Participant):
 
     def _number_among_others(self) -> None:
         """Number the node if others have its name: ROS allows that, but it is seldom meant."""
-        others = _at_work(self.stacks, self.fully_qualified_name)
+        others = _at_work(self.runtime, self.fully_qualified_name)
         if others:
             taken = {other.number for other in others}
             self.number = next(number for number in count(1) if number not in taken)
             note = f"several nodes are named {self.fully_qualified_name}"
-            notes = self.stacks.domain.outcome.notes
+            notes = self.runtime.domain.outcome.notes
             if note not in notes:
                 notes.append(note)
 
@@ -166,7 +168,7 @@ class NodeHandle(Destroyable, Participant):
         """Return the process-wide remapping arguments: the job's, or the context's."""
         if not self._outer:
             return None
-        if self.process is not self.stacks.programs.host:
+        if self.process is not self.runtime.programs.host:
             return self._outer[0]  # of a main, the job's arguments are among the context's
         return self._outer[min(1, len(self._outer) - 1)]
 
@@ -254,7 +256,7 @@ class NodeHandle(Destroyable, Participant):
     def usable_graph(self) -> Graph:
         """The graph, for calls of user code. Raises RCLError if the context is shut down."""
         self.require_up("failed to ask the graph")
-        return self.stacks.domain.graph
+        return self.runtime.domain.graph
 
     def require_up(self, task: str) -> None:
         """Raise RCLError if the node's context is shut down, as rcl does for ``task``."""
@@ -323,12 +325,12 @@ def class_name(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
-def _at_work(stacks: Runtime, name: str) -> list[Participant]:
+def _at_work(runtime: Runtime, name: str) -> list[Participant]:
     """Return the active nodes of a name: a main may leave a node with a context that is shut down,
     or without an executor."""
     return [
         node
-        for node in stacks.domain.graph.nodes_named(name)
+        for node in runtime.domain.graph.nodes_named(name)
         if not isinstance(node, NodeHandle)
-        or (node.context.ok() and (node.wrapper is not None or stacks.programs.is_hosted))
+        or (node.context.ok() and (node.wrapper is not None or runtime.programs.is_hosted))
     ]

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NoReturn
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
+from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
+from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
-from rsltrace.adapters.rclpy.stacks.blocking_calls import wait
-from rsltrace.adapters.rclpy.stacks.code_lines import CallSites
-from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, run_callback, start_callback
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import message_type
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interfaces import message_type
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.entity import callback_name
 from rsltrace.simulation.middleware.participant import QosEvent
@@ -47,11 +47,11 @@ class PublisherHandle(EntityHandle, Publisher):
         resolved = node.resolve(topic, service=False)
         codec = codec_for(msg_type)
         self.msg_type = msg_type
-        self.stacks = node.stacks
+        self.runtime = node.runtime
         self._serialize = codec.serialize
         self._canonical = codec.canonical
         profile = qos if isinstance(qos, Qos) else qos_of(qos)
-        domain = node.stacks.domain
+        domain = node.runtime.domain
         Publisher.__init__(self, domain.transport, node, resolved, message_type(msg_type), profile)
         self._event = node.dispatcher.event
         self._sites = CallSites(node.dispatcher, self.entity_id)
@@ -88,11 +88,11 @@ class PublisherHandle(EntityHandle, Publisher):
         """Wait until all messages have reached every reliable subscription; return whether they
         have."""
         limit_ns: int = timeout.nanoseconds
-        left_ns = self.acknowledged_ns() - self.stacks.loop.now_ns
+        left_ns = self.acknowledged_ns() - self.runtime.loop.now_ns
         if left_ns <= 0 or limit_ns == 0:
             return left_ns <= 0
         acked = limit_ns < 0 or left_ns <= limit_ns
-        wait(self.stacks, "its messages to be acknowledged", for_ns=left_ns if acked else limit_ns)
+        wait(self.runtime, "its messages to be acknowledged", for_ns=left_ns if acked else limit_ns)
         return acked
 
     settle, trace_name = Publisher.settle, Publisher.trace_name
@@ -116,12 +116,12 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
             self._refuse_filter(resolved, content_filter[0])
         self._deserialize = codec_for(msg_type).deserialize
         self.msg_type = msg_type
-        self.stacks = node.stacks
+        self.runtime = node.runtime
         self._real = node.real
         self._callback: Any = None
         self._coroutine = False
         self._with_info = False
-        graph = node.stacks.domain.graph
+        graph = node.runtime.domain.graph
         profile = graph.settled_request(resolved, qos_of(qos))
         Subscription.__init__(
             self, node.dispatcher, node, resolved, message_type(msg_type), profile
@@ -141,7 +141,9 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         message = deserialize(data)
         args = (message, _message_info(delivery)) if self._with_info else (message,)
         if self._coroutine:
-            start_callback(self.stacks, self, SUBSCRIPTION, callback, args, event, position, digest)
+            start_callback(
+                self.runtime, self, SUBSCRIPTION, callback, args, event, position, digest
+            )
             return
         self.dispatcher.execute(
             self, self.entity_id, self.node, SUBSCRIPTION, callback, args, event, position, digest
@@ -164,7 +166,7 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
     def _learn(self, wrapper: Any) -> None:
         """Look up how to run a new callback; user code may replace it at any time."""
         self._callback = wrapper._callback
-        self._coroutine = is_awaited(self.stacks, wrapper._callback)
+        self._coroutine = is_awaited(self.runtime, wrapper._callback)
         self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
 
     def forget_callback(self) -> None:
@@ -243,7 +245,7 @@ class EventHandle(QosEvent, EntityHandle):
     alarms: tuple[Alarm, ...] = ()
 
     def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
-        self.stacks = parent.stacks
+        self.runtime = parent.runtime
         super().__init__(parent.dispatcher, parent.node)
         self.listen(parent, _event_name(event_type))
 
@@ -270,11 +272,11 @@ class EventHandle(QosEvent, EntityHandle):
         if not self.has_news():
             self.is_queued = False
             return
-        if self.stacks.groups.must_wait(self, wrapper):
+        if self.runtime.groups.must_wait(self, wrapper):
             return
         self.is_queued = False
         args = (self.take_event(),)
-        run_callback(self.stacks, self, _QOS_EVENT, wrapper.callback, args, *self.cause, 0)
+        run_callback(self.runtime, self, _QOS_EVENT, wrapper.callback, args, *self.cause, 0)
 
     def settle(self) -> bool:
         self.find_wrapper()

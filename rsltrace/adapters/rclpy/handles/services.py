@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
-from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of, qos_of
-from rsltrace.adapters.rclpy.stacks.code_lines import CallSites, FunctionRecorder
-from rsltrace.adapters.rclpy.stacks.tasks import (
+from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites, FunctionRecorder
+from rsltrace.adapters.rclpy.concurrency.tasks import (
     executor_of,
     is_awaited,
     is_coroutine_function,
     start_coroutine,
 )
-from rsltrace.adapters.rclpy.wire.codec import codec_for
-from rsltrace.adapters.rclpy.wire.interfaces import service_type
-from rsltrace.adapters.rclpy.wire.type_descriptions import answer_request
+from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of, qos_of
+from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.messages.interfaces import service_type
+from rsltrace.adapters.rclpy.messages.type_descriptions import answer_request
 from rsltrace.simulation.middleware.graph import Graph
 from rsltrace.simulation.middleware.services import (
     CLIENT,
@@ -97,9 +97,9 @@ class ServiceEndHandle(ReceiverHandle, ServiceEndpoint):
         self._request = codec_for(srv_type.Request)
         self._response = codec_for(srv_type.Response)
         self.srv_type = srv_type
-        self.stacks = node.stacks
+        self.runtime = node.runtime
         self._service_events: ServiceEvents | None = None
-        return node.stacks.domain.transport, node, service, service_type(srv_type), qos_of(qos)
+        return node.runtime.domain.transport, node, service, service_type(srv_type), qos_of(qos)
 
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
         self._service_events = updated_service_events(self._service_events, self, clock, qos, state)
@@ -124,7 +124,7 @@ class ServiceHandle(ServiceEndHandle, Service):
 
     def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
         Service.__init__(self, *self._prepare(node, srv_type, name, qos))
-        node.stacks.domain.graph.add_service(self)
+        node.runtime.domain.graph.add_service(self)
 
     @property
     def name(self) -> str:
@@ -139,9 +139,9 @@ class ServiceHandle(ServiceEndHandle, Service):
             return
         data, event, position, digest, header = self.queue.popleft()
         args = self._request.deserialize(data), header
-        if is_awaited(self.stacks, self.wrapper.callback):
+        if is_awaited(self.runtime, self.wrapper.callback):
             serve = self._serve_async
-            start_coroutine(self.stacks, self, SERVICE, serve, args, event, position, digest)
+            start_coroutine(self.runtime, self, SERVICE, serve, args, event, position, digest)
         else:
             execute = self.dispatcher.execute
             serve_now = self._serve
@@ -189,7 +189,7 @@ class ClientHandle(ServiceEndHandle, Client):
         Client.__init__(self, *self._prepare(node, srv_type, name, qos))
         self._sites = CallSites(node.dispatcher, self.entity_id)
         self._functions = FunctionRecorder(node.dispatcher)
-        node.stacks.domain.graph.add_client(self)
+        node.runtime.domain.graph.add_client(self)
 
     @property
     def service_name(self) -> str:
@@ -238,9 +238,9 @@ class ClientHandle(ServiceEndHandle, Client):
             future = self.wrapper.get_pending_request(request_id.sequence_number)
         except KeyError:
             return  # cancelled, or answered by another server
-        executor = executor_of(self.stacks, self)
+        executor = executor_of(self.runtime, self)
         future._set_executor(executor)
-        if self.stacks.loop.polls:
+        if self.runtime.loop.polls:
             future.set_result(response)  # done callbacks are tasks
             return
         with future._lock:
@@ -262,7 +262,7 @@ class TypeDescriptionServiceHandle:
         from type_description_interfaces.srv import GetTypeDescription
 
         profile = boundary.rmw_qos_profile_t.predefined("qos_profile_services_default")
-        self._graph = node.stacks.domain.graph
+        self._graph = node.runtime.domain.graph
         self.impl = ServiceHandle(node, GetTypeDescription, "~/get_type_description", profile)
 
     def handle_request(self, request: Any, response_type: Any, node: Any) -> Any:

@@ -7,11 +7,11 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
+from rsltrace.adapters.rclpy.concurrency.callback_groups import is_busy
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
+from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.handles.clock import ClockHandle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle
-from rsltrace.adapters.rclpy.stacks.callback_groups import is_busy
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
-from rsltrace.adapters.rclpy.stacks.tasks import is_awaited, run_callback, start_callback
 from rsltrace.simulation.middleware.timer import TIMER, Timer
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
@@ -22,15 +22,15 @@ class TimerHandle(EntityHandle, Timer):
 
     lists = "timers"
 
-    def __init__(self, real: Any, stacks: Runtime, period_ns: int, autostart: bool) -> None:
+    def __init__(self, real: Any, runtime: Runtime, period_ns: int, autostart: bool) -> None:
         if period_ns < 0:
             raise real.RCLError("timer period must be non-negative")
-        self.stacks = stacks
+        self.runtime = runtime
         self._real = real
         self._callback: Any = None
         self._coroutine = False
         self._info: str | None = None
-        Timer.__init__(self, stacks.dispatcher, None, int(period_ns), canceled=not autostart)
+        Timer.__init__(self, runtime.dispatcher, None, int(period_ns), canceled=not autostart)
 
     activate = Timer.activate
 
@@ -52,17 +52,17 @@ class TimerHandle(EntityHandle, Timer):
             loop.timers.add(state)
         group = wrapper.callback_group
         if self.own_group:
-            if not self.stacks.groups.enter(self, wrapper, self.activate):
+            if not self.runtime.groups.enter(self, wrapper, self.activate):
                 loop.timers.remove(state)
                 return
         elif getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             loop.timers.remove(state)
-            self.stacks.groups.park(group, self, self.activate)
+            self.runtime.groups.park(group, self, self.activate)
             return
         callback = wrapper.callback
         if callback is not self._callback:
             self._callback = callback
-            self._coroutine = is_awaited(self.stacks, callback)
+            self._coroutine = is_awaited(self.runtime, callback)
             self._info = _info_parameter(callback)
         digest = self.deadline_hash()
         if self._info is not None:
@@ -70,7 +70,7 @@ class TimerHandle(EntityHandle, Timer):
         state.call(loop.now_ns)
         loop.timers.ran(state)
         if self._coroutine:
-            start_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
+            start_callback(self.runtime, self, TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             dispatcher.execute(
                 self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
@@ -160,12 +160,12 @@ class RosTimerHandle(TimerHandle):
     """
 
     def __init__(
-        self, real: Any, stacks: Runtime, clock: ClockHandle, period_ns: int, autostart: bool
+        self, real: Any, runtime: Runtime, clock: ClockHandle, period_ns: int, autostart: bool
     ) -> None:
         self._clock = clock
         self._credit_ns = 0
         self._ready = False
-        super().__init__(real, stacks, period_ns, autostart)
+        super().__init__(real, runtime, period_ns, autostart)
         if clock.is_driven:
             self._count_from(clock.now_ns())
         clock.followers.append(self)
@@ -216,14 +216,14 @@ class RosTimerHandle(TimerHandle):
         if wrapper is None or self.destroyed or state.canceled or state.deadline_ns > now_ns:
             return
         if self.own_group:
-            if not self.stacks.groups.enter(self, wrapper, self.activate):
+            if not self.runtime.groups.enter(self, wrapper, self.activate):
                 return
         elif is_busy(wrapper.callback_group, wrapper):
-            self.stacks.groups.park(wrapper.callback_group, self, self.activate)
+            self.runtime.groups.park(wrapper.callback_group, self, self.activate)
             return
         callback, digest = wrapper.callback, self.deadline_hash()
         state.call(now_ns)
-        run_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
+        run_callback(self.runtime, self, TIMER, callback, (), NO_EVENT, 0, digest)
         self.activate()
 
     # -- what rclpy calls ------------------------------------------------------------------------
@@ -271,9 +271,9 @@ class GuardConditionHandle(EntityHandle):
     kind = EntityKind.GUARD_CONDITION
     lists = "guards"
 
-    def __init__(self, stacks: Runtime) -> None:
-        self.stacks = stacks
-        super().__init__(stacks.dispatcher, None)
+    def __init__(self, runtime: Runtime) -> None:
+        self.runtime = runtime
+        super().__init__(runtime.dispatcher, None)
         self._triggered = False
         self._cause = (0, 0)
         self._found: tuple[int, int] | None = None
@@ -317,10 +317,10 @@ class GuardConditionHandle(EntityHandle):
         wrapper = self.wrapper
         if not self.is_due or wrapper is None or self.destroyed:
             return
-        if self.stacks.groups.must_wait(self, wrapper):
+        if self.runtime.groups.must_wait(self, wrapper):
             return
         cause = self._found
         if cause is None:
             cause, self._triggered = self._cause, False
         self._found = None
-        run_callback(self.stacks, self, _GUARD, wrapper.callback, (), *cause, 0)
+        run_callback(self.runtime, self, _GUARD, wrapper.callback, (), *cause, 0)

@@ -13,12 +13,12 @@ from functools import partialmethod
 from types import FrameType
 from typing import Any
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
+from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, start_coroutine
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
-from rsltrace.adapters.rclpy.stacks.blocking_calls import SimEvent
-from rsltrace.adapters.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.trace.model.event import NO_EVENT, EventKind
 
@@ -37,7 +37,7 @@ class WaitSetHandle(Handle):
         context: ContextHandle,
     ) -> None:
         super().__init__()
-        self._stacks = context.stacks
+        self._runtime = context.runtime
         self._context = context
         self._entities: dict[str, list[Any]] = {}
         self._found: dict[str, list[bool]] = {}
@@ -75,11 +75,11 @@ class WaitSetHandle(Handle):
     def wait(self, timeout_ns: int) -> None:
         """Wait in simulated time until something is ready; forever if negative."""
         if not self._look() and timeout_ns:
-            stacks = self._stacks
-            until_ns = None if timeout_ns < 0 else stacks.loop.now_ns + timeout_ns
-            news = SimEvent(stacks, self._wanted())
+            runtime = self._runtime
+            until_ns = None if timeout_ns < 0 else runtime.loop.now_ns + timeout_ns
+            news = SimEvent(runtime, self._wanted())
             with self.watched(news.set):
-                while not self._look() and (until_ns is None or stacks.loop.now_ns < until_ns):
+                while not self._look() and (until_ns is None or runtime.loop.now_ns < until_ns):
                     news.clear()
                     news.wait_ns(self._patience_ns(until_ns))
         for guard, found in zip(
@@ -120,7 +120,7 @@ class WaitSetHandle(Handle):
 
     def _patience_ns(self, until_ns: int | None) -> int | None:
         """Return the time until the next timer is due, or ``until_ns`` if that is sooner."""
-        now_ns = self._stacks.loop.now_ns
+        now_ns = self._runtime.loop.now_ns
         limits = [timer.time_until_next_call() for timer in self._entities["timer"]]
         limits.append(None if until_ns is None else until_ns - now_ns)
         known = [limit for limit in limits if limit is not None]
@@ -211,7 +211,7 @@ class UserWaitable:
     """A waitable of user code; ``wrapper`` is the user's object."""
 
     def __init__(self, node: NodeHandle, waitable: Any) -> None:
-        self.stacks = node.stacks
+        self.runtime = node.runtime
         self.node = node
         self.wrapper = waitable
         self.entity_id = node.entity_id
@@ -228,12 +228,12 @@ class UserWaitable:
     def trigger(self) -> None:
         if not self._queued and not self._closed:
             self._queued = True
-            self._cause = (self.stacks.loop.events, 0)
-            self.stacks.loop.ready.append(self)
+            self._cause = (self.runtime.loop.events, 0)
+            self.runtime.loop.ready.append(self)
 
     def _look_again(self) -> None:
         """Trigger it if it is ready, or when its next timer is due."""
-        loop = self.stacks.loop
+        loop = self.runtime.loop
         if self._set.ready_now():
             self.trigger()
             return
@@ -248,7 +248,7 @@ class UserWaitable:
         if self._closed or self.node.destroyed:
             return
         ready = self._set.ready_now()
-        if ready and self.stacks.groups.must_wait(self, self.wrapper):
+        if ready and self.runtime.groups.must_wait(self, self.wrapper):
             return
         self._queued = False
         if not ready:
@@ -260,7 +260,7 @@ class UserWaitable:
         if getattr(handle, "queue", None):
             *cause, digest = handle.queue[0][handle.origin]
         here: Any = self  # has what start_coroutine needs
-        start_coroutine(self.stacks, here, int(_KINDS[name]), self._execute, (), *cause, digest)
+        start_coroutine(self.runtime, here, int(_KINDS[name]), self._execute, (), *cause, digest)
 
     async def _execute(self) -> None:
         """Run it as rclpy's executors do after a wait."""
@@ -269,7 +269,7 @@ class UserWaitable:
         if waitable.is_ready(self._set):
             data = waitable.take_data()
             for future in waitable._futures:
-                future._set_executor(executor_of(self.stacks, self))
+                future._set_executor(executor_of(self.runtime, self))
             await waitable.execute(data)
         if not self._closed:
             self._look_again()

@@ -12,9 +12,9 @@ from functools import partial
 from types import FrameType
 from typing import Any, NoReturn
 
-from rsltrace.adapters.rclpy.stacks.blocking_calls import calling_runtime, wait
-from rsltrace.adapters.rclpy.stacks.program import SimulatedProgram
-from rsltrace.adapters.rclpy.stacks.runtime import Runtime
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import calling_runtime, wait
+from rsltrace.adapters.rclpy.concurrency.program import SimulatedProgram
+from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.terminals.terminal import Terminal
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.frames import replace_member
@@ -62,14 +62,14 @@ class NoTerminal:
 
 def refuse_reading(call: str) -> None:
     """Raise ``UnsupportedError`` if a node's code reads, but no debugger."""
-    stacks = calling_runtime()
-    if stacks is None or stacks.event.handle is None or _is_debugged(sys._getframe(2)):
+    runtime = calling_runtime()
+    if runtime is None or runtime.event.handle is None or _is_debugged(sys._getframe(2)):
         return
-    _fail(stacks, call)
+    _fail(runtime, call)
 
 
-def _fail(stacks: Runtime, call: str) -> NoReturn:
-    program = stacks.programs.present
+def _fail(runtime: Runtime, call: str) -> NoReturn:
+    program = runtime.programs.present
     if program.entry is None:
         raise UnsupportedError(
             f"{call}: a 'node' of a job has no terminal: write a function that spins it (main:), "
@@ -241,26 +241,26 @@ class Terminals:
     """The terminals of mains. While a main runs, its terminal is descriptor 0 (and 1, for
     curses)."""
 
-    def __init__(self, stacks: Runtime) -> None:
-        self._stacks = stacks
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
         self._stdin = sys.stdin
         self._real: dict[int, int] = {}
         self._at: dict[int, Terminal | None] = {}
         self._all: dict[SimulatedProgram, Terminal] = {}
-        stacks.programs.stdin_of = self.stdin_of
+        runtime.programs.stdin_of = self.stdin_of
 
     @property
     def present(self) -> Terminal | None:
         """The terminal of the running main, if it has one."""
-        return self._all.get(self._stacks.programs.present)
+        return self._all.get(self._runtime.programs.present)
 
     def make(self, programs: Sequence[SimulatedProgram], start_ns: int) -> None:
         """Make the terminals of mains; times of input count from ``start_ns``."""
         for program in programs:
             assert program.entry is not None
             if program.entry.stdin is not None:
-                self._all[program] = Terminal(self._stacks, program.entry.stdin, start_ns)
-                self._stacks.programs.on_enter = self._enter
+                self._all[program] = Terminal(self._runtime, program.entry.stdin, start_ns)
+                self._runtime.programs.on_enter = self._enter
 
     def hand_over(self, program: SimulatedProgram, successor: SimulatedProgram) -> None:
         """Give the terminal of a main to the one that starts again."""
@@ -275,7 +275,7 @@ class Terminals:
     def show(self, terminal: Terminal, has_screen: bool) -> None:
         """Send the output of the running main to its terminal, or not."""
         terminal.has_screen = has_screen
-        self._enter(self._stacks.programs.present)
+        self._enter(self._runtime.programs.present)
 
     def _enter(self, program: SimulatedProgram) -> None:
         terminal = self._all.get(program)
@@ -310,9 +310,9 @@ class Terminals:
 
 
 @contextmanager
-def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
+def simulated_terminals(runtime: Runtime) -> Iterator[Terminals]:
     """Let mains read from their simulated terminals, and no node from the real one."""
-    terminals = Terminals(stacks)
+    terminals = Terminals(runtime)
     real_stdin = sys.stdin
     with ExitStack() as stack:
         stack.callback(setattr, sys, "stdin", real_stdin)
@@ -329,14 +329,14 @@ def simulated_terminals(stacks: Runtime) -> Iterator[Terminals]:
 
 def _terminal_of_caller(terminals: Terminals) -> Terminal | None:
     """Return the terminal of the calling main, None for other code."""
-    stacks = calling_runtime()
-    return None if stacks is None or stacks.event.handle is None else terminals.present
+    runtime = calling_runtime()
+    return None if runtime is None or runtime.event.handle is None else terminals.present
 
 
 def _inputs(real: Callable[..., str]) -> Callable[..., str]:
     def input_(prompt: object = "", /) -> str:
-        stacks = calling_runtime()
-        if stacks is None or stacks.event.handle is None:
+        runtime = calling_runtime()
+        if runtime is None or runtime.event.handle is None:
             return real(prompt)
         if isinstance(sys.stdin, NoTerminal):
             refuse_reading("input()")
@@ -374,12 +374,12 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
             return real(reads, writes, others, timeout)  # type: ignore[no-any-return]
         kinds = [waited_for, list(writes), list(others)]
         alone = sum(map(len, kinds)) == 1
-        stacks = terminals._stacks
-        until_ns = None if timeout is None else stacks.loop.now_ns + waiting_ns(timeout)
+        runtime = terminals._runtime
+        until_ns = None if timeout is None else runtime.loop.now_ns + waiting_ns(timeout)
         while True:
             terminal.offer()
             found = real(*kinds, 0)
-            left_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
+            left_ns = None if until_ns is None else until_ns - runtime.loop.now_ns
             if any(found):
                 return found  # type: ignore[no-any-return]
             if left_ns is not None and left_ns <= 0:
@@ -390,7 +390,7 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
                 terminal.await_input(left_ns)
             else:
                 step_ns = _STEP_NS if left_ns is None else min(left_ns, _STEP_NS)
-                wait(stacks, "one of several descriptors", for_ns=step_ns, quiet=True)
+                wait(runtime, "one of several descriptors", for_ns=step_ns, quiet=True)
 
     return ready
 

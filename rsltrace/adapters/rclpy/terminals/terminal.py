@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any
 
+from rsltrace.adapters.rclpy.concurrency.blocking_calls import POLL_NS, wait
+from rsltrace.adapters.rclpy.concurrency.runtime import BlockedCall, Runtime
 from rsltrace.adapters.rclpy.entry import TypedInput
-from rsltrace.adapters.rclpy.stacks.blocking_calls import POLL_NS, wait
-from rsltrace.adapters.rclpy.stacks.runtime import BlockedCall, Runtime
 from rsltrace.guard.redirect import copy_of
 
 _END = b"\x04"
@@ -40,8 +40,8 @@ class Terminal:
     """``fd`` is the end that the main reads, ``stream`` its ``sys.stdin``. With ``has_screen`` the
     main also prints there (curses)."""
 
-    def __init__(self, stacks: Runtime, typed: Sequence[TypedInput], start_ns: int) -> None:
-        self._stacks = stacks
+    def __init__(self, runtime: Runtime, typed: Sequence[TypedInput], start_ns: int) -> None:
+        self._runtime = runtime
         self._typed = deque(typed)
         self._start_ns = start_ns
         self._keyboard, self.fd = map(_above_standard, _openpty())
@@ -53,7 +53,7 @@ class Terminal:
         self._looked_ns = -1
         self.stream = io.TextIOWrapper(io.BufferedReader(_Input(self)), encoding="utf-8")
         for at_ns in {at_ns for at_ns, _ in typed if at_ns is not None}:
-            stacks.loop.schedule(start_ns + at_ns, self._wake)
+            runtime.loop.schedule(start_ns + at_ns, self._wake)
 
     def close(self) -> None:
         """Close both ends."""
@@ -81,7 +81,7 @@ class Terminal:
         return True
 
     def _is_due(self, at_ns: int | None) -> bool:
-        return at_ns is None or self._start_ns + at_ns <= self._stacks.loop.now_ns
+        return at_ns is None or self._start_ns + at_ns <= self._runtime.loop.now_ns
 
     def _type(self, keys: bytes) -> None:
         _write(self._keyboard, keys)
@@ -105,18 +105,18 @@ class Terminal:
 
     def await_input(self, for_ns: int | None = None) -> bool:
         """Wait in simulated time for input; return whether there is any."""
-        stacks = self._stacks
-        until_ns = None if for_ns is None else stacks.loop.now_ns + for_ns
+        runtime = self._runtime
+        until_ns = None if for_ns is None else runtime.loop.now_ns + for_ns
         while not self.offer():
-            left_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
+            left_ns = None if until_ns is None else until_ns - runtime.loop.now_ns
             if left_ns is not None and left_ns <= 0:
                 return False
             if self._at_end and not self._typed and self._takes_lines():
-                wait(stacks, "the end of its input", for_ns=POLL_NS, quiet=True)
+                wait(runtime, "the end of its input", for_ns=POLL_NS, quiet=True)
                 self._type(_END)  # every further read gets the end, too
                 continue
             wait(
-                stacks,
+                runtime,
                 "something to be typed (stdin)",
                 until=self._waiting.append,
                 for_ns=left_ns,
@@ -127,7 +127,7 @@ class Terminal:
 
     def look(self) -> bool:
         """Return whether there is input. A second look at one instant takes a millisecond."""
-        loop = self._stacks.loop
+        loop = self._runtime.loop
         if self.offer():
             return True
         again, self._looked_ns = self._looked_ns == loop.now_ns, loop.now_ns

@@ -87,8 +87,8 @@ class Dispatcher:
     """Runs the callbacks of a run, one event at a time, and records the results.
 
     ``recorder`` is None in an unrecorded run; ``unrecorded`` then counts the outputs of the event.
-    ``door`` handles exceptions of what belongs to no participant (construction, mains). Whoever
-    resumes a callback has to call ``resume_observers`` and ``node_observers``.
+    ``exception_handler`` handles exceptions of what belongs to no participant (construction,
+    mains). Whoever resumes a callback has to call ``resume_observers`` and ``node_observers``.
     """
 
     def __init__(self, loop: EventLoop) -> None:
@@ -98,7 +98,7 @@ class Dispatcher:
         self.outcome = RunOutcome()
         self.recorder: Recorder | None = None
         self.unrecorded = 0
-        self.door: ExceptionHandler
+        self.exception_handler: ExceptionHandler
         self._pending = self.entities.pending
         self._observers: list[EventObserver] = []
         self._before: tuple[EventObserver, ...] = ()
@@ -184,8 +184,10 @@ class Dispatcher:
         if isinstance(error, OutputError):
             raise error
         node = self.event.node
-        door: ExceptionHandler = self.door if node is None else node.door
-        door.raised(error, handle)
+        exception_handler: ExceptionHandler = (
+            self.exception_handler if node is None else node.exception_handler
+        )
+        exception_handler.raised(error, handle)
 
     def end_event(self) -> None:
         """Record the current event, possibly a later part of the one ``execute`` began."""

@@ -121,7 +121,7 @@ class EventOwner(Protocol):
     entity_id: int
     fully_qualified_name: str
     state: ParticipantState | None
-    door: ExceptionHandler
+    exception_handler: ExceptionHandler
 
 
 @dataclass(eq=False, slots=True)

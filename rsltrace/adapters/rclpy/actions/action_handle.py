@@ -1,0 +1,228 @@
+"""Base classes of action servers and clients, and goals.
+
+An action is three services and two topics under ``<name>/_action/``. Each is an entity, so the
+trace shows every request, response, feedback and status. Arrivals go to rclpy's waitable one by
+one, in the order of arrival.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from rsltrace.adapters.rclpy.concurrency.code_lines import FunctionRecorder
+from rsltrace.adapters.rclpy.concurrency.mailbox import servers_text
+from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, start_coroutine
+from rsltrace.adapters.rclpy.handles.destroyable import Handle
+from rsltrace.adapters.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.adapters.rclpy.handles.node import NodeHandle
+from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.adapters.rclpy.handles.services import ClientHandle, ServiceHandle
+from rsltrace.adapters.rclpy.messages.interfaces import type_name
+from rsltrace.trace.model.event import EventKind
+
+# Numbers of action_msgs/msg/GoalStatus. The state machine of a goal is rcl_action's (ROS 2 Jazzy).
+ACCEPTED, EXECUTING, CANCELING, SUCCEEDED, CANCELED, ABORTED = 1, 2, 3, 4, 5, 6
+_TRANSITIONS = {
+    (ACCEPTED, "EXECUTE"): EXECUTING,
+    (ACCEPTED, "CANCEL_GOAL"): CANCELING,
+    (EXECUTING, "CANCEL_GOAL"): CANCELING,
+    (EXECUTING, "SUCCEED"): SUCCEEDED,
+    (EXECUTING, "ABORT"): ABORTED,
+    (CANCELING, "SUCCEED"): SUCCEEDED,
+    (CANCELING, "ABORT"): ABORTED,
+    (CANCELING, "CANCELED"): CANCELED,
+}
+
+
+class GoalHandle(Handle):
+    """Stands in for ``_rclpy.ActionGoalHandle``: the state machine of one accepted goal."""
+
+    def __init__(self, real: Any, goals: dict[bytes, GoalHandle], info: Any) -> None:
+        super().__init__()
+        goal_id = bytes(info.goal_id.uuid)
+        if goal_id in goals:
+            raise real.RCLError("goal ID already exists")
+        self._real = real
+        self.info = info
+        self.status = ACCEPTED
+        self.accepted_ns = info.stamp.sec * 1_000_000_000 + info.stamp.nanosec
+        self.done_ns: int | None = None
+        self.status_bytes = b""
+        """Its part of a status message, without the status; empty before the first message."""
+        goals[goal_id] = self
+
+    def get_status(self) -> int:
+        return self.status
+
+    def is_active(self) -> bool:
+        return self.status in (ACCEPTED, EXECUTING, CANCELING)
+
+    def cancelable(self) -> bool:
+        """Return whether a cancel request can stop the goal."""
+        return (self.status, "CANCEL_GOAL") in _TRANSITIONS
+
+    def update_goal_state(self, event: Any) -> None:
+        """Apply an event to the state machine. Raises RCLError if it is not allowed."""
+        state = _TRANSITIONS.get((self.status, event.name))
+        if state is None:
+            raise self._real.RCLError(
+                f"goal_handle attempted invalid transition from state {self.status} "
+                f"with event {event.name}"
+            )
+        self.status = state
+
+
+ACTION = int(EventKind.ACTION)
+
+PartT = TypeVar("PartT", bound="ActionEndpoint")
+
+
+class ActionEndpoint(ReceiverHandle):
+    """An endpoint of an action; its arrivals go to the action's waitable."""
+
+    owner: ActionHandle
+    in_waitable = True
+    in_wait_sets: str
+    """Its kind in a wait set: ``service``, ``client`` or ``subscription``."""
+    purpose: str
+    """``goal``, ``cancel``, ``result``, ``feedback`` or ``status``."""
+
+    def find_wrapper(self) -> Any:
+        """Return the action's waitable once its node is being run."""
+        if self.wrapper is None:
+            waitable = self.owner.find_waitable()
+            if waitable is not None:
+                self.begin(waitable, self.node)
+        return self.wrapper
+
+    def dispatch(self) -> None:
+        """Let rclpy take the oldest arrival and execute it, as one event."""
+        if not self.may_run():
+            return
+        origin = self.queue[0][self.origin]
+        start_coroutine(self.runtime, self, ACTION, self.owner.execute, (self,), *origin)
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"action": self.owner.name}
+
+    def user_callback(self) -> object:
+        """Return the server's callback for this kind of request."""
+        own = getattr(self.wrapper, f"_{self.purpose}_callback", None)
+        if getattr(own, "__module__", "").startswith("rclpy."):  # the default goal callback
+            own = None
+        return own or getattr(self.wrapper, "_execute_callback", None)
+
+
+class ActionService(ActionEndpoint, ServiceHandle):
+    """A server's end of one of the three services."""
+
+    in_wait_sets = "service"
+
+
+class ActionServiceClient(ActionEndpoint, ClientHandle):
+    """A client's end of one of the three services."""
+
+    in_wait_sets = "client"
+
+
+class ActionSubscriptionHandle(ActionEndpoint, SubscriptionHandle):
+    """A client's feedback or status subscription."""
+
+    in_wait_sets = "subscription"
+
+
+class ActionHandle(Handle):
+    """Base class of action servers and clients: their endpoints (``parts``)."""
+
+    waitable_attribute: str
+    is_client: bool
+
+    def __init__(self, node: NodeHandle, action_type: Any, name: str) -> None:
+        super().__init__()
+        self.runtime = node.runtime
+        self._functions = FunctionRecorder(node.dispatcher)
+        self.node = node
+        self.name = node.resolve(name, service=False)
+        self.parts: list[ActionEndpoint] = []
+        self.publishers: list[PublisherHandle] = []
+        self.action_type = action_type
+        node.actions.append(self)
+        self._ready: ActionEndpoint | None = None
+        self._places: dict[ActionEndpoint, int] = {}
+
+    @property
+    def type_name(self) -> str:
+        return type_name(self.action_type)
+
+    def own(self, kind: type[PartT], interface: Any, name: str, qos: Any) -> PartT:
+        """Make an endpoint below ``<name>/_action/``; its owner is set before its constructor."""
+        part = kind.__new__(kind)
+        part.owner = self
+        part.purpose = name.partition("_goal")[0].replace("send", "goal")
+        part.__init__(self.node, interface, self.path(name), qos)  # type: ignore[misc]
+        self.parts.append(part)
+        return part
+
+    def add_to_waitset(self, wait_set: Any) -> None:
+        for part in self.parts:
+            self._places[part] = getattr(wait_set, f"add_{part.in_wait_sets}")(part)
+
+    def is_part_ready(self, wait_set: Any, part: ActionEndpoint) -> bool:
+        """Return whether an endpoint is being executed, or is ready in a wait set."""
+        if wait_set is None:
+            return part is self._ready
+        return bool(wait_set.is_ready(part.in_wait_sets, self._places[part]))
+
+    def path(self, name: str) -> str:
+        return f"{self.name}/_action/{name}"
+
+    def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
+        """Publish service events of its three services (ROS 2 Kilted and later)."""
+        for part in self.parts:
+            if isinstance(part, ActionService | ActionServiceClient):
+                part.configure_introspection(clock, qos, state)
+
+    def find_waitable(self) -> Any:
+        """Return the rclpy object around this handle, or None if its node is not being run."""
+        if self.node.wrapper is not None:
+            for waitable in self.node.wrapper.waitables:
+                if getattr(waitable, self.waitable_attribute, None) is self:
+                    return waitable
+        return None
+
+    def waits_for(self, future: Any) -> str:
+        """Describe what would complete a client's future; empty for other futures."""
+        waitable = self.find_waitable()
+        for what in ("goal", "result", "cancel"):
+            pending = getattr(waitable, f"_pending_{what}_requests", {})
+            if future in pending.values():
+                graph = self.runtime.domain.graph
+                servers = servers_text(len(graph.services(self.path("send_goal"))))
+                answer = "the result of a goal" if what == "result" else f"the answer to a {what}"
+                return f"{answer}, of action {self.name} ({servers})"
+        return ""
+
+    async def execute(self, part: ActionEndpoint) -> None:
+        """Run the waitable as rclpy's executors do when ``part`` is ready."""
+        waitable = part.wrapper
+        self._ready = part
+        try:
+            waitable.is_ready(None)
+            data = waitable.take_data()
+        finally:
+            self._ready = None
+        if "feedback" in data:
+            self._tell_feedback_callback(part, data["feedback"])
+        for future in waitable._futures:
+            future._set_executor(executor_of(self.runtime, part))
+        await waitable.execute(data)
+
+    def _tell_feedback_callback(self, part: ActionEndpoint, message: Any) -> None:
+        callbacks = part.wrapper._feedback_callbacks
+        callback = callbacks.get(bytes(message.goal_id.uuid))
+        self._functions.run(part.entity_id, callback)
+
+    def _destroy(self) -> None:
+        self.node.actions.remove(self)
+        for handle in [*self.parts, *self.publishers]:
+            handle.destroy_when_not_in_use()

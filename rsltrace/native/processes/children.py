@@ -1,0 +1,136 @@
+"""The processes of a native run, as the run sees them: started, listened to, and ended."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import threading
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.child_processes import kill_group, start_connected
+from rsltrace.errors import JobError
+from rsltrace.native.processes.wire import EntryOrder, Frame, Link
+
+_MAIN = "rsltrace.native.processes.child"
+_LOOK_S = 0.2
+_REAPED_WITHIN_S = 10.0
+"""A process that was killed, or has closed its socket, is gone after a moment."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessStart:
+    """What to start as a process: whose it is, what it does there, and its surroundings.
+
+    ``respawn`` is how much later (ns) it starts again, and how often (None: always); ``may_fail``
+    says that the run goes on if it is killed; ``required`` that the run ends with it.
+    """
+
+    name: str
+    key: str
+    order: EntryOrder
+    environment: Mapping[str, str]
+    folder: Path | None
+    is_main: bool
+    respawn: tuple[int, int | None] | None = None
+    may_fail: bool = False
+    required: bool = False
+
+
+class ObservedProcess(threading.Thread):
+    """One process, and the thread that listens to it.
+
+    ``told`` gets its frames, ``ended`` its exit status (negative: the signal that killed it).
+    """
+
+    def __init__(
+        self,
+        start: ProcessStart,
+        told: Callable[[ObservedProcess, Frame], None],
+        ended: Callable[[ObservedProcess, int], None],
+    ) -> None:
+        super().__init__(name=f"rsltrace {start.name}", daemon=True)
+        self.what = start
+        self.is_ready = threading.Event()
+        """It could begin, or it has ended."""
+        self.is_over = False
+        self.has_begun = False
+        self.has_failed = False
+        """Whether it has said itself what went wrong."""
+        self.is_stopping = False
+        self.is_stuck = False
+        self.exit_text = ""
+        self._told = told
+        self._ended = ended
+        try:
+            self._process, here = start_connected(
+                _MAIN, env=dict(start.environment), cwd=start.folder, start_new_session=True
+            )
+        except OSError as error:
+            raise JobError(f"{start.name} cannot be started: {error.strerror}") from error
+        self._link = Link(here)
+        try:
+            with suppress(BrokenPipeError, ConnectionResetError):  # has ended: that is noticed
+                self._link.send(start.order)
+        except Exception as error:
+            self.kill()
+            self._process.wait()
+            here.close()
+            raise JobError(
+                f"the job cannot be given to the process of {start.name} ({error}): name functions "
+                "and classes of modules in it"
+            ) from error
+        here.settimeout(_LOOK_S)
+        self.start()
+
+    def run(self) -> None:
+        has_ended = False
+        while True:
+            try:
+                frame = self._link.receive()
+                if frame is None:
+                    break
+                self._told(self, frame)
+            except TimeoutError:
+                if has_ended:  # what it has started holds the socket
+                    break
+                has_ended = self._process.poll() is not None
+            except Exception as error:
+                self.exit_text = f"what it told cannot be read: {error}"
+                self.kill()
+                break
+        status = self._status()
+        self.kill()  # what it has left behind
+        self.is_over = True
+        self._ended(self, status)
+        self.is_ready.set()
+        self._link.close()
+
+    def _status(self) -> int:
+        if self.what.order.command:  # it has let go of the socket to become something else
+            return self._process.wait()
+        try:
+            return self._process.wait(_REAPED_WITHIN_S)
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return self._process.wait()
+
+    def go(self) -> None:
+        """Let it begin."""
+        self.has_begun = True
+        with suppress(OSError):  # has ended
+            self._link.send("go")
+
+    def stop(self) -> None:
+        """Tell it to end: as ``ros2 launch`` does, if it is a main."""
+        self.is_stopping = True
+        with suppress(OSError):
+            self._link.send("stop")
+        if self.what.is_main and self.has_begun:
+            self._process.send_signal(signal.SIGINT)
+
+    def kill(self) -> None:
+        """Kill the process with all that it has started."""
+        kill_group(self._process.pid)

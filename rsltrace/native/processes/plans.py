@@ -1,0 +1,102 @@
+"""From a job to the processes of its native run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import replace
+
+from rsltrace.adapters.processes.build import is_python
+from rsltrace.adapters.rclpy.entry import StartRule
+from rsltrace.errors import SetupError
+from rsltrace.job import Job, NodeSpec, locate
+from rsltrace.native.processes.children import ProcessStart
+from rsltrace.native.processes.wire import EntryOrder
+from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
+from rsltrace.run.plans.processes import ProcessPrograms
+
+THE_BAGS = "the bags"
+"""The name of the process that plays them."""
+
+
+def starts_of(job: Job, like: EntryOrder) -> list[ProcessStart]:
+    """Return what to start, in the order of the job, with orders like the given one; whoever plays
+    its bags comes last.
+
+    :raises JobError: a program, or the folder that it is to run in, is not there.
+    """
+    processes = ProcessPrograms(job, lambda text: None)
+    told = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
+    like = replace(like, job=told, module_path=tuple(sys.path))
+    starts = []
+    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+        where = spec.origin or locate(job, ("nodes", index, spec.kind))
+        command = _command(told, index, processes, where)
+        starts.append(
+            ProcessStart(
+                spec.target,
+                key,
+                replace(like, index=index, command=command),
+                _environment(spec, processes, is_program=bool(command)),
+                processes.folder(spec, where),
+                spec.node is None,
+                None if spec.respawn is None else (spec.respawn.delay_ns, spec.respawn.times),
+                spec.on_exception == "log" or spec.respawn is not None,
+                spec.required,
+            )
+        )
+    if job.bags:
+        order = replace(like, plays_bags=True)
+        starts.append(ProcessStart(THE_BAGS, THE_BAGS, order, dict(os.environ), None, True))
+    return starts
+
+
+def _observed(job: Job, spec: NodeSpec) -> NodeSpec:
+    """Return an entry as its process has to see it: Python code is observed there, and not by the
+    library that processes of a simulation have."""
+    changes: dict[str, object] = {"isolated": False}
+    if spec.program is not None:
+        path = job.resolve(spec.program)
+        if path.is_file() and is_python(path):
+            changes |= {"program": None, "script": spec.program}
+    return spec.model_copy(update=changes)
+
+
+def _command(job: Job, index: int, processes: ProcessPrograms, where: str) -> tuple[str, ...]:
+    """Return the command line of an entry that is not Python, empty for others."""
+    spec = job.nodes[index]
+    words = processes.command(spec, where)
+    if words is None:
+        return ()
+    arguments = arguments_of(job, index, arguments_for_all(job), where=where)
+    return (*words, *spec.arguments, *(word for part in arguments for word in part.arguments))
+
+
+def _environment(spec: NodeSpec, processes: ProcessPrograms, *, is_program: bool) -> dict[str, str]:
+    """Return the variables of a process; a compiled one finds the libraries of ROS's wheels."""
+    around = {**os.environ, "PYTHONUNBUFFERED": "1", **spec.environment}
+    if not is_program:
+        return around
+    libraries = []
+    try:
+        from rsltrace.adapters.processes.build import find_ros
+
+        libraries = [str(path) for path in find_ros().libraries if path.is_relative_to(sys.prefix)]
+    except SetupError:
+        pass  # what is sourced has said it itself
+    for name, places in (
+        ("LD_LIBRARY_PATH", libraries),
+        ("PYTHONPATH", processes.search_path),
+        ("AMENT_PREFIX_PATH", processes.prefixes),
+    ):
+        if places:
+            given = [around[name]] if around.get(name) else []
+            around[name] = os.pathsep.join([*given, *places])
+    return around
+
+
+def start_rules(job: Job) -> dict[str, StartRule]:
+    """Return when those entries begin that do not begin with the run, by their keys."""
+    keys = entry_keys(job.nodes)
+    rules = {key: start_rule(job, index, keys) for index, key in enumerate(keys)}
+    return {key: rule for key, rule in rules.items() if rule is not None}

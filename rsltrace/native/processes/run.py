@@ -1,0 +1,395 @@
+"""A native run in which each entry is a process of its own, as ``ros2 launch`` has it."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import Counter, deque
+from contextlib import ExitStack
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+from rsltrace import errors
+from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.entry import StartRule
+from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
+from rsltrace.child_processes import how_ended
+from rsltrace.errors import NodeError, RsltraceError, RunError
+from rsltrace.native.callback_observer import EXECUTORS
+from rsltrace.native.native_run import (
+    ENDS_WITHIN_S,
+    LOOK_EVERY_S,
+    NativeResult,
+    NativeRun,
+    ProcessorTime,
+)
+from rsltrace.native.processes.children import ObservedProcess, ProcessStart
+from rsltrace.native.processes.plans import start_rules, starts_of
+from rsltrace.native.processes.start_queue import StartQueue
+from rsltrace.native.processes.wire import EntryOrder, Frame, SpanDecoder
+from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
+from rsltrace.native.support import check_loopback, domain
+from rsltrace.run.plans.entries import missed_starts
+from rsltrace.run.stop_rules import has_stop
+from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.texts import NS_PER_S, format_seconds
+
+# What several processes have done, in the order in which it began.
+#
+# All have one steady clock. A process says up to when it has told everything; what began before
+# that in all of them is in order for good.
+
+STALLED_NS = 20 * NS_PER_S
+"""A process that says nothing for so long (stopped, or in a call that keeps the interpreter) must
+not keep all others from the file."""
+
+
+class ProcessSpans:
+    """One process: the spans that it has told of, and up to when that is all of them."""
+
+    def __init__(self) -> None:
+        self.spans: deque[CallbackSpan] = deque()
+        self.until_ns = now_ns()
+        self.is_over = False
+
+
+class SpanMerger:
+    """Takes spans from threads, and gives them in the order of their starts."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._sources: list[ProcessSpans] = []
+        self._latest_ns = 0
+        self.late = 0
+        """Spans that came too late for their place, and were put after what was written."""
+
+    def source(self) -> ProcessSpans:
+        """Return a new source: nothing is in order from now on before it has said so."""
+        with self._lock:
+            source = ProcessSpans()
+            self._sources.append(source)
+            return source
+
+    def add(self, source: ProcessSpans, spans: list[CallbackSpan], until_ns: int) -> None:
+        """Add spans in the order of their starts; no other one will begin before ``until_ns``."""
+        with self._lock:
+            source.spans.extend(spans)
+            source.until_ns = max(source.until_ns, until_ns)
+
+    def end(self, source: ProcessSpans) -> None:
+        """Take note that nothing more comes from a source."""
+        with self._lock:
+            source.is_over = True
+
+    def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
+        """Take what is in order, everything if ``patience_ns`` is None."""
+        with self._lock:
+            taken = self._taken(self._until(patience_ns))
+        for span in taken:
+            if span.start_ns < self._latest_ns:
+                self.late += 1
+                span.start_ns = self._latest_ns
+                span.end_ns = max(span.end_ns, span.start_ns)
+            self._latest_ns = span.start_ns
+        return taken
+
+    def _until(self, patience_ns: int | None) -> int | None:
+        if patience_ns is None:
+            return None
+        patient_ns = now_ns() - STALLED_NS
+        waited = [
+            source.until_ns
+            for source in self._sources
+            if not source.is_over and source.until_ns > patient_ns
+        ]
+        return min(waited, default=None)
+
+    def _taken(self, until_ns: int | None) -> list[CallbackSpan]:
+        taken: list[CallbackSpan] = []
+        for source in self._sources:
+            spans = source.spans
+            while spans and (until_ns is None or spans[0].start_ns < until_ns):
+                taken.append(spans.popleft())
+        self._sources = [one for one in self._sources if one.spans or not one.is_over]
+        taken.sort(key=lambda span: span.start_ns)
+        return taken
+
+
+_KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
+"""A process that is stuck ends itself before; this is for one that cannot."""
+Counts = tuple[int, int, int, int, int]
+"""Of a process: its events, when it was last active (steady), messages that could not be read,
+its processor time, and that of telling of it."""
+_QUIET_ENDS = ("KeyboardInterrupt", "ExternalShutdownException")
+
+
+class MultiProcessRun(NativeRun):
+    """Each entry of the job in a process of its own; what they tell is merged into one trace."""
+
+    def open(self, stack: ExitStack, output: Path, *, force: bool, echo: bool) -> None:
+        """ProcessStart the processes up to where they could begin, then create the trace."""
+        self.merge = SpanMerger()
+        self.starts = StartQueue()
+        self.children: list[ObservedProcess] = []
+        self._ids, self._threads = count(1), count(1)
+        self._told: dict[ObservedProcess, tuple[SpanDecoder, ProcessSpans]] = {}
+        self._counts: dict[ObservedProcess, Counts] = {}
+        self._sources: dict[str, Path] = {}
+        self._refusal: RsltraceError | None = None
+        self._restarts: list[tuple[int, ProcessStart]] = []
+        self._restarted: Counter[str] = Counter()
+        self._news = threading.Lock()
+        self._on_message: dict[str, Any] = {}
+        self._log_type = get_message_class("rcl_interfaces/msg/Log")
+        self.prepare(output)
+        self._rules = start_rules(self.job)
+        if self.domain_id is None:
+            check_loopback()
+        number = stack.enter_context(domain(self.domain_id))
+        stack.callback(self._kill_all)
+        kind = EXECUTORS[self.executor]
+        like = EntryOrder(self.job, 0, kind, echo, self.policy, self.rules)
+        starts = starts_of(self.job, like)
+        for start in starts:
+            self._start(start)
+        self._wait_until_ready()
+        described = {
+            "middleware": boundary().real.rclpy_get_rmw_implementation_identifier(),
+            "executor": f"{EXECUTORS[self.executor]} per entry of the job",
+            "processes": str(len(starts)),
+            "domain": str(number),
+        }
+        if self.policy is not None and (mains := [one.name for one in starts if one.is_main]):
+            self.note(
+                f"--policy has no effect in mains, which spin for themselves: {', '.join(mains)}"
+            )
+        if unobserved := [one.name for one in starts if one.order.command]:
+            described["not observed"] = ", ".join(unobserved)
+            self.note(
+                f"not observed, since not in Python: {', '.join(unobserved)}; what these send is "
+                "seen where it arrives, and its cause is unknown"
+            )
+        self.create(stack, output, self.merge, described, self._sources, force=force)
+        self.watch_stop_topics(self._on_message)
+
+    def _start(self, start: ProcessStart) -> ObservedProcess:
+        child = ObservedProcess(start, self._hear, self._ended)
+        self.children.append(child)
+        return child
+
+    def _wait_until_ready(self) -> None:
+        for child in self.children:
+            while not child.is_ready.wait(LOOK_EVERY_S * 10):
+                pass
+        if self._refusal is not None:
+            raise self._refusal
+        if self.error is not None:
+            raise self.error
+
+    # -- what processes tell, in threads of their own -------------------------------------------
+
+    def _hear(self, child: ObservedProcess, frame: Frame) -> None:
+        what, *values = frame
+        if what == "spans":
+            self._hear_spans(child, *values)
+        elif what == "ready":
+            self._sources.update({name: Path(path) for name, path in values[0].items()})
+            child.is_ready.set()
+        elif what == "constructed":
+            self.starts.tell("started", child.what.key)
+        elif what == "error":
+            self._hear_error(child, *values)
+        elif what == "raised":
+            self._hear_raised(child, *values)
+        elif what == "shutdown":
+            child.has_failed = True
+            self.stop(Stop(f"{child.what.name} has ended: rclpy was shut down"))
+        elif what == "exit":
+            child.exit_text = values[0]
+        elif what == "levels":
+            self.levels.update(values[0])
+        elif what == "stuck":
+            child.is_stuck = True
+        else:
+            raise ValueError(f"an unknown frame, {what!r}")
+
+    def _hear_spans(
+        self,
+        child: ObservedProcess,
+        until_ns: int,
+        counts: Counts,
+        definitions: list[tuple[Any, ...]],
+        spans: list[tuple[Any, ...]],
+    ) -> None:
+        reader, source = self._told[child]
+        reader.define(definitions)
+        found = [reader.span(values) for values in spans]
+        self._counts[child] = counts
+        if self._rules:
+            self.starts.look_at(found)
+        if self._on_message:
+            self._look_for_end(found)
+        self.merge.add(source, found, until_ns)
+
+    def _look_for_end(self, spans: list[CallbackSpan]) -> None:
+        for span in spans:
+            for output in span.outputs:
+                if isinstance(output, SentMessage) and (
+                    told := self._on_message.get(output.entity.name)
+                ):
+                    type_name = "" if output.entity.sends is None else output.entity.sends.name
+                    told(output.data, get_message_class(type_name))
+
+    def _hear_error(self, child: ObservedProcess, kind: str, said: str) -> None:
+        child.has_failed = True
+        if child.has_begun:
+            self.fail(RunError(said))
+            return
+        with self._news:
+            if self._refusal is None:
+                self._refusal = getattr(errors, kind)(said)
+
+    def _hear_raised(
+        self, child: ObservedProcess, what: str, node: str, kind: str, said: str, traceback: str
+    ) -> None:
+        child.has_failed = True
+        if child.is_stopping:
+            if kind not in _QUIET_ENDS:
+                self.notes.append(f"{child.what.name}, told to end, raised {kind}: {said}")
+            return
+        reason = f"{what} raised {kind}"
+        stamp_ns = self.clocks.stamp(time.monotonic_ns())
+        name = child.what.name
+        self.fail(
+            NodeError(
+                f"{reason}: {said}",
+                node=node,
+                entity=name,
+                stamp_ns=stamp_ns,
+                traceback_text=traceback,
+            ),
+            reason,
+        )
+
+    def _ended(self, child: ObservedProcess, status: int) -> None:
+        """Take note of the end of a process."""
+        if child in self._told:
+            self.merge.end(self._told[child][1])
+        what, how = child.what, how_ended(status)
+        if child.exit_text:
+            how += f": {child.exit_text}"
+        self.starts.tell("ended", what.key)
+        if child.is_stopping or child.has_failed:
+            if status < 0 and not (child.is_stuck or status == -signal.SIGINT):
+                self.notes.append(f"{what.name}, told to end, {how}")
+            return
+        if not child.has_begun:
+            if self._refusal is None:
+                self._refusal = RunError(f"the process of {what.name} {how} before it began")
+            return
+        if what.respawn is not None and self._restart(what):
+            self.notes.append(f"{what.name} {how} at {self._at} s, and was started again")
+        elif status < 0 and not what.may_fail:
+            self.fail(RunError(f"{what.name} {how}, {self._at} s after the start of the run"))
+        elif not what.is_main and not what.may_fail:
+            self.fail(RunError(f"{what.name} {how} in the middle of the run, at {self._at} s"))
+        else:
+            self.notes.append(f"{what.name} {'ended' if status == 0 else how} at {self._at} s")
+        if what.required:
+            self.stop(Stop(f"{what.key} has ended, which the run requires"))
+        if what.order.plays_bags and not has_stop(self.job):
+            self.stop(Stop("end of the bag"))
+
+    @property
+    def _at(self) -> str:
+        return format_seconds(max(time.monotonic_ns() - self.begun_ns, 0))
+
+    def _restart(self, what: ProcessStart) -> bool:
+        assert what.respawn is not None
+        delay_ns, times = what.respawn
+        with self._news:
+            if times is not None and self._restarted[what.key] >= times:
+                return False
+            self._restarted[what.key] += 1
+            self._restarts.append((time.monotonic_ns() + delay_ns, what))
+        return True
+
+    # -- the run --------------------------------------------------------------------------------
+
+    def go_on(self) -> None:
+        """Let the processes begin, as the job says, and wait until the run ends."""
+        self.span_writer.start()
+        self.begun_ns = time.monotonic_ns()
+        for child in list(self.children):
+            rule = self._rules.get(child.what.key)
+            if rule is None:
+                self._go(child)
+            else:
+                self.starts.add(child, rule)
+        for _ in self.wait():
+            for child in self.starts.due():
+                self._go(child)
+            self._start_again()
+            counts = list(self._counts.values())
+            self.look(sum(one[0] for one in counts), max((one[1] for one in counts), default=0))
+            self._look_for_mains()
+
+    def _go(self, child: ObservedProcess) -> None:
+        reader = SpanDecoder(self._ids, self._threads, self._log_type)
+        self._told[child] = reader, self.merge.source()
+        child.go()
+
+    def _start_again(self) -> None:
+        """ProcessStart what has ended and is to come again."""
+        now_ns = time.monotonic_ns()
+        with self._news:
+            due = [what for at_ns, what in self._restarts if at_ns <= now_ns]
+            self._restarts = [one for one in self._restarts if one[0] > now_ns]
+        for what in due:
+            self.starts.add(self._start(what), StartRule())
+
+    def _look_for_mains(self) -> None:
+        """End the run once every main has ended, if there is nothing else."""
+        over = all(child.is_over and child.what.is_main for child in self.children)
+        if over and not (self.starts.waiting or self._restarts):
+            self.stop(Stop("every main has ended"))
+
+    def finish(self) -> NativeResult:
+        """Stop the processes, close the trace, and say how it went.
+
+        :raises OutputError: if the trace cannot be written.
+        """
+        ended_after = sum(one[0] for one in self._counts.values())
+        for child in self.children:
+            if not child.is_over:
+                child.stop()
+        deadline = time.monotonic() + _KILLED_AFTER_S
+        for child in self.children:
+            child.join(max(deadline - time.monotonic(), 0.1))
+            if child.is_alive():
+                child.is_stuck = True
+                child.kill()
+                child.join()
+        if self.merge.late:
+            self.notes.append(
+                f"{self.merge.late} events came more than {STALLED_NS // NS_PER_S} s late from "
+                "processes that stood still, and are later in the trace than they were"
+            )
+        self.notes += missed_starts(self.job, self.starts.missed())
+        stuck = tuple(child.what.name for child in self.children if child.is_stuck)
+        unreadable, cpu_ns, beside_ns = (
+            sum(one[place] for one in self._counts.values()) for place in (2, 3, 4)
+        )
+        return self.close(
+            ended_after, stuck, unreadable, ProcessorTime(cpu_ns - beside_ns, beside_ns)
+        )
+
+    def _kill_all(self) -> None:
+        """Leave no process behind, whatever has happened."""
+        for child in self.children:
+            if not child.is_over:
+                child.kill()
+        for child in self.children:
+            child.join()
