@@ -237,12 +237,12 @@ def test_what_a_job_takes_from_outside_of_its_revisions(robot: Robot, tmp_path: 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--good", "main", "--bad", "main", "job.yaml"), "are one commit"),
+        (("--good", "main", "--bad", "main", "job.yaml"), "are the same commit"),
         (("--good", "main", "--bad", "main~1", "job.yaml"), "exchange them"),
         (("--good", "v9", "--bad", "main", "job.yaml"), "has no revision 'v9'"),
         (("--good", "-x", "--bad", "main", "job.yaml"), "has no revision '-x'"),
         (("--good", "main~1", "--bad", "main", "job.yaml", "--check", "event > 1"), "'events'?"),
-        (("--good", "main~1", "--bad", "main", "../job.yaml"), "in no checkout of a git"),
+        (("--good", "main~1", "--bad", "main", "../job.yaml"), "not in a checkout of a git"),
         (("--good", "main~1", "--bad", "main", "other.yaml"), "the good revision"),
     ],
 )

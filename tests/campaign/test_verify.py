@@ -87,7 +87,7 @@ def test_what_differs_and_is_not_published_is_found_in_the_run_in_which_it_begin
     first, _, _, *lines = done.stdout.splitlines()
     assert "one digest" in first
     assert lines[0].startswith("The events agree, but the state of /n differs: its attribute drawn")
-    assert lines[1].startswith("provoked by nothing")
+    assert lines[1].startswith("cause: not a perturbation")
     assert "drawn  0." in done.stdout  # both values
     assert "(verified.py:" in done.stdout
     assert "report it" not in done.stdout  # the job lets it pass

@@ -26,7 +26,8 @@ from rsltrace.simulation.chance.distribution import (
     Uniform,
     normal_quantile,
 )
-from rsltrace.simulation.chance.stream import RandomStream, exp, log
+from rsltrace.simulation.chance.portable_math import exp, log
+from rsltrace.simulation.chance.stream import RandomStream
 
 N = 100_000
 MS = 1_000_000

@@ -138,7 +138,7 @@ def test_one_unreadable_run_does_not_hide_the_others(
         ((A, B, "--abs", "x"), "'x' is not FIELD=TOL"),
         ((A, B, "--abs", "x=much"), "'x=much' is not FIELD=TOL"),
         ((A, B, "--rel", "x=-1"), "the tolerance -1.0 of x is not a number of 0 or more"),
-        ((A, B, "--by", "stamp"), "--by is for recordings"),
+        ((A, B, "--by", "stamp"), "--by needs a recording"),
         ((A, B, "--format", "yaml"), "'yaml' is not one of"),
         ((A, "gone.mcap"), "gone.mcap does not exist"),
     ],

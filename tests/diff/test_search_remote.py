@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 import rsltrace
 from rsltrace.errors import SetupError, TraceError, TraceFormatError
+from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
-from rsltrace.trace.mcap.source import FileSource, open_source
+from rsltrace.trace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
 from tests.range_server import RangeServer
 
@@ -112,7 +113,7 @@ def test_a_recording_at_an_address(server: RangeServer, tmp_path: Path) -> None:
     assert result.exit_code == 2
     said = " ".join(result.output.split())
     assert "plain MCAP recording" in said, said
-    assert "download a recording to compare it" in said, said
+    assert "download the recording first" in said, said
 
 
 def test_without_fsspec(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -38,7 +38,7 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     assert "check: the second comes last: /last: data == 1" in done.stdout
     found = [one for one in result_rows(folder) if one.failure is not None]
     assert found[0].failure.key == "the second comes last"
-    again = shlex.split(re.search(r"again: rsltrace (.*)", done.stdout)[1])
+    again = shlex.split(re.search(r"reproduce: rsltrace (.*)", done.stdout)[1])
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
     assert repeated.returncode == 1
     assert f"digest {found[0].digest}  events {found[0].events}" in repeated.stdout

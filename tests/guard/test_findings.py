@@ -187,9 +187,7 @@ def test_info_cat_and_diff_tell(
     report = command("diff", "a.mcap", "b.mcap")
     assert "verdict: same-input-different-output" in report
     assert "! environment: os.environ['SHIFT']  not set  |  '9'" in report
-    assert "likely cause: /n read SHIFT, not set in a and 9 in b, at m.py:" in " ".join(
-        report.split()
-    )
+    assert "likely cause: /n read SHIFT (not set in a, 9 in b) at m.py:" in " ".join(report.split())
     as_json = json.loads(command("diff", "a.mcap", "b.mcap", "--format", "json"))
     assert as_json["divergences"][0]["calls"][0] == {
         "source": "environment",
@@ -220,7 +218,7 @@ def test_a_diff_remembers_what_the_node_read_before(
     assert [(c.call, c.event_a, c.a, c.b) for c in found.calls] == [
         ("os.environ['SHIFT']", 0, "not set", "'9'")
     ]
-    assert found.root_sentence == f"/n read SHIFT, not set in a and 9 in b, at {INIT.split()[0]}"
+    assert found.root_sentence == f"/n read SHIFT (not set in a, 9 in b) at {INIT.split()[0]}"
 
 
 @pytest.mark.parametrize(

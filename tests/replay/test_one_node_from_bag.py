@@ -153,8 +153,8 @@ def test_the_command(robot: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["--bag", "bag"], "go with --node"),
-        (["--all"], "go with --node"),
+        (["--bag", "bag"], "need --node"),
+        (["--all"], "need --node"),
         (["--node", "filter", "--until", "3"], "go without --node"),
         (["--node", "filter", "--bag", "bag", "--until-diverged"], "goes without --bag"),
     ],

@@ -77,7 +77,7 @@ def test_a_trace_that_names_other_code_or_other_input(
         rsltrace.replay(here)
     done = CliRunner().invoke(cli, ["replay", "run.mcap"])
     assert done.exit_code == 2
-    assert "nothing was run; --trust runs it" in done.stderr
+    assert "nothing was run; use --trust if" in done.stderr
 
 
 def write_hostile(path: Path, overrides: tuple[str, ...]) -> None:

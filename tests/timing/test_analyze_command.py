@@ -102,10 +102,15 @@ def test_without_a_trace_the_job_is_run_and_may_be_drawn(
     ("words", "change", "error", "message"),
     [
         (["--deadline", "/nowhere=1ms"], "", JobError, "no chain ends in /nowhere"),
-        (["--reservation", "5ms/2ms"], "", UsageError, "is no reservation"),
-        (["--times", "max", "--set", "seed=1"], "", UsageError, "nothing says how long"),
+        (["--reservation", "5ms/2ms"], "", UsageError, "is not a reservation"),
+        (["--times", "max", "--set", "seed=1"], "", UsageError, "times of callbacks are unknown"),
         ([], "min_time_step: 1ms\n", JobError, "time moves on in steps"),
-        (["--plot", "picture.txt"], "", RsltraceError, "a picture is one of .png, .svg, .pdf"),
+        (
+            ["--plot", "picture.txt"],
+            "",
+            RsltraceError,
+            "must end in .png, .svg, .pdf",
+        ),
     ],
 )
 def test_what_cannot_be_analyzed_is_said(

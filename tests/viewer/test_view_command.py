@@ -67,7 +67,7 @@ def test_starting_somewhere(made: Path, tmp_path: Path) -> None:
     ("arguments", "message"),
     [
         (["--export", "x.png"], "should end in .svg or .txt"),
-        (["--export", "x.txt", "--size", "big"], "no size"),
+        (["--export", "x.txt", "--size", "big"], "is not a size"),
         (["--export", "x.txt", "--at", "soon"], "expected a time"),
         (["--export", "x.txt", "--filter", "kin:3"], "^^^"),
         (["--export", "no/such/folder/x.txt"], "cannot be written"),
@@ -108,12 +108,12 @@ def test_the_traces_of_a_folder(
     made: Path, long: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert "there is no trace and no bag in this folder" in view().output
+    assert "the working directory has no trace and no bag" in view().output
     shutil.copy(made, tmp_path / "made.mcap")
     (tmp_path / "sub").mkdir()
     shutil.copy(long, tmp_path / "sub" / "long.mcap")
     (tmp_path / "junk.mcap").write_bytes(b"junk")
-    assert "this folder has" in view().output
+    assert "the working directory has" in view().output
     found = found_in(Path())
     assert {str(entry.path) for entry in found} == {"made.mcap", "sub/long.mcap"}
     assert {entry.amount for entry in found} == {"603 events", "30,003 events"}

@@ -341,9 +341,9 @@ def test_how_it_is_called(folder: Path) -> None:
     for words in ([trace, trace, "--live"], ["--live"], [trace, "--live", "--follow"]):
         done = CliRunner().invoke(cli, ["view", *words])
         assert done.exit_code == 2
-        assert "--live works with one trace" in done.output
+        assert "--live needs one trace" in done.output
     done = CliRunner().invoke(cli, ["view", trace, "--trust"])
-    assert "are for --live" in done.output
+    assert "need --live" in done.output
 
 
 @pytest.mark.long

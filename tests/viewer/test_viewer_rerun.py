@@ -140,7 +140,7 @@ def test_how_it_is_called(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for words in (["--follow"], ["--export", "screen.txt"]):
         done = CliRunner().invoke(cli, ["view", str(made), "--rerun", *words])
         assert done.exit_code == 2
-        assert "not with --follow or --export" in done.output
+        assert "cannot be combined with --follow or --export" in done.output
 
 
 class Cursor:

@@ -24,6 +24,7 @@ from rsltrace.adapters.launch.api.parameters import ParameterFile, ParameterValu
 from rsltrace.adapters.launch.model import Attribute, Element, truth, typed
 from rsltrace.adapters.launch.substitution import parse_template
 from rsltrace.errors import JobError, nearest
+from rsltrace.trace.model.regular_file import not_regular
 
 _WITHOUT_MEANING = (
     "output",
@@ -88,6 +89,8 @@ class _FilePath(AttributeText):
         written = super()._text(context)
         path = context.file.parent / written
         if not path.is_file():
+            if path.exists():
+                raise ValueError(f"{written} is {not_regular(path)}")
             raise ValueError(f"there is no {self._what} {written}")
         return str(path)
 

@@ -134,6 +134,7 @@ def time_text(time_ns: int) -> str:
 def _yaml(values: dict[str, Any]) -> str:
     from ruamel.yaml import YAML
     from ruamel.yaml.comments import CommentedMap, CommentedSeq
+    from ruamel.yaml.representer import RoundTripRepresenter
 
     def laid_out(value: Any) -> Any:
         """Put what holds nothing but texts and numbers into one line."""
@@ -149,12 +150,16 @@ def _yaml(values: dict[str, Any]) -> str:
             made.fa.set_flow_style()
         return made
 
+    class NullRepresenter(RoundTripRepresenter):
+        """Writes ``null`` where YAML would have nothing."""
+
+    NullRepresenter.add_representer(
+        type(None), lambda dumper, _: dumper.represent_scalar("tag:yaml.org,2002:null", "null")
+    )
     yaml = YAML()
     yaml.width = 100
     yaml.indent(mapping=2, sequence=4, offset=2)
-    yaml.representer.add_representer(
-        type(None), lambda dumper, _: dumper.represent_scalar("tag:yaml.org,2002:null", "null")
-    )
+    yaml.Representer = NullRepresenter
     stream = StringIO()
     yaml.dump(laid_out(values), stream)
     return stream.getvalue()

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from rsltrace.trace.tables.rows import entity_table, event_table, output_table
+from rsltrace.trace.tables.rows import TableInput, entity_table, event_table, output_table
 from rsltrace.trace.tables.table import TraceTable
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder
     from rsltrace.trace.index import ChannelInfo
-    from rsltrace.trace.reader import Trace
 
 __all__ = ["TraceTable", "TraceTables"]
 
@@ -27,7 +26,7 @@ class TraceTables:
     timer's event) are null.
     """
 
-    def __init__(self, trace: Trace, decoder: Callable[[ChannelInfo], Decoder]) -> None:
+    def __init__(self, trace: TableInput, decoder: Callable[[ChannelInfo], Decoder]) -> None:
         self._trace = trace
         self._decoder = decoder
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +16,8 @@ from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NO_FIELD
-from rsltrace.trace.tables.rows import TextDictionary, node_names, whole_numbers
+from rsltrace.trace.tables.rows import TableInput, TextDictionary, node_names, whole_numbers
 from rsltrace.trace.tables.table import TraceTable
-
-if TYPE_CHECKING:
-    from rsltrace.trace.reader import Trace
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20
@@ -40,7 +37,7 @@ class _MessageColumn(NamedTuple):
 
 
 def message_table(
-    trace: Trace,
+    trace: TableInput,
     decoder_of: Callable[[ChannelInfo], Decoder],
     topic: str,
     fields: Sequence[str] | None,
@@ -72,7 +69,7 @@ def message_table(
 def _batches(
     arrow: Any,
     schema: Any,
-    trace: Trace,
+    trace: TableInput,
     channel: ChannelInfo,
     decoder: Decoder,
     chosen: Sequence[_MessageColumn],
@@ -122,7 +119,7 @@ def _batches(
 class _Senders:
     """By the number of a channel's message: its event and its sender."""
 
-    def __init__(self, trace: Trace, channel: ChannelInfo) -> None:
+    def __init__(self, trace: TableInput, channel: ChannelInfo) -> None:
         sent = {
             (kind.value, entity)
             for entity in trace.entities
@@ -158,7 +155,7 @@ class _Senders:
         return events, owners
 
 
-def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
+def _channel(trace: TableInput, topic: str, type_name: str | None) -> ChannelInfo:
     """Return the channel of a topic and type."""
     found = [channel for channel in trace.channels.values() if channel.topic == topic]
     if not found:
@@ -178,7 +175,7 @@ def _channel(trace: Trace, topic: str, type_name: str | None) -> ChannelInfo:
 
 
 def _selected_columns(
-    trace: Trace, decoder: Decoder, topic: str, fields: Sequence[str] | None
+    trace: TableInput, decoder: Decoder, topic: str, fields: Sequence[str] | None
 ) -> list[_MessageColumn]:
     """Return the columns for the requested fields, in order."""
     if isinstance(fields, str):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -21,14 +21,32 @@ from rsltrace.trace.model.event import (
     NO_SEQUENCE,
     EventFlag,
     EventKind,
+    Output,
     OutputKind,
 )
 from rsltrace.trace.tables.table import TraceTable
 
 if TYPE_CHECKING:
-    from rsltrace.trace.reader import Trace
+    from rsltrace.trace.index import ChannelInfo
 
 _WHOLE_MAX = np.uint64(2**63 - 1)
+
+
+class TableInput(Protocol):
+    """What a table needs of a trace."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def entities(self) -> dict[int, Entity]: ...
+    @property
+    def channels(self) -> Mapping[int, ChannelInfo]: ...
+    def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]: ...
+    def outputs(
+        self, first: int = 0, last: int | None = None
+    ) -> Iterator[npt.NDArray[np.void]]: ...
+    def channel_of(self, output: Output) -> ChannelInfo | None: ...
+    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]: ...
 
 
 class TextDictionary:
@@ -59,7 +77,7 @@ def node_names(entities: Mapping[int, Entity]) -> dict[int, str | None]:
     return {number: node.name if node and node.id else None for number, node in nodes.items()}
 
 
-def event_table(trace: Trace, first: int, last: int | None) -> TraceTable:
+def event_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
     """Return the events as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
@@ -115,7 +133,7 @@ def event_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     return TraceTable(make)
 
 
-def output_table(trace: Trace, first: int, last: int | None) -> TraceTable:
+def output_table(trace: TableInput, first: int, last: int | None) -> TraceTable:
     """Return the outputs as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
@@ -163,7 +181,7 @@ def output_table(trace: Trace, first: int, last: int | None) -> TraceTable:
     return TraceTable(make)
 
 
-def entity_table(trace: Trace) -> TraceTable:
+def entity_table(trace: TableInput) -> TraceTable:
     """Return the entities as a table."""
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
@@ -186,7 +204,7 @@ def entity_table(trace: Trace) -> TraceTable:
     return TraceTable(make)
 
 
-def whole_numbers(trace: Trace, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+def whole_numbers(trace: TableInput, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
     """Return indexes or stamps as signed integers, which can be subtracted."""
     if len(values) and values.max() > _WHOLE_MAX:
         raise TraceError(f"{trace.name}: an event is later than any time of ROS")
@@ -194,7 +212,7 @@ def whole_numbers(trace: Trace, values: npt.NDArray[np.uint64]) -> npt.NDArray[n
 
 
 def check_kinds(
-    trace: Trace, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
+    trace: TableInput, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
 ) -> None:
     """Raise TraceError for a kind that this version does not know."""
     unknown = set(np.unique(values).tolist()) - {kind.value for kind in known}
