@@ -218,8 +218,8 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
         "  a.launch.xml:4:3: demo/taker: package 'demo' has no executable 'taker'; did you mean "
         "'talker'? It has compiled, listener, script, talker",
         "  a.launch.xml:5:3: no_such_package/x (n): there is no package 'no_such_package': install "
-        "it for this Python (pip install), add its sources to search_path, or source the workspace it "
-        "is built in",
+        "it for this Python (pip install), add its sources to search_path, or source the "
+        "workspace it is built in",
         "  a.launch.xml:6:3: process './program': it belongs to no package",
         "  a.launch.xml:7:3: process 'rviz2 -d x': other programs do not run in a simulation",
         "  a.launch.xml:9:3: shutdown: a run ends by the job's stop: conditions",
