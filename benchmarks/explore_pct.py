@@ -25,7 +25,7 @@ from std_msgs.msg import UInt8
 
 from rsltrace import Simulation
 from rsltrace.job import Job
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.search.explore.steps import TrialObserver
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.policy import Pct, pct_bound
@@ -131,7 +131,7 @@ def job(policy: Mapping[str, Any], seed: int, bursts: int = 1) -> Job:
 def run(policy: Mapping[str, Any], seed: int) -> tuple[list[str], TrialObserver]:
     """Run the nodes once; return what they have received, and what there was to choose."""
     handled.clear()
-    with Session(job(policy, seed), None) as session:
+    with RunSession(job(policy, seed), None) as session:
         watch = TrialObserver(session, steps=False)
         session.begin()
         session.go_on()

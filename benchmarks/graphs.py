@@ -294,7 +294,7 @@ def run_rsltrace(
     sys.path.insert(0, str(EXAMPLES.parent))  # the checkout this file is in, installed or not
     from rsltrace import load_job
     from rsltrace import record as record_job
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
     from rsltrace.trace.writer import TraceWriter
 
     job_path = folder / "job.yaml"
@@ -307,7 +307,7 @@ def run_rsltrace(
     output = folder / "run.mcap" if record else None
     spent = Spent()
     start = perf_counter()
-    with spent.timing(Session, "go_on"), spent.timing(TraceWriter, "close"):
+    with spent.timing(RunSession, "go_on"), spent.timing(TraceWriter, "close"):
         result = record_job(load_job(job_path), output=output, force=True)
     return {
         "callbacks": int(result.events),

@@ -21,7 +21,7 @@ from rsltrace.trace.words.logs import parse_log
 
 if TYPE_CHECKING:
     from rsltrace.debug.event_history import EventLedger, Payload
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
 
 _LINES_MAX = 400
 _FLAGS = 10
@@ -125,7 +125,7 @@ class CurrentEventView:
     One object serves the whole run. ``call`` is the function that the event calls.
     """
 
-    def __init__(self, session: Session, ledger: EventLedger) -> None:
+    def __init__(self, session: RunSession, ledger: EventLedger) -> None:
         self.start_ns = session.start_ns
         self._domain = session.world.domain
         self._event = self._domain.event

@@ -33,7 +33,7 @@ from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventKind
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
 
 _LOOK_EVERY = 64
 _NEVER = 1 << 62
@@ -55,7 +55,7 @@ class Engine(EventObserver):
 
     def __init__(
         self,
-        session: Session,
+        session: RunSession,
         ledger: EventLedger,
         lines: Lines,
         *,

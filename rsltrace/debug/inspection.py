@@ -36,7 +36,7 @@ from rsltrace.simulation.middleware.overview import graph_overview
 if TYPE_CHECKING:
     from rsltrace.debug.current_event import CurrentEventView
     from rsltrace.debug.event_history import EventLedger
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
 
 # ``print EXPRESSION`` and ``DebugSession.evaluate`` take Python from the user at the prompt, in a
 # copy of a run whose code they trust: it may call methods of nodes. Text from files is never
@@ -154,7 +154,7 @@ class StoppedRun(Protocol):
     """A run that is stopped between two events."""
 
     view: CurrentEventView
-    session: Session
+    session: RunSession
     ledger: EventLedger
 
     def names(self) -> RunNames:

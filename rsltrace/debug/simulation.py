@@ -80,7 +80,7 @@ def _serve(
     from rsltrace.debug.event_history import EventLedger
     from rsltrace.replay.editing import EditObserver
     from rsltrace.run.process import RunCallbacks
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
 
     idle = _middleware_threads()
     trace = history.trace
@@ -89,7 +89,7 @@ def _serve(
         recorded = Path(os.path.abspath(trace.name))
     ledger = EventLedger(history, ends_at_size_after=None if trace is None else trace.ended_after)
     session = stack.enter_context(
-        Session(
+        RunSession(
             job,
             None,
             echo=spec["echo"],

@@ -35,7 +35,7 @@ from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
 
 
 def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
@@ -169,7 +169,7 @@ class EditObserver(EventObserver):
         self.error: EditError | None = None
         self._setting: OutsideEvent | None = None
         """The current event, if it is an edit itself."""
-        self._session: Session
+        self._session: RunSession
 
     @property
     def branches(self) -> bool:
@@ -189,7 +189,7 @@ class EditObserver(EventObserver):
             f"events, at {format_seconds(self._loop.now_ns - self._session.start_ns)} s"
         )
 
-    def attach(self, session: Session) -> None:
+    def attach(self, session: RunSession) -> None:
         self._session = session
         self._loop = session.loop
         self._dispatcher = session.world.domain.dispatcher

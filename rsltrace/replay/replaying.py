@@ -21,7 +21,7 @@ from rsltrace.replay.result import ReplayResult
 from rsltrace.replay.verification import EventVerification
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.process import preserved_process
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
 from rsltrace.trace.reader import Trace
@@ -59,7 +59,7 @@ def replay_prepared(
             f"to: replay it with --node {node}"
         )
 
-    def on_first(session: Session) -> None:
+    def on_first(session: RunSession) -> None:
         session.world.echo_logs(echo)
 
     verification = EventVerification(plan.trace, until, first=first, on_first=on_first)
@@ -102,7 +102,7 @@ def _run(
     metadata = {METADATA_EDITS: edits_metadata(edits, plan.trace)} if edits else {}
     with (
         preserved_process(),
-        Session(
+        RunSession(
             plan.job, path, force=force, observer=observer, replay=recorded, metadata=metadata
         ) as session,
     ):

@@ -18,7 +18,7 @@ from rsltrace.trace.format import REPLAY_DIVERGED
 from rsltrace.trace.model.event import EventKind
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import RunResult, Session
+    from rsltrace.run.session import RunResult, RunSession
     from rsltrace.trace.reader import Trace
     from rsltrace.trace.recorder import Recorder
 
@@ -44,7 +44,7 @@ class EventVerification(EventObserver):
         until: int | None = None,
         *,
         first: int = 0,
-        on_first: Callable[[Session], None] | None = None,
+        on_first: Callable[[RunSession], None] | None = None,
     ) -> None:
         self.verified = 0
         self.diverged = False
@@ -58,10 +58,10 @@ class EventVerification(EventObserver):
         self._first = first if on_first is not None else -1
         self._next_mark = self._limit if self._first < 1 else self._first
         self._expected = self._hashes()
-        self._session: Session
+        self._session: RunSession
         self._recorder: Recorder
 
-    def attach(self, session: Session) -> None:
+    def attach(self, session: RunSession) -> None:
         dispatcher = session.world.domain.dispatcher
         assert dispatcher.recorder is not None, "a replay is recorded"
         self._session, self._recorder = session, dispatcher.recorder

@@ -7,7 +7,7 @@ from pathlib import Path
 from rsltrace.job import Job
 from rsltrace.run.process import RunCallbacks, preserved_process
 from rsltrace.run.provenance import environment
-from rsltrace.run.session import RunResult, Session
+from rsltrace.run.session import RunResult, RunSession
 from rsltrace.run.simulation import Simulation
 
 __all__ = ["RunCallbacks", "RunResult", "Simulation", "environment", "record", "run"]
@@ -51,7 +51,7 @@ def run(
     earlier = None if replay is None else Path(replay)
     with (
         preserved_process(),
-        Session(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session,
+        RunSession(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session,
     ):
         session.begin()
         if not session.ended:

@@ -1,6 +1,6 @@
 """Stop in the middle of a run, from where runs of other jobs continue.
 
-Their jobs differ only in what comes later (``Session.becomes``), so each run is as if made from the
+Their jobs differ only in what comes later (``RunSession.becomes``): each run is as if made from the
 beginning. ``rsltrace.search.explore.prefix`` makes the copies.
 """
 
@@ -13,13 +13,13 @@ from greenlet import getcurrent
 from rsltrace.job import Job
 from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.run.driver import next_step_ns
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.loop.policy import Departures
 from rsltrace.trace.model.texts import format_seconds
 
 
-def run_up_to(session: Session, time_ns: int) -> bool:
+def run_up_to(session: RunSession, time_ns: int) -> bool:
     """Run up to and including a simulated time; return whether anything follows."""
     loop, runners = session.loop, session.world.runtime.runners
 
@@ -50,14 +50,14 @@ def why_no_branches(job: Job) -> str:
     return ""
 
 
-def why_no_branch(session: Session, job: Job) -> str:
+def why_no_branch(session: RunSession, job: Job) -> str:
     """Return why a job's run cannot branch off where a session stands, or ""."""
     first = next(_obstacles(session, job), "")
     at = format_seconds(session.loop.now_ns - session.start_ns)
     return first and f"{first} up to {at} s"
 
 
-def _obstacles(session: Session, job: Job) -> Iterator[str]:
+def _obstacles(session: RunSession, job: Job) -> Iterator[str]:
     """Yield what already differs."""
     old, loop = session.job, session.loop
     before = getattr(loop, "policy", None)
@@ -78,7 +78,7 @@ def _obstacles(session: Session, job: Job) -> Iterator[str]:
         yield "it has a fault"
 
 
-def _is_to_come(fault: FaultSpec, session: Session) -> bool:
+def _is_to_come(fault: FaultSpec, session: RunSession) -> bool:
     if fault.of_node:  # of those that come at a time, the order among what is due then is another
         return fault.event is not None and fault.event >= session.loop.events
     assert fault.message is not None

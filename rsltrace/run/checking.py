@@ -13,7 +13,7 @@ from rsltrace.run.plans.bags import PLAYER
 from rsltrace.run.plans.entries import impossible_starts
 from rsltrace.run.plans.executables import executable_source
 from rsltrace.run.process import RunCallbacks, preserved_process
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.simulation.loop.stop import Stop
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def check_job(job: Job, *, everything: bool = False) -> CheckedJob:
 
     notes: list[str] = []
     observer = RunCallbacks(note=notes.append)
-    with preserved_process(), Session(job, None, observer=observer) as session:
+    with preserved_process(), RunSession(job, None, observer=observer) as session:
         session.whole_graph = True
         session.begin()
         if session.error is not None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent
 
 from rsltrace.errors import RunError
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.stop import quiet_until_ns
 
@@ -45,7 +45,7 @@ class Driver:
     ``outside`` is where the driver stands while the loop does not run.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: RunSession) -> None:
         from rsltrace.adapters.driver import Outside
 
         self.session = session

@@ -27,7 +27,7 @@ from rsltrace.job import FaultSpec, Job
 from rsltrace.run.branching import why_no_branch as why_no_branch
 from rsltrace.run.branching import why_no_branches
 from rsltrace.run.inputs import check_output
-from rsltrace.run.session import RunResult, Session
+from rsltrace.run.session import RunResult, RunSession
 from rsltrace.trace.writer import TraceWriter
 
 # A function that runs in a copy of this process, and what comes back of it.
@@ -118,7 +118,7 @@ class ForkedRun:
         self._output = output
         self._force = force
         writer = TraceWriter(None, force=force, events_per_segment=job.record.segment_events)
-        self.session = Session(job, None, force=force, echo=echo, writer=writer)
+        self.session = RunSession(job, None, force=force, echo=echo, writer=writer)
         self.session.may_become = True
         self._descriptors: list[int] = []
         self._threads: frozenset[int] = frozenset()

@@ -135,7 +135,7 @@ class RunResult:
         return format_seconds(self.end_ns - self.start_ns)
 
 
-class Session:
+class RunSession:
     """A run under way. Use as a context manager: within it, rclpy is simulated.
 
     ``begin`` constructs the nodes and jumps to the start, ``go_on`` runs the loop until it ends (or
@@ -211,7 +211,7 @@ class Session:
             for one, other in pairs:
                 guard.descriptors.join(one, other)
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> RunSession:
         """Open everything. Whatever can be known to be wrong is found before a file is made.
 
         :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.

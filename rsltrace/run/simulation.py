@@ -15,7 +15,7 @@ from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time, parse_time_in_run
 from rsltrace.run.driver import Driver
 from rsltrace.run.forked import ForkedRun, ForkResult
-from rsltrace.run.session import RunResult, Session
+from rsltrace.run.session import RunResult, RunSession
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.model.texts import format_seconds
@@ -98,7 +98,7 @@ class Simulation:
             self._session = self._forking.session
         else:
             self._forking = None
-            self._session = Session(loaded, path, force=force, echo=echo)
+            self._session = RunSession(loaded, path, force=force, echo=echo)
         self._entered: Driver | None = None
         self._taps: dict[str, list[TopicTap]] = {}
         self._result: RunResult | None = None

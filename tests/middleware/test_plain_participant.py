@@ -72,7 +72,7 @@ def run(
     from std_srvs.srv import Trigger
 
     from rsltrace import Job, NodeSpec, StopSpec
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
     from rsltrace.trace.model.event import EventKind
 
     class Counter(Node):  # type: ignore[misc]
@@ -121,7 +121,7 @@ def run(
             return response
 
     job = Job(nodes=[NodeSpec(node=Counter)], stop=StopSpec(duration=1), seed=7, **options)
-    with Session(job, path, force=True) as session:
+    with RunSession(job, path, force=True) as session:
         session.begin()
         made: list[Stranger] = []
         world = session.world

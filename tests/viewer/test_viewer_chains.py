@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rsltrace_viewer.model import chains
 from rsltrace_viewer.model.chains import read_chains
-from rsltrace_viewer.model.plots.series import CHAIN_AGE, CHAIN_LATENCY, Source, series_of
+from rsltrace_viewer.model.plots.series import CHAIN_AGE, CHAIN_LATENCY, PlotSource, series_of
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from trace_maker import MS, START_NS, Opened
@@ -75,7 +75,7 @@ def test_chains_of_causes_and_those_that_checks_are_about(slow_once: Path) -> No
         (CHAIN_LATENCY, by_cause.name, "latency"),
         (CHAIN_AGE, by_check.name, "age"),
     ):
-        series = list(series_of(run, Source(kind, name)))[-1]
+        series = list(series_of(run, PlotSource(kind, name)))[-1]
         (chain,) = measure_latencies(
             run.trace,
             topics=name.partition(" via ")[0].split(" → "),
@@ -83,7 +83,7 @@ def test_chains_of_causes_and_those_that_checks_are_about(slow_once: Path) -> No
         ).chains
         assert series.values.tolist() == [ns / MS for ns in chain.durations(measure).tolist()]
         assert series.times.tolist() == [ns / 1e9 for ns in chain.found.output_ns.tolist()]
-    gone = list(series_of(run, Source(CHAIN_AGE, "/raw → /gone")))[-1]
+    gone = list(series_of(run, PlotSource(CHAIN_AGE, "/raw → /gone")))[-1]
     assert gone.note.startswith("nobody publishes /gone")
     run.close()
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rsltrace_viewer.model.folder import History, Marks
+from rsltrace_viewer.model.folder import Bookmarks, VisitedEvents
 from rsltrace_viewer.model.inspector.effects import effects_of
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.message_tree import Openness, Role
@@ -202,7 +202,7 @@ def test_columns_and_positions_of_a_window_agree(columns: int, length: int) -> N
 
 
 def test_history_goes_back_and_forward() -> None:
-    history = History()
+    history = VisitedEvents()
     first, second = (False, 1), (True, 5)
     history.leave(first)
     history.leave(second)
@@ -215,7 +215,7 @@ def test_history_goes_back_and_forward() -> None:
 
 
 def test_a_mark_is_that_of_all_events_in_a_row() -> None:
-    marks = Marks()
+    marks = Bookmarks()
     row = [(False, 3), (True, 4)]
     assert marks.toggle(row)
     assert [marks.of([event]) for event in [*row, (True, 3)]] == [True, True, False]

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
-from rsltrace_viewer.model.plots.series import Source, most_telling
+from rsltrace_viewer.model.plots.series import PlotSource, most_telling
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.message_values import message_values, samples, varying_values
 from rsltrace_viewer.session import Session
@@ -138,7 +138,7 @@ def test_values_that_vary_on_a_topic_come_first() -> None:
 
 
 def test_a_plot_begins_with_a_field_that_differs_or_varies() -> None:
-    fields = [Source("field", "/pose", name) for name in ("stamp", "x", "turn", "value")]
+    fields = [PlotSource("field", "/pose", name) for name in ("stamp", "x", "turn", "value")]
 
     def run(*rows: tuple[int, int, int, int]) -> list[object]:
         return [message(stamp=s, x=x, turn=t, value=v) for s, x, t, v in rows]

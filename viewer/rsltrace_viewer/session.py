@@ -19,7 +19,7 @@ from rsltrace.trace.model.texts import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
-from rsltrace_viewer.model.folder import Event, History, Marks
+from rsltrace_viewer.model.folder import Bookmarks, Event, VisitedEvents
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.message_tree import Line, Openness
@@ -28,10 +28,10 @@ from rsltrace_viewer.model.lanes import Lanes
 from rsltrace_viewer.model.logs import Logs, mark_lanes, read_logs
 from rsltrace_viewer.model.overview import Overview, read_overview
 from rsltrace_viewer.model.query import conditions
-from rsltrace_viewer.model.query.conditions import Condition
+from rsltrace_viewer.model.query.conditions import EventFilter
 from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.model.query.tokens import QueryError
-from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
+from rsltrace_viewer.model.rows import AllRows, FilteredRows, RowList
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import (
     ColumnLayout,
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from rsltrace_viewer.model.comparison import Comparison
     from rsltrace_viewer.model.plots.runs import RunPlots
 
-SEEK: dict[str, tuple[Condition, str]] = {
+SEEK: dict[str, tuple[EventFilter, str]] = {
     "raised": (conditions.RAISED, "exception"),
     "log": (conditions.ANY_LOG, "log record"),
     "warning": (conditions.log_at_least(30), "warning"),
@@ -62,7 +62,7 @@ SEEK: dict[str, tuple[Condition, str]] = {
 BOTH, RUN_A, RUN_B = "diff", "a", "b"
 """What is shown of two runs."""
 
-Sought = Mapping[str, Condition]
+Sought = Mapping[str, EventFilter]
 """By run, what its events have to fulfil: entities have numbers of their own in each."""
 
 
@@ -81,15 +81,15 @@ class Session:
             from rsltrace_viewer.model.comparison import Comparison
 
             self.view = self.comparison = Comparison(a, b)
-        self.rows: Rows = AllRows(self.view.count)
+        self.rows: RowList = AllRows(self.view.count)
         self.filter_text = ""
         self.search: Sought | None = None
         self.search_text = ""
         self.place = 0
         if self.comparison is not None:
             self.place = self.comparison.first_place or 0
-        self.history = History()
-        self.marks = Marks()
+        self.history = VisitedEvents()
+        self.marks = Bookmarks()
         self.openness = Openness()
         self.effects: Effects | None = None
         self.base_ns = a.start_ns if a.since_epoch else 0

@@ -14,7 +14,7 @@ from rsltrace.trace.reader import Trace
 NONE = -1
 
 
-class NativeTimes:
+class EventDurations:
     """The times of a native run, by the indexes of its events.
 
     ``durations`` has how long each event took, in ns, shape (events,).
@@ -53,9 +53,9 @@ class NativeTimes:
         return dict(zip(keys, since.tolist(), strict=True))
 
 
-def native_times(trace: Trace) -> NativeTimes | None:
+def native_times(trace: Trace) -> EventDurations | None:
     """Return the times of a native run, None of a simulated one.
 
     :raises TraceError: the trace is damaged.
     """
-    return NativeTimes(trace) if is_native(trace) and len(timings(trace)) else None
+    return EventDurations(trace) if is_native(trace) and len(timings(trace)) else None

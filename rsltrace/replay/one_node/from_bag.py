@@ -27,7 +27,7 @@ from rsltrace.replay.verification import interruption
 from rsltrace.run import RunCallbacks, run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
 from rsltrace.run.process import preserved_process
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
@@ -46,7 +46,7 @@ class NodeTopics:
     published: dict[str, str]
 
 
-class _NodeProbe(Session):
+class _NodeProbe(RunSession):
     """Constructs the entries of a job one by one until one has made the node."""
 
     def find(self, node: str) -> NodeTopics:

@@ -24,7 +24,7 @@ from rsltrace.trace.model.event import NO_EVENT, Output, OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
     from rsltrace.simulation.loop.loop import EventLoop
 
 _COMPARED = (
@@ -208,7 +208,7 @@ class OutputWatch(EventObserver):
         self._sent: list[tuple[int, int, int]] = []
         self._loop: EventLoop
 
-    def attach(self, session: Session) -> None:
+    def attach(self, session: RunSession) -> None:
         self._loop = session.loop
         session.world.domain.dispatcher.add_observer(self)
 

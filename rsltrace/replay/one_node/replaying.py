@@ -28,7 +28,7 @@ from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import preserved_process
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.policy import Fifo
 from rsltrace.simulation.loop.recorded_input_loop import (
@@ -112,7 +112,7 @@ class ServiceAnswers:
         return int(rows["entity"][0]) if drawn else -1
 
 
-class NodeReplaySession(Session):
+class NodeReplaySession(RunSession):
     """A session that runs one entry. The recording replaces the job's bags, stop conditions, policy
     and executors."""
 

@@ -22,7 +22,7 @@ from rsltrace.errors import (
 )
 from rsltrace.job import Job
 from rsltrace.run.process import preserved_process, search_path
-from rsltrace.run.session import RunResult, Session
+from rsltrace.run.session import RunResult, RunSession
 from rsltrace.search.explore.steps import TrialObserver, behaviours_of, final_state_of
 from rsltrace.search.explore.trial import (
     CHECK,
@@ -73,7 +73,7 @@ def run_trial(
     wants = wants or TrialOptions()
     began = time.perf_counter()
     job = source.job(trial)
-    with preserved_process(), Session(job, trace, force=True) as session:
+    with preserved_process(), RunSession(job, trace, force=True) as session:
         watch = TrialObserver(session, steps=wants.steps, fork_ns=wants.fork_ns)
         session.begin()
         if not session.ended:

@@ -27,7 +27,7 @@ from rsltrace.line_protocol import Lines
 from rsltrace.search.explore.trial import JobSource, Trial
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunSession
     from rsltrace.search.explore.outcome import TrialOptions
     from rsltrace.search.explore.steps import TrialObserver
 
@@ -200,7 +200,7 @@ class _PausedRun:
     def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any], stack: ExitStack) -> None:
         from rsltrace.run.branching import run_up_to, why_no_branches
         from rsltrace.run.process import preserved_process, skip_final_collection
-        from rsltrace.run.session import Session
+        from rsltrace.run.session import RunSession
         from rsltrace.search.explore.outcome import TrialOptions
         from rsltrace.search.explore.steps import TrialObserver
         from rsltrace.trace.writer import TraceWriter
@@ -213,7 +213,7 @@ class _PausedRun:
         self.why = why_no_branches(job)
         writer = TraceWriter(None, force=True, events_per_segment=job.record.segment_events)
         stack.enter_context(preserved_process())
-        self.session: Session = Session(job, None, force=True, writer=writer)
+        self.session: RunSession = RunSession(job, None, force=True, writer=writer)
         self.session.may_become = True
         stack.enter_context(self.session)
         self._watch: TrialObserver = TrialObserver(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.run.session import Session
+from rsltrace.run.session import RunSession
 from rsltrace.search.explore.trial import TrialStep
 from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.policy import Candidate, ChoicePoint
@@ -153,7 +153,7 @@ class _PhaseEnd:
 class TrialObserver:
     """Observes the choices of a run's policy, from before it begins."""
 
-    def __init__(self, session: Session, *, steps: bool, fork_ns: int = -1) -> None:
+    def __init__(self, session: RunSession, *, steps: bool, fork_ns: int = -1) -> None:
         """``fork_ns``: since the start of the run, when others are forked from it (-1: never)."""
         self.order: list[tuple[int, int]] = []
         """Of each choice, which of how many was taken."""

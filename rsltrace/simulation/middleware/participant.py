@@ -61,7 +61,7 @@ class QosEvent(DomainEntity):
         return f"{self.endpoint.topic} {self.status}"
 
 
-class ActionEndpoint(Protocol):
+class NodeAction(Protocol):
     """A client or a server of an action, which is made of other endpoints."""
 
     name: str
@@ -99,7 +99,7 @@ class Participant(DomainEntity):
         self.fully_qualified_name = full_name(namespace, name)
         self.exception_handler = exception_handler
         self.state: ParticipantState | None = None
-        self.actions: list[ActionEndpoint] = []
+        self.actions: list[NodeAction] = []
         self.timers: list[Timer] = []
 
     @property

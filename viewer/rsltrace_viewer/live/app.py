@@ -16,7 +16,7 @@ from rsltrace.debug.checkpoints import Breakpoint
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.trace.model.texts import printable
-from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, Stop, Superseded
+from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, LiveStop, Superseded
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import LIVE_KEYS
@@ -188,14 +188,14 @@ class LiveApp(ViewerApp):
         self._say("running … Esc stops" if step > 0 else "running back … Esc stops")
         self._drive(lambda wanted: run(index, wanted), self._stopped)
 
-    def _stopped(self, stop: Stop) -> None:
+    def _stopped(self, stop: LiveStop) -> None:
         self.go(self.session.view.place_of(stop.event), centre=True)
         self._hit = stop.breakpoint.number if stop.breakpoint is not None else None
         self._show_breakpoints()
         self._say(stop.why)
 
     def action_escape(self) -> None:
-        """Stop what runs; otherwise end the nearest thing that can be ended."""
+        """LiveStop what runs; otherwise end the nearest thing that can be ended."""
         running = any(w.group == "live" and w.is_running for w in self.workers)
         if running and not self.prompt.asking and self._status.startswith("running"):
             with suppress(DebugError):

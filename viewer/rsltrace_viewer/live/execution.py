@@ -16,7 +16,7 @@ from rsltrace.debug.checkpoints import Breakpoint, StopReport
 from rsltrace.debug.client import DebugSession
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.source import Source
+from rsltrace_viewer.model.source import CallbackCode
 from rsltrace_viewer.model.timeline.events import node_of
 
 WATCHES_MAX = 8
@@ -37,7 +37,7 @@ class Executed:
     node: str
     before: dict[str, str]
     after: dict[str, str]
-    source: Source | None
+    source: CallbackCode | None
     watched: tuple[tuple[str, str], ...] = ()
     wrong: str = ""
 
@@ -51,7 +51,7 @@ class Executed:
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class LiveStop:
     """Where a run has stopped: at ``event``. ``why`` is for people."""
 
     event: int
@@ -93,7 +93,7 @@ class Execution:
             tuple((text, self._value(text, name)) for text in self.watches),
         )
 
-    def run_on(self, index: int, wanted: Callable[[], bool]) -> Stop:
+    def run_on(self, index: int, wanted: Callable[[], bool]) -> LiveStop:
         """Run on behind an event, to the next at which a breakpoint stops, or to the end.
 
         :raises Superseded: it is not wanted any more.
@@ -101,7 +101,7 @@ class Execution:
         self._reach(index + 1, wanted)
         return self._stop(self.session.go_on())
 
-    def run_back(self, index: int, wanted: Callable[[], bool]) -> Stop:
+    def run_back(self, index: int, wanted: Callable[[], bool]) -> LiveStop:
         """Run back to the last event before this one at which a breakpoint stops, or to the first.
 
         :raises Superseded: it is not wanted any more.
@@ -131,7 +131,7 @@ class Execution:
             if stopped.reason != "paused":
                 return stopped
 
-    def _stop(self, stopped: StopReport) -> Stop:
+    def _stop(self, stopped: StopReport) -> LiveStop:
         place = stopped.position
         event = place.index if place.is_next else place.index - 1
         why = {
@@ -142,7 +142,7 @@ class Execution:
         }.get(stopped.reason, stopped.reason)
         if stopped.breakpoint is not None:
             why = f"breakpoint {stopped.breakpoint.number}: {stopped.breakpoint.text}"
-        return Stop(min(max(event, 0), max(self._run.count - 1, 0)), why, stopped.breakpoint)
+        return LiveStop(min(max(event, 0), max(self._run.count - 1, 0)), why, stopped.breakpoint)
 
     def _attributes(self, node: str) -> dict[str, str]:
         with suppress(DebugError):  # not constructed yet, or destroyed
@@ -150,12 +150,12 @@ class Execution:
             return {name: _ADDRESS.sub("", value) for name, value in found.items()}
         return {}
 
-    def _source(self) -> Source | None:
+    def _source(self) -> CallbackCode | None:
         found: dict[str, Any] | None = self.session.inspect("source")
         if not found:
             return None
         lines = tuple(str(line) for line in found["lines"])
-        return Source(found["file"], int(found["line"]), found["name"], lines, at=found["at"])
+        return CallbackCode(found["file"], int(found["line"]), found["name"], lines, at=found["at"])
 
     def _value(self, expression: str, node: str) -> str:
         for owner in (node, None):

@@ -25,7 +25,7 @@ Event = tuple[bool, int]
 _KEPT = 500
 
 
-class History:
+class VisitedEvents:
     """Events visited. Going somewhere new after going back drops what lay ahead, as in browsers."""
 
     def __init__(self) -> None:
@@ -56,7 +56,7 @@ class History:
         return self._ahead.pop()
 
 
-class Marks:
+class Bookmarks:
     """Marked events. A row of two runs is marked with all events in it."""
 
     def __init__(self) -> None:

@@ -151,7 +151,7 @@ def _add_times(
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class OverviewSection:
     """A node, callback or topic of the overview. ``share`` is its part of all events (of all
     messages; of the simulated time, where ``took`` is known). ``waited`` says how long its messages
     were on their way, ``took`` how long it ran, ``paused`` how long it waited while it ran."""
@@ -167,7 +167,7 @@ class Part:
     paused: Times | None = None
 
 
-def nodes_of(run: Run, overview: Overview) -> list[Part]:
+def nodes_of(run: Run, overview: Overview) -> list[OverviewSection]:
     """Return the nodes, the busiest first."""
     nodes: dict[str, tuple[Occurrences, Times]] = {
         node.name: (Occurrences(), Times()) for node in run.nodes
@@ -180,7 +180,7 @@ def nodes_of(run: Run, overview: Overview) -> list[Part]:
                 own[1].add(took.count, took.total_ns, took.most_ns)
     whole = _whole(run, overview)
     return _sorted(
-        Part(
+        OverviewSection(
             name,
             "node",
             name,
@@ -194,7 +194,7 @@ def nodes_of(run: Run, overview: Overview) -> list[Part]:
     )
 
 
-def callbacks_of(run: Run, overview: Overview) -> list[Part]:
+def callbacks_of(run: Run, overview: Overview) -> list[OverviewSection]:
     """Return what ran callbacks, the busiest first."""
     parts, whole = [], _whole(run, overview)
     for entity, series in overview.events.items():
@@ -203,7 +203,7 @@ def callbacks_of(run: Run, overview: Overview) -> list[Part]:
             continue
         took = overview.took.get(entity, Times())
         parts.append(
-            Part(
+            OverviewSection(
                 run.entity_name(entity),
                 found.kind.label,
                 run.node_name(entity),
@@ -228,7 +228,7 @@ def _whole(run: Run, overview: Overview) -> int:
     return max(sum(series.count for series in overview.events.values()), 1)
 
 
-def topics_of(run: Run, overview: Overview) -> list[Part]:
+def topics_of(run: Run, overview: Overview) -> list[OverviewSection]:
     """Return the topics that messages were sent on, the busiest first."""
     topics: dict[tuple[str, str], Occurrences] = {}
     for entity in run.entities.values():
@@ -240,12 +240,12 @@ def topics_of(run: Run, overview: Overview) -> list[Part]:
             own.add(series.count, series.first_ns, series.last_ns)
     total = sum(series.count for series in topics.values())
     return _sorted(
-        Part(name, kind, "", one.count, one.rate_hz, one.count / max(total, 1))
+        OverviewSection(name, kind, "", one.count, one.rate_hz, one.count / max(total, 1))
         for (name, kind), one in topics.items()
     )
 
 
-def _sorted(parts: Iterable[Part]) -> list[Part]:
+def _sorted(parts: Iterable[OverviewSection]) -> list[OverviewSection]:
     return sorted(parts, key=lambda part: (-part.share, -part.count, part.name))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace_viewer.model.query.conditions import Condition, mask_of
+from rsltrace_viewer.model.query.conditions import EventFilter, mask_of
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.view import View
 
@@ -17,8 +17,8 @@ _BLOCK = 4096
 """Places that are counted together."""
 
 
-class Rows(Protocol):
-    """Rows of a timeline, numbered from 0."""
+class RowList(Protocol):
+    """RowList of a timeline, numbered from 0."""
 
     @property
     def count(self) -> int:
@@ -56,7 +56,7 @@ class FilteredRows:
     One bit per event is kept, and a byte per place: ten megabytes for ten million events.
     """
 
-    def __init__(self, sought: Sequence[tuple[Run, Condition, bool]], view: View) -> None:
+    def __init__(self, sought: Sequence[tuple[Run, EventFilter, bool]], view: View) -> None:
         """Look in each run for what fulfils its condition. The bool says that it is run b."""
         self._found = [_Found(run, condition, other) for run, condition, other in sought]
         self._view = view
@@ -129,7 +129,7 @@ class FilteredRows:
 class _Found:
     """What fulfils a condition in one run, so far: a bit for each event of a segment."""
 
-    def __init__(self, run: Run, condition: Condition, other: bool) -> None:
+    def __init__(self, run: Run, condition: EventFilter, other: bool) -> None:
         self.run = run
         self.other = other
         self.bits: list[npt.NDArray[np.uint8] | None] = []

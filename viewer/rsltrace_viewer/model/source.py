@@ -17,7 +17,7 @@ _BYTES_MAX = 4 << 20
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class CallbackCode:
     """The callback of an event: ``line`` is the number of the first of ``lines``, ``at`` that of
     the one at which it waits, ``sent`` those from which its outputs came. ``note`` says why there
     are none, or that they may not be those of the run."""
@@ -31,7 +31,7 @@ class Source:
     sent: frozenset[int] = frozenset()
 
 
-def source_of(run: Run, index: int) -> Source | None:
+def source_of(run: Run, index: int) -> CallbackCode | None:
     """Return the callback of event ``index``; None where the trace names none.
 
     Raises TraceError, IndexError.
@@ -44,12 +44,14 @@ def source_of(run: Run, index: int) -> Source | None:
     name, _, line = place.rpartition(":")
     if found is None:
         note = "not below this folder or that of the trace: open it where the job is"
-        return Source(name, int(line) if line.isdecimal() else 1, place, (), note)
+        return CallbackCode(name, int(line) if line.isdecimal() else 1, place, (), note)
     path, first = found
     try:
         data = path.read_bytes()[:_BYTES_MAX]
     except OSError as error:
-        return Source(str(path), first, place, (), f"cannot be read: {error.strerror or error}")
+        return CallbackCode(
+            str(path), first, place, (), f"cannot be read: {error.strerror or error}"
+        )
     text = data.decode("utf-8", "replace")
     lines = text.splitlines()
     note = "" if _is_that_of(run.trace, name, data) else "changed since this run: it may be others"
@@ -59,7 +61,7 @@ def source_of(run: Run, index: int) -> Source | None:
         note = "; ".join(filter(None, (f"or it ran {places_text(places[1:])}", note)))
     last = min(_last_line(text, first), first + _LINES_MAX)
     sent = _lines_in(name, run, index)
-    return Source(str(path), first, place, tuple(lines[first - 1 : last]), note, sent=sent)
+    return CallbackCode(str(path), first, place, tuple(lines[first - 1 : last]), note, sent=sent)
 
 
 def place_of_output(run: Run, index: int, number: int) -> tuple[Path, int] | None:

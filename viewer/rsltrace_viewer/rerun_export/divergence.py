@@ -131,7 +131,7 @@ _WIDTH = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Marks:
+class DivergenceMarks:
     """What of a diff the layout shows. ``fields`` are (topic, curves) that differ."""
 
     document: str
@@ -143,7 +143,7 @@ class Marks:
     """When the runs diverge."""
 
 
-def marks_of(diff: Diff) -> Marks:
+def marks_of(diff: Diff) -> DivergenceMarks:
     """Return what the layout needs to know."""
     first = diff.shown
     here = _either(first.a, first.b) if first is not None else None
@@ -157,7 +157,7 @@ def marks_of(diff: Diff) -> Marks:
     lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
     topics = dict.fromkeys(reach.topic for each in diff.divergences for reach in each.reaches)
     stamp_ns = here.stamp_ns if here is not None else None
-    return Marks(DOCUMENT, lanes, tuple(fields), tuple(topics), stamp_ns)
+    return DivergenceMarks(DOCUMENT, lanes, tuple(fields), tuple(topics), stamp_ns)
 
 
 def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk]:

@@ -19,7 +19,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for, joining_chunks
 from rsltrace_viewer.rerun_export.divergence import (
     Distances,
-    Marks,
+    DivergenceMarks,
     distance_chunks,
     divergence_chunks,
     marks_of,
@@ -107,7 +107,7 @@ def _send(
         export_run(trace, label, clock, recording)
         for trace, label in zip(opened, labels, strict=True)
     ]
-    marks: Marks | None = None
+    marks: DivergenceMarks | None = None
     if len(opened) == 2:
         trees = [run.seen.frames for run in shown]
         recording.send_chunks(joining_chunks(list(labels), trees))

@@ -21,7 +21,7 @@ from rsltrace_viewer.rerun_export.moments import NO_NODE
 from rsltrace_viewer.rerun_export.run import Shown
 
 if TYPE_CHECKING:
-    from rsltrace_viewer.rerun_export.divergence import Marks
+    from rsltrace_viewer.rerun_export.divergence import DivergenceMarks
 
 _PLOTS_SHOWN = 3
 _PLOTS_MAX = 16
@@ -42,7 +42,7 @@ Part: TypeAlias = Container | View
 
 def blueprint(
     shown: Sequence[Shown],
-    marks: Marks | None = None,
+    marks: DivergenceMarks | None = None,
     distances: Distances | None = None,
     timeline: str = SIM_TIME,
 ) -> rrb.Blueprint:
@@ -69,7 +69,9 @@ def blueprint(
     )
 
 
-def _time_panel(shown: Sequence[Shown], marks: Marks | None, timeline: str) -> rrb.TimePanel:
+def _time_panel(
+    shown: Sequence[Shown], marks: DivergenceMarks | None, timeline: str
+) -> rrb.TimePanel:
     """Of two runs, the viewer opens on the divergence and plays what is around it, slowly enough
     to be watched, over and over."""
     if marks is None or marks.stamp_ns is None or timeline != SIM_TIME:
@@ -152,7 +154,9 @@ def _from_above(
     )
 
 
-def _plots(shown: Sequence[Shown], marks: Marks | None, distances: Distances) -> Part | None:
+def _plots(
+    shown: Sequence[Shown], marks: DivergenceMarks | None, distances: Distances
+) -> Part | None:
     """The same curves of all runs in one plot; the most telling ones at once, the rest in tabs.
 
     Of two runs, how far they are apart comes first; what is equal in both says nothing.
@@ -228,7 +232,7 @@ def _rank(topic: str, names: str) -> tuple[bool, bool, int]:
     )
 
 
-def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
+def _below(shown: Sequence[Shown], marks: DivergenceMarks | None) -> list[Part]:
     lanes = list(marks.lanes) if marks is not None else []
     logs: list[str] = []
     rates: list[str] = []

@@ -22,7 +22,7 @@ from textual.worker import get_current_worker
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
-from rsltrace_viewer.model.source import Source, source_of
+from rsltrace_viewer.model.source import CallbackCode, source_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.follow import walk
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
@@ -298,7 +298,7 @@ class Shell(App[None]):
         here = self.session.current()
         if here is not None and self.screen_stack[0].has_class("with-source"):
 
-            def arrive(found: list[Source | None] | None, done: bool) -> None:
+            def arrive(found: list[CallbackCode | None] | None, done: bool) -> None:
                 if self.session.current() == here:
                     self.source.show(found[0] if found else None)
 

@@ -12,8 +12,8 @@ from rsltrace_viewer.model.plots.series import (
     CHAIN_AGE,
     CHAIN_LATENCY,
     TELLING_MAX,
+    PlotSource,
     Series,
-    Source,
     channel_of,
     fields_of,
     series_of,
@@ -57,13 +57,13 @@ class RunPlots:
         """Return the topics with messages."""
         return list(dict.fromkeys(t for run in self._runs for t in topics_with_messages(run)))
 
-    def others(self) -> list[Source]:
+    def others(self) -> list[PlotSource]:
         """Return rates, latencies, and what is known of chains."""
         kinds = (CHAIN_LATENCY, CHAIN_AGE)
-        chains = [Source(kind, name) for name in self._chains for kind in kinds]
+        chains = [PlotSource(kind, name) for name in self._chains for kind in kinds]
         return [*dict.fromkeys(s for run in self._runs for s in sources_of(run)), *chains]
 
-    def fields(self, topic: str) -> list[Source]:
+    def fields(self, topic: str) -> list[PlotSource]:
         """Return the numeric fields of a topic. Raises TraceError."""
         of_runs = (
             fields_of(run, topic) for run in self._runs if topic in topics_with_messages(run)
@@ -105,7 +105,7 @@ class RunPlots:
         """Return the time of the selected event."""
         return None if self._stamp_ns is None else (self._stamp_ns - self._base_ns) / 1e9
 
-    def series(self, source: Source) -> Iterator[list[Series]]:
+    def series(self, source: PlotSource) -> Iterator[list[Series]]:
         """Yield the series of each run. Raises TraceError."""
         done: list[Series] = []
         for run in self._runs:

@@ -37,7 +37,7 @@ _UNITS = {"rate": "Hz", "latency": "ms", CHAIN_LATENCY: "ms", CHAIN_AGE: "ms"}
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class PlotSource:
     """Something that can be plotted. ``field`` is ``pose.position.x`` or empty."""
 
     kind: str
@@ -69,17 +69,17 @@ class Series:
 _NO_POINTS: npt.NDArray[np.float64] = np.zeros(0)
 
 
-def sources_of(run: Run) -> list[Source]:
+def sources_of(run: Run) -> list[PlotSource]:
     """Return rates and latencies of a run; fields of a topic come from ``fields_of``."""
     found = []
     counts = run.trace.message_counts
     sent = {c.topic for c in run.trace.channels.values() if counts.get(c.id)}
     for entity in _publishers(run):
         if entity.name in sent and entity.name not in _OF_EVERY_NODE:
-            found.append(Source("rate", entity.name))
+            found.append(PlotSource("rate", entity.name))
     for entity in run.entities.values():
         if entity.kind is EntityKind.SUBSCRIPTION and entity.name in {e.name for e in found}:
-            found.append(Source("latency", f"{entity.name} → {run.node_name(entity.id)}"))
+            found.append(PlotSource("latency", f"{entity.name} → {run.node_name(entity.id)}"))
     return found
 
 
@@ -95,15 +95,15 @@ def topics_with_messages(run: Run) -> list[str]:
     return sorted(dict.fromkeys(topics), key=lambda topic: topic in _OF_EVERY_NODE)
 
 
-def fields_of(run: Run, topic: str) -> list[Source]:
+def fields_of(run: Run, topic: str) -> list[PlotSource]:
     """Return the numeric fields of a topic, as its first message has them. Raises TraceError."""
     for _, _, data in run.trace.messages(topic):
         message = run.trace.decode(topic, data)
-        return [Source("field", topic, path) for path in numeric_paths(message)]
+        return [PlotSource("field", topic, path) for path in numeric_paths(message)]
     return []
 
 
-def series_of(run: Run, source: Source) -> Iterator[Series]:
+def series_of(run: Run, source: PlotSource) -> Iterator[Series]:
     """Yield a series as it becomes known, the last one whole. Raises TraceError."""
     if source.kind == "field":
         yield from _field_series(run, source)
@@ -141,7 +141,7 @@ def numeric_paths(value: Any, path: str = "") -> Iterator[str]:
                 yield from numeric_paths(getattr(value, field.name), inner)
 
 
-def most_telling(fields: Sequence[Source], messages: Sequence[Sequence[object]]) -> Source:
+def most_telling(fields: Sequence[PlotSource], messages: Sequence[Sequence[object]]) -> PlotSource:
     """Return the field of a topic to plot first, given some of its messages in each run.
 
     A field that differs between the runs comes before one that varies, and that before constants;
@@ -200,7 +200,7 @@ def channel_of(run: Run, topic: str) -> ChannelInfo | None:
     return next((c for c in channels if c.topic == topic and counts.get(c.id)), None)
 
 
-def _field_series(run: Run, source: Source) -> Iterator[Series]:
+def _field_series(run: Run, source: PlotSource) -> Iterator[Series]:
     trace = run.trace
     channel = channel_of(run, source.name)
     if channel is None:
@@ -398,11 +398,11 @@ class PlotData(Protocol):
         """Return the topics with messages."""
         ...
 
-    def others(self) -> list[Source]:
+    def others(self) -> list[PlotSource]:
         """Return what else can be plotted: rates, latencies."""
         ...
 
-    def fields(self, topic: str) -> list[Source]:
+    def fields(self, topic: str) -> list[PlotSource]:
         """Return the numeric fields of a topic."""
         ...
 
@@ -418,7 +418,7 @@ class PlotData(Protocol):
         """Return the time of what is selected."""
         ...
 
-    def series(self, source: Source) -> Iterator[list[Series]]:
+    def series(self, source: PlotSource) -> Iterator[list[Series]]:
         """Yield the series of each run as they become known, the last time whole."""
         ...
 

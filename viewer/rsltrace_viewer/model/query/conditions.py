@@ -29,7 +29,7 @@ def ids(found: Iterable[int]) -> Ids:
     return np.array(sorted(found), dtype=np.uint32)
 
 
-class Condition(Protocol):
+class EventFilter(Protocol):
     """Something an event can fulfil."""
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
@@ -207,7 +207,7 @@ class WithFinding:
 class Not:
     """Events that do not fulfil ``inner``."""
 
-    inner: Condition
+    inner: EventFilter
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
         """Return the mask."""
@@ -222,7 +222,7 @@ class Not:
 class All:
     """Events that fulfil all of ``parts``; put the cheap ones first."""
 
-    parts: tuple[Condition, ...]
+    parts: tuple[EventFilter, ...]
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
         """Return the mask."""
@@ -242,7 +242,7 @@ class All:
 class Any:
     """Events that fulfil one of ``parts``."""
 
-    parts: tuple[Condition, ...]
+    parts: tuple[EventFilter, ...]
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
         """Return the mask."""
@@ -256,7 +256,7 @@ class Any:
         return any(part.can_be_in(run, number) for part in self.parts)
 
 
-def of_nodes(run: Run, owners: frozenset[int]) -> Condition:
+def of_nodes(run: Run, owners: frozenset[int]) -> EventFilter:
     """Return the condition of belonging to nodes (by their ids), their constructors included."""
     own = ids(e.id for e in run.entities.values() if e.node in owners)
 
@@ -291,20 +291,20 @@ def says(text: str) -> WithOutput:
     return WithOutput(kinds, lambda run, output: folded in run.words.output(output).casefold())
 
 
-RAISED: Condition = Any(
+RAISED: EventFilter = Any(
     (WithFlag(EventFlag.RAISED), WithOutput(frozenset((OutputKind.EXCEPTION,))))
 )
-GUARD_FINDING: Condition = WithFinding()
-ANY_LOG: Condition = WithOutput(frozenset((OutputKind.LOG,)))
+GUARD_FINDING: EventFilter = WithFinding()
+ANY_LOG: EventFilter = WithOutput(frozenset((OutputKind.LOG,)))
 
 
-def mask_of(run: Run, condition: Condition, number: int) -> tuple[Segment, Mask]:
+def mask_of(run: Run, condition: EventFilter, number: int) -> tuple[Segment, Mask]:
     """Return segment ``number`` and which of its events fulfil ``condition``."""
     segment = run.segment(number)
     return segment, condition.mask(run, segment, np.ones(len(segment.events), dtype=np.bool_))
 
 
-def find(run: Run, condition: Condition, start: int, step: int) -> Iterator[int | None]:
+def find(run: Run, condition: EventFilter, start: int, step: int) -> Iterator[int | None]:
     """Walk from event ``start`` (which does not count) on, by ``step`` 1 or back by -1.
 
     Yields None after each segment without a match, so that a caller may stop or show progress,

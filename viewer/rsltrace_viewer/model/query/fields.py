@@ -21,7 +21,7 @@ from rsltrace.trace.segments import output_of
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace_viewer.model.query import conditions
-from rsltrace_viewer.model.query.conditions import Condition, Mask
+from rsltrace_viewer.model.query.conditions import EventFilter, Mask
 from rsltrace_viewer.model.query.tokens import (
     LARGEST,
     QueryError,
@@ -156,7 +156,7 @@ def _names(message: object) -> Iterator[str]:
         yield from _names(getattr(message, name))
 
 
-def _read_node(run: Run, token: Token) -> Condition:
+def _read_node(run: Run, token: Token) -> EventFilter:
     owners = set()
     for part in alternatives(token):
         matching = {node.id for node in run.nodes if is_named(part.text, node.name)}
@@ -167,7 +167,7 @@ def _read_node(run: Run, token: Token) -> Condition:
     return conditions.of_nodes(run, frozenset(owners))
 
 
-def _read_entity(run: Run, token: Token) -> Condition:
+def _read_entity(run: Run, token: Token) -> EventFilter:
     found = set()
     for part in alternatives(token):
         number = part.text.removeprefix("#")
@@ -182,7 +182,7 @@ def _read_entity(run: Run, token: Token) -> Condition:
     return conditions.OfEntities(conditions.ids(found))
 
 
-def _read_topic(run: Run, token: Token) -> Condition:
+def _read_topic(run: Run, token: Token) -> EventFilter:
     found = set()
     for part in alternatives(token):
         matching = {
@@ -199,7 +199,7 @@ def _read_topic(run: Run, token: Token) -> Condition:
     return conditions.OfEntities(conditions.ids(found), outputs=True)
 
 
-def _read_type(run: Run, token: Token) -> Condition:
+def _read_type(run: Run, token: Token) -> EventFilter:
     parts = alternatives(token)
     found = {
         e.id
@@ -227,11 +227,11 @@ def _kind_choices() -> dict[str, int]:
     }
 
 
-def _read_kind(run: Run, token: Token) -> Condition:
+def _read_kind(run: Run, token: Token) -> EventFilter:
     return conditions.OfKinds(np.array(_choose(token, _kind_choices(), "kind"), dtype=np.uint8))
 
 
-def _read_out(run: Run, token: Token) -> Condition:
+def _read_out(run: Run, token: Token) -> EventFilter:
     choices = {kind.label: int(kind) for kind in OutputKind}
     kinds = _choose(token, choices, "kind of output")
     return conditions.WithOutput(frozenset(OutputKind(kind) for kind in kinds))
@@ -242,11 +242,11 @@ def level_of(token: Token) -> int:
     return min(_choose(token, LOG_LEVELS, "level"))
 
 
-def _read_level(run: Run, token: Token) -> Condition:
+def _read_level(run: Run, token: Token) -> EventFilter:
     return conditions.log_at_least(level_of(token))
 
 
-_STATES: dict[str, Condition] = {
+_STATES: dict[str, EventFilter] = {
     "raised": conditions.RAISED,
     "suspended": conditions.WithFlag(EventFlag.SUSPENDED),
     "silent": conditions.Silent(),
@@ -254,7 +254,7 @@ _STATES: dict[str, Condition] = {
 }
 
 
-def _read_is(run: Run, token: Token) -> Condition:
+def _read_is(run: Run, token: Token) -> EventFilter:
     found = []
     for part in alternatives(token):
         if part.text.lower() not in _STATES:
@@ -270,7 +270,7 @@ def whole_number(text: str) -> int:
     return min(int(text), LARGEST)
 
 
-def _read_time(run: Run, token: Token) -> Condition:
+def _read_time(run: Run, token: Token) -> EventFilter:
     start_ns = run.trace.start_ns
 
     def stamp_ns(text: str) -> int:
@@ -279,23 +279,23 @@ def _read_time(run: Run, token: Token) -> Condition:
     return conditions.Between("stamp", *number_range(token, stamp_ns, "a time"))
 
 
-def _read_index(run: Run, token: Token) -> Condition:
+def _read_index(run: Run, token: Token) -> EventFilter:
     return conditions.Between("index", *number_range(token, whole_number, "an index"))
 
 
-def _read_hash(run: Run, token: Token) -> Condition:
+def _read_hash(run: Run, token: Token) -> EventFilter:
     digits = token.text.lower()
     if not re.fullmatch(r"[0-9a-f]{1,16}", digits):
         raise QueryError("a hash has 1 to 16 digits of 0-9 and a-f", token.start, token.end)
     return conditions.HashBegins(digits)
 
 
-def _read_text(run: Run, token: Token) -> Condition:
+def _read_text(run: Run, token: Token) -> EventFilter:
     folded = unquoted(token).casefold()
     return conditions.Any((conditions.says(folded), MessageText(folded)))
 
 
-def _read_where(run: Run, token: Token) -> Condition:
+def _read_where(run: Run, token: Token) -> EventFilter:
     try:
         return conditions.Where(TraceCondition(unquoted(token), run.trace))
     except ConditionError as error:
@@ -310,7 +310,7 @@ def place_of(token: Token, error: ConditionError) -> tuple[int, int]:
     return token.start + at + error.start, token.start + at + error.end
 
 
-def bare_word(run: Run, token: Token) -> Condition:
+def bare_word(run: Run, token: Token) -> EventFilter:
     """Return the condition for a word without a field: in names, logs and exceptions."""
     word = unquoted(token)
     if not word:
@@ -330,7 +330,7 @@ class Field:
     """A field of the language: what it means, how it is read, what can be completed."""
 
     help: str
-    read: Callable[[Run, Token], Condition]
+    read: Callable[[Run, Token], EventFilter]
     choices: Callable[[Run], list[str]] = lambda run: []
 
 

@@ -18,7 +18,7 @@ from typing import Generic, TypeVar
 
 from rsltrace.conditions.topic_fields import is_about_messages
 from rsltrace_viewer.model.query import conditions
-from rsltrace_viewer.model.query.conditions import Condition
+from rsltrace_viewer.model.query.conditions import EventFilter
 from rsltrace_viewer.model.query.fields import FIELDS, MessageText, bare_word
 from rsltrace_viewer.model.query.tokens import QueryError, Token, tokens
 from rsltrace_viewer.model.run import Run
@@ -75,14 +75,14 @@ class Language(Generic[T]):
     any_of: Callable[[Sequence[T]], T]
 
 
-def parse(text: str, run: Run) -> Condition | None:
+def parse(text: str, run: Run) -> EventFilter | None:
     """Return the condition that ``text`` stands for in a trace; None if it is empty.
 
     Raises QueryError.
     """
     return read(
         text,
-        Language[Condition](
+        Language[EventFilter](
             {name: partial(field.read, run) for name, field in FIELDS.items()},
             partial(bare_word, run),
             conditions.Not,
@@ -186,7 +186,7 @@ class _Parser(Generic[T]):
         return field(rest)
 
 
-def _cost(condition: Condition) -> int:
+def _cost(condition: EventFilter) -> int:
     """Numbers first, then logs, then decoded messages."""
     if isinstance(condition, (MessageText, conditions.Where)):
         return 3

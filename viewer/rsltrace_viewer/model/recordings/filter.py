@@ -49,7 +49,7 @@ _LOG_TYPE = "rcl_interfaces/msg/Log"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class TopicMessages:
     """Some messages of a topic: those from number ``start`` on, as many as ``data`` has."""
 
     recording: Recording
@@ -76,20 +76,20 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class TopicCondition:
     """Which messages of a part fulfil something: ``mask(part, among)``, where only those in
     ``among`` need an answer. ``reads``: it looks into messages."""
 
-    mask: Callable[[Part, Mask], Mask]
+    mask: Callable[[TopicMessages, Mask], Mask]
     reads: bool = False
 
 
-def read_filter(text: str, recordings: Sequence[Recording]) -> Condition | None:
+def read_filter(text: str, recordings: Sequence[Recording]) -> TopicCondition | None:
     """Return the condition that ``text`` stands for; None if it is empty. Raises QueryError."""
     topics, types = _names(recordings)
     return read(
         text,
-        Language[Condition](
+        Language[TopicCondition](
             {
                 "topic": partial(_named, topics, lambda topic: topic.name, "topic"),
                 "type": partial(_named, types, lambda topic: topic.type, "type"),
@@ -100,7 +100,7 @@ def read_filter(text: str, recordings: Sequence[Recording]) -> Condition | None:
                 "where": partial(_where, topics),
             },
             _bare,
-            lambda one: Condition(lambda part, among: ~one.mask(part, among), one.reads),
+            lambda one: TopicCondition(lambda part, among: ~one.mask(part, among), one.reads),
             _all_of,
             _any_of,
         ),
@@ -114,7 +114,7 @@ def choices(recordings: Sequence[Recording]) -> Choices:
     return {name: partial(list, known.get(name, [])) for name in FIELDS}
 
 
-def steps_of(condition: Condition, recording: Recording, topic: Topic) -> Iterator[Mask]:
+def steps_of(condition: TopicCondition, recording: Recording, topic: Topic) -> Iterator[Mask]:
     """Yield which messages of a topic fulfil a condition, some of them at a time. Messages that
     are not kept in memory are read again. Raises BagError, TraceError."""
     with ExitStack() as stack:
@@ -123,7 +123,7 @@ def steps_of(condition: Condition, recording: Recording, topic: Topic) -> Iterat
             source = stack.enter_context(open_source(recording.path))
             messages = (bytes(found[2]) for found in source.read([topic.number]))
         for start in range(0, len(topic.stamps), _PER_STEP):
-            part = Part(recording, topic, start, list(islice(messages, _PER_STEP)))
+            part = TopicMessages(recording, topic, start, list(islice(messages, _PER_STEP)))
             yield condition.mask(part, part.all(True))
 
 
@@ -132,7 +132,7 @@ def _names(recordings: Sequence[Recording]) -> tuple[list[str], list[str]]:
     return sorted({topic.name for topic in topics}), sorted({topic.type for topic in topics})
 
 
-def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token) -> Condition:
+def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token) -> TopicCondition:
     wanted = set()
     for part in alternatives(token):
         matching = {name for name in names if is_named(part.text, name)}
@@ -140,10 +140,10 @@ def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token
             known = ", ".join(names[:8])
             raise QueryError(f"no {what} matches; there are {known}", part.start, part.end)
         wanted |= matching
-    return Condition(lambda part, among: part.all(of(part.topic) in wanted))
+    return TopicCondition(lambda part, among: part.all(of(part.topic) in wanted))
 
 
-def _time(token: Token) -> Condition:
+def _time(token: Token) -> TopicCondition:
     def limits(start_ns: int) -> tuple[int, int]:
         def stamp_ns(text: str) -> int:
             return parse_time_in_run(text).stamp_ns(start_ns)
@@ -152,7 +152,7 @@ def _time(token: Token) -> Condition:
 
     limits(0)  # which says what is wrong with it
 
-    def between(part: Part, among: Mask) -> Mask:
+    def between(part: TopicMessages, among: Mask) -> Mask:
         stamps = np.array(part.topic.stamps[part.start : part.end], dtype=np.int64)
         try:
             low, high = limits(part.recording.start_ns)
@@ -161,22 +161,22 @@ def _time(token: Token) -> Condition:
         found: Mask = (stamps >= low) & (stamps <= min(high, 2**63 - 1))
         return found
 
-    return Condition(between)
+    return TopicCondition(between)
 
 
-def _index(token: Token) -> Condition:
+def _index(token: Token) -> TopicCondition:
     low, high = number_range(token, whole_number, "an index")
 
-    def between(part: Part, among: Mask) -> Mask:
+    def between(part: TopicMessages, among: Mask) -> Mask:
         places = np.arange(part.start, part.end, dtype=np.uint64)
         found: Mask = (places >= np.uint64(low)) & (places <= np.uint64(high))
         return found
 
-    return Condition(between)
+    return TopicCondition(between)
 
 
-def _says(folded: str) -> Condition:
-    def says(part: Part, among: Mask) -> Mask:
+def _says(folded: str) -> TopicCondition:
+    def says(part: TopicMessages, among: Mask) -> Mask:
         def accept(data: bytes) -> bool:
             try:
                 return folded in str(to_plain(part.recording.decode(part.topic, data))).casefold()
@@ -185,10 +185,10 @@ def _says(folded: str) -> Condition:
 
         return part.each(accept, among)
 
-    return Condition(says, reads=True)
+    return TopicCondition(says, reads=True)
 
 
-def _level(token: Token) -> Condition:
+def _level(token: Token) -> TopicCondition:
     least = level_of(token)
 
     def accept(data: bytes) -> bool:
@@ -197,14 +197,14 @@ def _level(token: Token) -> Condition:
         except ValueError:
             return False
 
-    def logged(part: Part, among: Mask) -> Mask:
+    def logged(part: TopicMessages, among: Mask) -> Mask:
         is_log = part.topic.type == _LOG_TYPE
         return part.each(accept, among) if is_log else part.all(False)
 
-    return Condition(logged, reads=True)
+    return TopicCondition(logged, reads=True)
 
 
-def _where(topics: list[str], token: Token) -> Condition:
+def _where(topics: list[str], token: Token) -> TopicCondition:
     try:
         found = OF_MESSAGE.match(with_topic_prefix(unquoted(token)))
         if found is None:
@@ -216,7 +216,7 @@ def _where(topics: list[str], token: Token) -> Condition:
     except ConditionError as error:
         raise QueryError(error.message, *place_of(token, error)) from None
 
-    def holds(part: Part, among: Mask) -> Mask:
+    def holds(part: TopicMessages, among: Mask) -> Mask:
         if part.topic.name != found[1]:
             return part.all(False)
         start = StartOfTrace(part.recording.start_ns)
@@ -230,27 +230,27 @@ def _where(topics: list[str], token: Token) -> Condition:
 
         return part.each(accept, among)
 
-    return Condition(holds, reads=True)
+    return TopicCondition(holds, reads=True)
 
 
-def _bare(token: Token) -> Condition:
+def _bare(token: Token) -> TopicCondition:
     word = unquoted(token)
     if not word:
         raise QueryError("there is nothing between the quotes", token.start, token.end)
     says = _says(word.casefold())
 
-    def meant(part: Part, among: Mask) -> Mask:
+    def meant(part: TopicMessages, among: Mask) -> Mask:
         if is_named(word, part.topic.name) or is_named(word, part.topic.type):
             return part.all(True)
         return says.mask(part, among) if part.topic.type == _LOG_TYPE else part.all(False)
 
-    return Condition(meant, reads=True)
+    return TopicCondition(meant, reads=True)
 
 
-def _all_of(parts: Sequence[Condition]) -> Condition:
+def _all_of(parts: Sequence[TopicCondition]) -> TopicCondition:
     ordered = sorted(parts, key=lambda one: one.reads)
 
-    def all_of(part: Part, among: Mask) -> Mask:
+    def all_of(part: TopicMessages, among: Mask) -> Mask:
         left: Mask = among.copy()
         for one in ordered:
             if not left.any():
@@ -258,16 +258,16 @@ def _all_of(parts: Sequence[Condition]) -> Condition:
             left &= one.mask(part, left)
         return left
 
-    return Condition(all_of, ordered[-1].reads)
+    return TopicCondition(all_of, ordered[-1].reads)
 
 
-def _any_of(parts: Sequence[Condition]) -> Condition:
+def _any_of(parts: Sequence[TopicCondition]) -> TopicCondition:
     ordered = sorted(parts, key=lambda one: one.reads)
 
-    def any_of(part: Part, among: Mask) -> Mask:
+    def any_of(part: TopicMessages, among: Mask) -> Mask:
         found = part.all(False)
         for one in ordered:
             found |= one.mask(part, among & ~found)
         return found
 
-    return Condition(any_of, ordered[-1].reads)
+    return TopicCondition(any_of, ordered[-1].reads)

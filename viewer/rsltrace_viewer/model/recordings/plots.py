@@ -10,8 +10,8 @@ from rsltrace.errors import TraceError
 from rsltrace_viewer.model.plots.series import (
     SAMPLES_MAX,
     TELLING_MAX,
+    PlotSource,
     Series,
-    Source,
     numeric_paths,
     value_at,
 )
@@ -36,16 +36,16 @@ class RecordingPlots:
         """Return the topics with messages."""
         return list(dict.fromkeys(name for name, _ in self._session.keys if self._of(name)))
 
-    def others(self) -> list[Source]:
+    def others(self) -> list[PlotSource]:
         """Return the rates."""
-        return [Source("rate", name) for name in self.topics()]
+        return [PlotSource("rate", name) for name in self.topics()]
 
-    def fields(self, topic: str) -> list[Source]:
+    def fields(self, topic: str) -> list[PlotSource]:
         """Return the numeric fields of a topic's first message. Raises TraceError."""
         for recording, found in self._of(topic):
             if found.data and found.data[0] is not None:
                 message = recording.decode(found, found.data[0])
-                return [Source("field", topic, path) for path in numeric_paths(message)]
+                return [PlotSource("field", topic, path) for path in numeric_paths(message)]
         return []
 
     def messages(self, topic: str) -> list[list[object]]:
@@ -74,7 +74,7 @@ class RecordingPlots:
         time = session.message_text(min(session.row, session.pairs.count - 1))[0]
         return float(time) if time else None
 
-    def series(self, source: Source) -> Iterator[list[Series]]:
+    def series(self, source: PlotSource) -> Iterator[list[Series]]:
         """Yield the series of each recording. Raises TraceError."""
         done: list[Series] = []
         for recording, topic in self._of(source.name):

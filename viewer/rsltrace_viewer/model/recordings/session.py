@@ -15,7 +15,7 @@ from rsltrace.job.values.times import START, TimeInRun
 from rsltrace.trace.decode import to_plain
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace_viewer.model.inspector.message_tree import Line, Openness, Role, message_lines
-from rsltrace_viewer.model.recordings.filter import Condition, Mask, read_filter, steps_of
+from rsltrace_viewer.model.recordings.filter import Mask, TopicCondition, read_filter, steps_of
 from rsltrace_viewer.model.recordings.recording import Pairs, Recording, Topic
 from rsltrace_viewer.model.timeline.message_values import (
     SAMPLES_MAX,
@@ -36,7 +36,7 @@ Key = tuple[str, str]
 class Matches:
     """Looks at a topic when it is asked to, and remembers what it found."""
 
-    def __init__(self, condition: Condition) -> None:
+    def __init__(self, condition: TopicCondition) -> None:
         self._condition = condition
         self._masks: dict[Key, list[Mask]] = {}
 

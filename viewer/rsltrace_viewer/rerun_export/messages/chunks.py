@@ -38,9 +38,9 @@ from rsltrace_viewer.rerun_export.columns import (
 )
 from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerRows
 from rsltrace_viewer.rerun_export.messages.rows import (
+    ComponentRows,
     Curves,
     LoadedColumns,
-    Rows,
     Stream,
     Waiting,
     curves_of,
@@ -190,7 +190,7 @@ class MessageRows:
                 return self._curve_names(path, names)
         return loaded_chunk(path, (), columns)
 
-    def _as_it_is(self, rows: Rows) -> Iterator[Chunk]:
+    def _as_it_is(self, rows: ComponentRows) -> Iterator[Chunk]:
         """What the loader made, on our timelines, with the run's own frames."""
         columns = []
         for f, column in rows.columns:
@@ -212,7 +212,7 @@ class MessageRows:
         if _CLOUD in names:
             yield from self._cloud(rows, names)
 
-    def _cloud(self, rows: Rows, names: set[str]) -> Iterator[Chunk]:
+    def _cloud(self, rows: ComponentRows, names: set[str]) -> Iterator[Chunk]:
         """Colour a cloud that has no colours of its own, and note where it is."""
         positions = next(column for f, column in rows.columns if f.name == _CLOUD)
         if _CLOUD_COLOURS not in names:
@@ -224,7 +224,7 @@ class MessageRows:
             low, high = box if known is None else known
             self.seen.extents[rows.path] = np.minimum(low, box[0]), np.maximum(high, box[1])
 
-    def _derived(self, rows: Rows) -> Iterator[Chunk]:
+    def _derived(self, rows: ComponentRows) -> Iterator[Chunk]:
         by_name = {f.name: column for f, column in rows.columns}
         for name, column in by_name.items():
             type_name, _, kind = name.partition(":")
@@ -291,11 +291,13 @@ class MessageRows:
     def _paint(self, topic: str) -> Paint:
         return Paint(colour(self._paths.label, self._numbers[topic]))
 
-    def _draw(self, rows: Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
+    def _draw(
+        self, rows: ComponentRows, drawing: Drawing, messages: pa.StructArray
+    ) -> Iterator[Chunk]:
         frames = frames_of(messages) or [""] * len(messages)
         yield from self._drawing(rows, drawing, frames)
 
-    def _drawing(self, rows: Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
+    def _drawing(self, rows: ComponentRows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
         path = f"{rows.path}/{drawing.part}"
         names = pa.array([str(name) for name in frames])
         column = lists(np.ones(len(frames), dtype=np.int64), names)
@@ -310,7 +312,7 @@ class MessageRows:
             paint = self._paint(rows.topic)
             self._trails.add_poses(rows.path, rows.topic, first, paint, drawing.position)
 
-    def _loaded_pose(self, rows: Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
+    def _loaded_pose(self, rows: ComponentRows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
         """The loader knows poses, but draws nothing where they are."""
         positions = _flat(by_name["InstancePoses3D:translations"], 3)
         quaternions = _flat(by_name["InstancePoses3D:quaternions"], 4)
@@ -319,7 +321,9 @@ class MessageRows:
             drawing = pose_drawing(positions, quaternions, self._paint(rows.topic))
             yield from self._drawing(rows, drawing, frames)
 
-    def _fix(self, rows: Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
+    def _fix(
+        self, rows: ComponentRows, fixes: pa.Array, altitude: pa.Array | None
+    ) -> Iterator[Chunk]:
         self.seen.fixes[rows.path] = None
         positions = _flat(fixes, 2)
         self._trails.add_fixes(rows.path, self._paint(rows.topic), positions)
@@ -331,7 +335,7 @@ class MessageRows:
 
     # Curves.
 
-    def _curves(self, rows: Rows, curves: Iterator[Curves]) -> Iterator[Chunk]:
+    def _curves(self, rows: ComponentRows, curves: Iterator[Curves]) -> Iterator[Chunk]:
         for curve in curves:
             path = rows.path + (join(curve.path) if curve.path else "")
             scalars = rr.Scalars.descriptor_scalars()
@@ -344,7 +348,7 @@ class MessageRows:
                 self.seen.topic_of[path] = rows.topic
                 yield from self._curve_names(path, names)
 
-    def _note_points(self, path: str, rows: Rows, values: pa.ListArray) -> None:
+    def _note_points(self, path: str, rows: ComponentRows, values: pa.ListArray) -> None:
         if self._paths.label:
             points = (rows.stamps_ns, rows.events, values)
             self.seen.points.setdefault(path, []).append(points)

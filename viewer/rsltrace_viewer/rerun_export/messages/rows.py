@@ -1,4 +1,4 @@
-"""Rows of messages on their way from Rerun's loader to our recording.
+"""ComponentRows of messages on their way from Rerun's loader to our recording.
 
 The chunks of a trace are cut where its events are, so those of a slow topic hold few rows each.
 Rows of one kind wait here until there are enough for a chunk: faster to write, and to view.
@@ -182,7 +182,7 @@ LoadedColumns = tuple[tuple[pa.Field, pa.Array], ...]
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class ComponentRows:
     """The rows of one chunk: where they belong and what they hold."""
 
     topic: str
@@ -195,7 +195,7 @@ class Rows:
 
 @dataclass(slots=True)
 class Waiting:
-    """Rows of one sequence that wait to become one chunk."""
+    """ComponentRows of one sequence that wait to become one chunk."""
 
     topic: str
     path: str
@@ -225,7 +225,7 @@ class Waiting:
         """Whether it is time to make a chunk of them."""
         return self.rows >= _ROWS_PER_CHUNK or self.bytes >= _BYTES_PER_CHUNK
 
-    def joined(self, clock: Clock) -> Rows:
+    def joined(self, clock: Clock) -> ComponentRows:
         """Return all rows."""
         if len(self.parts) == 1:
             arrays = self.parts[0]
@@ -235,7 +235,7 @@ class Waiting:
         events = np.concatenate(self.events)
         times = ((SIM_TIME, clock.array(stamps)), (EVENT, pa.array(events)))
         columns = tuple(zip(self.fields, arrays, strict=True))
-        return Rows(self.topic, self.path, times, stamps, events, columns)
+        return ComponentRows(self.topic, self.path, times, stamps, events, columns)
 
 
 def loaded_columns(batch: pa.RecordBatch) -> LoadedColumns:

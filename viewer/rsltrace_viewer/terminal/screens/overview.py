@@ -19,7 +19,7 @@ from rsltrace_viewer.model.chains import Chain
 from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.overview import (
     Overview,
-    Part,
+    OverviewSection,
     Times,
     Trouble,
     callbacks_of,
@@ -52,7 +52,7 @@ Choice = tuple[str, str]
 """What was chosen: ``filter`` with its text, ``event`` with its run and number (``b 12``), ``key``
 with the action that a key has among the events, ``more`` with the table to be shown whole."""
 _Line = tuple[Pieces, Choice | None]
-_Row = Sequence[Part | None]
+_Row = Sequence[OverviewSection | None]
 """The same node, topic or callback in each run."""
 _Column = tuple[str, Callable[[_Row], str]]
 """The head of a column, and its texts."""
@@ -352,7 +352,7 @@ def _ending(run: Run, name: str) -> Pieces:
     return ((text, "plain"),)
 
 
-_TIMES_OF: dict[str, Callable[[Part], Times | None]] = {
+_TIMES_OF: dict[str, Callable[[OverviewSection], Times | None]] = {
     "takes": lambda part: part.took,
     "waits": lambda part: part.paused,
     "on the way": lambda part: part.waited,
@@ -368,7 +368,7 @@ def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[_Column]:
             yield f"{words}: {what}{', busy' * busy}", partial(_times, of, busy=busy)
 
 
-def _times(of: Callable[[Part], Times | None], row: _Row, *, busy: bool) -> str:
+def _times(of: Callable[[OverviewSection], Times | None], row: _Row, *, busy: bool) -> str:
     found = [None if part is None else of(part) for part in row]
     texts = [
         format_duration(one.mean_ns, 3) if one is not None and one.count else "" for one in found
@@ -380,7 +380,7 @@ def _times(of: Callable[[Part], Times | None], row: _Row, *, busy: bool) -> str:
     return ", ".join(text or "-" for text in texts) if any(texts) else ""
 
 
-def _some(row: _Row) -> Part:
+def _some(row: _Row) -> OverviewSection:
     return next(part for part in row if part is not None)
 
 
@@ -391,14 +391,14 @@ def _name(row: _Row, field: str) -> str:
     return printable(f"{part.name}  {part.kind}" if field == "topic" else part.name)
 
 
-def _numbers(part: Part | None) -> str:
+def _numbers(part: OverviewSection | None) -> str:
     if part is None:
         return f"{'-':>10}{'':9}"
     rate = "" if part.rate_hz is None else f"{part.rate_hz:.4g}"
     return f"{part.count:>10,}{rate:>9}"
 
 
-def _filter_of(field: str, part: Part) -> str:
+def _filter_of(field: str, part: OverviewSection) -> str:
     if field == "entity":
         return f'node:"{part.node}" entity:"{part.name}"'
     return f'{field}:"{part.node if field == "node" else part.name}"'

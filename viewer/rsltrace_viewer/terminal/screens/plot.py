@@ -21,8 +21,8 @@ from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.plots.series import (
     Plot,
     PlotData,
+    PlotSource,
     Series,
-    Source,
     difference,
     most_telling,
     plot,
@@ -111,7 +111,7 @@ class PlotScreen(Screen[None]):
     def __init__(self, data: PlotData) -> None:
         super().__init__()
         self._data = data
-        self._choices: list[Source | str] = []
+        self._choices: list[PlotSource | str] = []
         self._topic = ""
 
     def compose(self) -> ComposeResult:
@@ -150,21 +150,21 @@ class PlotScreen(Screen[None]):
         self.query_one("#what", Static).update(Content(f"plots  {printable(topic)}"))
         return True
 
-    def _fields(self, topic: str) -> list[Source]:
+    def _fields(self, topic: str) -> list[PlotSource]:
         try:
             return self._data.fields(topic)
         except RsltraceError as error:
             self.query_one("#plot", PlotView).show(printable(str(error)), [], None)
             return []
 
-    def _most_telling(self, topic: str, fields: list[Source]) -> Source:
+    def _most_telling(self, topic: str, fields: list[PlotSource]) -> PlotSource:
         try:
             messages = self._data.messages(topic)
         except RsltraceError:  # the plot will say it
             messages = []
         return most_telling(fields, messages)
 
-    def _offer(self, choices: list[Source | str], highlighted: int = 0) -> None:
+    def _offer(self, choices: list[PlotSource | str], highlighted: int = 0) -> None:
         self._choices = choices
         options = self.query_one(OptionList)
         options.clear_options()
@@ -176,7 +176,7 @@ class PlotScreen(Screen[None]):
     def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
         """Plot what is under the cursor; of a topic, a field that differs or varies."""
         choice = self._choices[event.option_index]
-        if isinstance(choice, Source):
+        if isinstance(choice, PlotSource):
             self._plot(choice)
         elif fields := self._fields(choice):
             self._plot(self._most_telling(choice, fields))
@@ -189,7 +189,7 @@ class PlotScreen(Screen[None]):
         if isinstance(choice, str):
             self._fields_level(choice)
 
-    def _plot(self, source: Source) -> None:
+    def _plot(self, source: PlotSource) -> None:
         def arrive(series: list[Series] | None, finished: bool) -> None:
             if not self.is_attached:
                 return
@@ -224,7 +224,7 @@ class PlotScreen(Screen[None]):
         options.action_cursor_down() if step > 0 else options.action_cursor_up()
 
 
-def _words(choice: Source | str) -> str:
+def _words(choice: PlotSource | str) -> str:
     if isinstance(choice, str):
         return f"{printable(choice)}  ›"
     return printable(choice.field or choice.label)

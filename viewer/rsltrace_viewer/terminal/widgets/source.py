@@ -11,7 +11,7 @@ from textual.highlight import highlight
 from textual.widgets import Static
 
 from rsltrace.trace.model.texts import printable
-from rsltrace_viewer.model.source import Source
+from rsltrace_viewer.model.source import CallbackCode
 
 
 class SourceView(VerticalScroll, can_focus=True):
@@ -27,14 +27,14 @@ class SourceView(VerticalScroll, can_focus=True):
 
     def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
-        self._shown: Source | None = None
+        self._shown: CallbackCode | None = None
 
     def compose(self) -> ComposeResult:
         """Make the text."""
         yield Static(id="note")
         yield Static(id="code")
 
-    def show(self, source: Source | None) -> None:
+    def show(self, source: CallbackCode | None) -> None:
         """Show a callback, with signs at lines that wait or send; None: there is none in Python."""
         if source == self._shown and source is not None:
             return
@@ -62,7 +62,7 @@ class SourceView(VerticalScroll, can_focus=True):
         self.scroll_to(0, max(above, 0), animate=False)
 
 
-def _sign(source: Source, number: int) -> tuple[str, str]:
+def _sign(source: CallbackCode, number: int) -> tuple[str, str]:
     """Return what stands before a line, and its style: where it waits, where it sent something."""
     if number == source.at:
         return "▶", "bold $text-accent"
