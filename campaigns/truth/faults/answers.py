@@ -44,7 +44,7 @@ def _asked(rng: random.Random, guard: str, line: str) -> tuple[World, World, Tru
 def answer(rng: random.Random) -> Planted:
     a, b, truth = _asked(rng, "record", "ask({port})")
     return Planted(
-        a, b, replace(truth, first=(rf"{LIKELY}.*socket\.recv\(\), .*1\.5' in a and .*2\.5' in b",))
+        a, b, replace(truth, first=(rf"{LIKELY}.*socket\.recv\(\) \(.*1\.5' in a, .*2\.5' in b",))
     )
 
 
@@ -60,7 +60,7 @@ def http(rng: random.Random) -> Planted:
     line = 'float(urllib.request.build_opener().open("http://127.0.0.1:{port}/").read())'
     a, b, truth = _asked(rng, "record", line)
     return Planted(
-        a, b, replace(truth, first=(rf"{LIKELY}.*recv.*1\.5'.* in a and .*2\.5'.* in b",))
+        a, b, replace(truth, first=(rf"{LIKELY}.*recv.*1\.5'.* in a, .*2\.5'.* in b",))
     )
 
 
@@ -90,13 +90,13 @@ _program(
     "exit status of a program",
     'float(subprocess.call(["sh", "-c", "exit $TRUTH_VALUE"]))',
     "record",
-    rf"{LIKELY}.*Popen\(.*TRUTH_VALUE'\), exit status 4 in a and exit status 6 in b",
+    rf"{LIKELY}.*Popen\(.*TRUTH_VALUE'\) \(exit status 4 in a, exit status 6 in b\)",
 )
 _program(
     "output of a shell",
     'float(os.popen("echo $TRUTH_VALUE").read())',
     "record",
-    rf"{LIKELY}.*echo \$TRUTH_VALUE'\), b'4\\n' in a and b'6\\n' in b",
+    rf"{LIKELY}.*echo \$TRUTH_VALUE'\) \(b'4\\n' in a, b'6\\n' in b\)",
 )
 _program(
     "output of a program that is not recorded",
@@ -118,7 +118,7 @@ def _file(name: str, file: str, one: str, other: str, line: str, *top: str, says
         a.files[file] = one
         b = a.copy()
         b.files[file] = other
-        words = rf"{LIKELY}{node.full_name} read {says or file}.* in a and .* in b, at "
+        words = rf"{LIKELY}{node.full_name} read {says or file}.* in a, .* in b\) at "
         return Planted(a, b, replace(_truth(node), first=(words,)))
 
 

@@ -56,7 +56,7 @@ def only_one(rng: random.Random) -> Planted:
     a, node = _reads(rng, READ, in_constructor=rng.random() < 0.5)
     b = a.copy()
     b.environment["TRUTH_VALUE"] = "7"
-    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE, not set in a and 7 in b"
+    words = rf"{LIKELY}{node.full_name} read TRUTH_VALUE \(not set in a, 7 in b\)"
     return Planted(a, b, replace(_truth(node), first=(words,)))
 
 
@@ -107,7 +107,7 @@ def decides_on_topic(rng: random.Random) -> Planted:
     truth = Truth(
         ("graph",),
         node.full_name,
-        first=(rf"{LIKELY}{node.full_name} read TRUTH_TOPIC, /one in a and /other in b",),
+        first=(rf"{LIKELY}{node.full_name} read TRUTH_TOPIC \(/one in a, /other in b\)",),
         never=(*ALWAYS_FALSE, "TRUTH_VALUE"),
         independent=None,
     )
@@ -169,7 +169,7 @@ def name(rng: random.Random) -> Planted:
     a.files["things/one"] = "1\n"
     b = a.copy()
     b.files["things/more"] = "2\n"
-    listed = r"listed things, 1 name \(one\) in a and 2 names \(more, one\) in b, at .*:\d+"
+    listed = r"listed things \(1 name \(one\) in a, 2 names \(more, one\) in b\) at .*:\d+"
     return Planted(a, b, _truth(node, listed))
 
 
@@ -206,7 +206,7 @@ def set_order(rng: random.Random) -> Planted:
     b.hidden = "fault"
     first = (
         r"/list\W+data has the same elements in a different order",
-        rf"{LIKELY}the order of the set self\.things, at {node.module}\.py:\d+",
+        rf"{LIKELY}the order of the set self\.things at {node.module}\.py:\d+",
     )
     return Planted(a, b, replace(_truth(node), first=first, values=""))
 
