@@ -98,9 +98,9 @@ def bisect(
     behaviour.
 
     A change is a different digest, or a different result of --check or --run. Each revision runs
-    with its own job and nodes in a separate git worktree; your checkout is not touched. Both end
-    revisions run first, and twice. Revisions that do not run are skipped, as by "git bisect skip",
-    and so are those in which a node raises an exception that neither end raises.
+    with its own job and nodes in a separate git worktree; your checkout is not touched. The good
+    and the bad revision run first, twice each. Revisions that fail to run, or raise an exception
+    that neither of these two raises, are skipped, as by "git bisect skip".
 
     Exit status: 0 if one commit was found; 1 if skipped revisions leave several candidates; 2 for
     an error: the ends do not differ, the job is nondeterministic, or there is no repository.

@@ -187,11 +187,11 @@ def cat(
 
     The columns are: index, simulated time in seconds, node, kind, entity, hash of the input, hash
     of the outputs, outputs (/topic, call /service, reply /service, log LEVEL text and so on), and
-    [flags]. A line that starts with "!" is a finding of the guard in the event above it. Entities
-    that rclpy creates in every node are only counted; --json lists them.
+    [flags]. A line that starts with "!" is a finding of the guard in the event above it. Built-in
+    entities of rclpy (such as /rosout) are shown only as a count; --json lists them.
 
-    All filter options are repeatable, except times. An event must match one value of each option
-    given. Globs match whole names: --topic '/robot1/*'.
+    All filter options are repeatable, except times. An event is printed if it matches at least one
+    value of every option given. Globs match whole names: --topic '/robot1/*'.
     """
     if payloads and not as_json:
         raise click.UsageError("--payloads needs --json")

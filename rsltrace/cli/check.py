@@ -70,9 +70,11 @@ def check(
     Given a trace instead (rsltrace check run.mcap), evaluate the job's checks (checks:) on it.
     Checks that are Python functions run only if --job names the job file.
 
-    Exit status: 0 if nothing is wrong; 1 if a check fails or the graph looks wrong (incompatible
-    QoS, a subscription without a publisher, a client without a server, a topic that both a bag
-    and a node publish, a rule of the job that matches nothing); 2 if the job cannot run.
+    Problems of a graph are: incompatible QoS, a subscription without a publisher, a client
+    without a server, a topic that both a bag and a node publish, a rule that matches nothing.
+
+    Exit status: 0 if there are no problems, 1 if a check fails or the graph has a problem, 2 if
+    the job cannot run.
     """
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
@@ -189,13 +191,13 @@ def _text(job: Job, checked: CheckedJob) -> list[str]:
         if checked.unused:
             lines.append("(what nodes create later, in callbacks, is not there yet)")
     else:
-        lines.append("nothing looks wrong")
+        lines.append("no problems found")
     return lines
 
 
 def _row(link: GraphLink) -> list[str]:
     senders, receivers = (
-        ", ".join(dict.fromkeys(end.node for end in ends)) or "nobody"
+        ", ".join(dict.fromkeys(end.node for end in ends)) or "(none)"
         for ends in (link.senders, link.receivers)
     )
     return [link.name, link.type, senders, "->", receivers]

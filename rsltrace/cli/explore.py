@@ -178,9 +178,9 @@ def explore(
 ) -> int:
     """Run JOB in many callback orders and find the runs that fail.
 
-    A run fails if a check of the job (checks:) fails, a node raises an exception, the run
-    deadlocks or livelocks, reaches its timeout (stop: {timeout: …}) or crashes. Each failing run
-    is printed as an "rsltrace record" command that reproduces it.
+    A run fails if a check of the job (checks:) fails or a node raises an exception. It also fails
+    if it deadlocks, livelocks, crashes or reaches its timeout (stop: {timeout: …}). Each failing
+    run is printed as an "rsltrace record" command that reproduces it.
 
     Exit status: 0 if no run failed, 1 if one did, 2 for an error. Results so far are kept, and
     --resume continues the search.

@@ -79,10 +79,11 @@ def fit(
     simulated: Path | None,
     as_values: bool,
 ) -> None:
-    """Fit the delay: and execution: of JOB to the times of TRACE, a native run.
+    """Fit the delay: and execution: of JOB to the times of TRACE, a native run
+    (rsltrace record --native).
 
-    A simulation of the fitted job has the robot's timing. JOB is the job that was run. If you
-    leave it out, the file of that name beside TRACE or in the working directory is used.
+    A simulation of the fitted job reproduces the measured timing. JOB is the job that was run. If
+    you leave it out, the file of that name beside TRACE or in the working directory is used.
 
     A delay is the time from publishing to reception. An execution time is the time for which a
     callback occupies its executor: the callback itself, and the time that rclpy needs to start it

@@ -141,8 +141,8 @@ _VALUE_MAX = 100
 def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     """Summarize TRACE: its digest, counts, nodes, and entities with their rates.
 
-    Traces with the same digest are of identical runs. Rates count an entity's events (for
-    publishers: messages) in simulated time, from the first to the last. If the run was killed, the
+    Runs with the same digest are identical. A rate is events (for publishers: messages) per second
+    of simulated time, between the first and the last. If the run was killed, the
     summary covers what was written. A native run has no digest; its callback times are listed.
     """
     with Trace.open(trace) as opened:

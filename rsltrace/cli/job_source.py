@@ -62,7 +62,8 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 "--ros-args",
                 is_flag=True,
                 expose_value=False,
-                help="Pass the arguments up to -- to all nodes: -p, -r, --params-file.",
+                help="Pass the ROS arguments that follow (-p, -r, --params-file) to all nodes; "
+                "-- ends them.",
             ),
         )
     ):

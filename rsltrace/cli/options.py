@@ -20,7 +20,7 @@ seed_option = click.option(
 until_option = click.option(
     "--until",
     metavar="T",
-    help="Stop at time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
+    help="Stop T after the start of the run (seconds, 90s, 5ms), or at simulated time @T.",
 )
 timeout_option = click.option(
     "--timeout",

@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 @click.option(
     "--force",
     is_flag=True,
-    help="Replace an existing trace and bag once the new ones are complete (never a trace that "
-    "is read).",
+    help="Replace an existing trace and bag once the new ones are complete. A trace that this run "
+    "reads is never replaced.",
 )
 @seed_option
 @until_option
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     "--replay",
     type=click.Path(path_type=Path),
     metavar="TRACE",
-    help="Give the nodes the external values that TRACE recorded (guard: mode record).",
+    help="Give the nodes the external inputs that TRACE recorded (guard: mode record).",
 )
 @json_option
 @click.option("--print-job", is_flag=True, help="Print the job as YAML and do not run it.")

@@ -73,8 +73,8 @@ _SHOWN_MAX = 12
     "bags",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="With --node: take the input from this rosbag2 recording. TRACE may then be a job. "
-    "Repeatable.",
+    help="With --node: take the input from this rosbag2 recording. A job file may then stand in "
+    "place of TRACE. Repeatable.",
 )
 @click.option(
     "--until-diverged", is_flag=True, help="With --node: stop at the first output that differs."
@@ -121,8 +121,8 @@ def replay(
     """Run the job in TRACE again and compare every event with the recorded one.
 
     The job, launch arguments, parameters, seeds, order and recorded external values come from
-    TRACE. Nodes, bags and files are the ones on this machine now. The replay stops at the first
-    event that diverges and explains it as "rsltrace diff" does.
+    TRACE. The code of nodes, bags and files are read from this machine, as they are now. The
+    replay stops at the first event that diverges and explains it as "rsltrace diff" does.
 
     A replay runs code. It first prints which code, from where, and what has changed since the
     recording. It asks for confirmation (or --trust) unless a job file in the working directory or

@@ -96,8 +96,8 @@ def view(
     messages and plots.
 
     With --live, the job in TRACE runs again as you step. Each event is verified, and shown with its
-    changes to the node and with the source of its callback. This runs code
-    and asks first as "rsltrace replay" does. --job-folder and --trust need --live.
+    changes to the node and with the source of its callback. --live runs the code that TRACE
+    names; like "rsltrace replay", it asks first. --job-folder and --trust need --live.
 
     Without TRACE, choose among the traces and bags in the working directory. One trace opens with
     an overview (press Esc for the events), two open where they diverge. Press ? for all keys and q

@@ -407,7 +407,7 @@ def test_a_report_fits_a_screen_whatever_there_is_to_say(width: int) -> None:
     lines = render(crowded, "text", width=width).splitlines()
     assert len(lines) <= 40
     text = "\n".join(lines)
-    for needed in ("ranges[17]", "<- h", "before it", "affects", "next: ", "job.yaml"):
+    for needed in ("ranges[17]", "<- h", "no earlier event", "affects", "next: ", "job.yaml"):
         assert needed in text, needed
     # only what names the two files (a digest must not be cut) and commands may be wider
     wide = [row for row in lines if len(row) > width]

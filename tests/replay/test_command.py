@@ -89,7 +89,7 @@ def test_a_divergence_is_told_as_by_diff(command: Callable[..., Any], tmp_path: 
     assert "  nodes_of_replay  nodes_of_replay.py  (has changed)\n" in done.stderr
     assert "verdict: same-input-different-output; the first 4 events agree" in done.stdout
     assert "data  0.28125  |  0.2835  |a-b| 0.00225" in done.stdout
-    assert "job and environment differ: code of module nodes_of_replay" in done.stdout
+    assert "settings that differ: code of module nodes_of_replay" in done.stdout
     assert done.stdout.endswith(
         "\nnext: rsltrace replay run.mcap -o replay.mcap; rsltrace view run.mcap replay.mcap\n"
     )

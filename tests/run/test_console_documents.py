@@ -136,6 +136,7 @@ def renewed(step: Step, now: list[str]) -> list[str]:
             if skips:
                 for old in gap:
                     lines += difflib.get_close_matches(old, now[ahead:until], 1, 0.0)
+                lines += ["..."] * bool(gap)
             else:
                 lines += now[ahead:until]
             lines += [line] * (place in same)

@@ -346,10 +346,10 @@ def test_the_same_driver_gives_the_same_trace(simulate: Any, tmp_path: Path) -> 
         ),
         (
             lambda sim: sim.call(sim.node("echo").say, 5),  # of two at one time, by their names
-            "what outside did at 1.0 s happened only in b; a continued with the message from "
+            "what outside did at 1.0 s is only in b; the next event in a is the message from "
             "outside on /numbers at 1.0 s",
         ),
-        (lambda sim: None, "the message from outside on /numbers at 1.0 s happened only in a"),
+        (lambda sim: None, "the message from outside on /numbers at 1.0 s is only in a"),
     ],
 )
 def test_a_diff_blames_the_driver(simulate: Any, tmp_path: Path, second: Any, said: str) -> None:

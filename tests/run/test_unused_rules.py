@@ -198,7 +198,7 @@ class Arm(LifecycleNode):
     yaml = "nodes: [{node: nodes_under_test:Arm, parameters: {rate: 5.0, ratee: 5.0}}]\n"
     job_file(yaml + "stop: {duration: 700ms}\n", code)
     done = command("check", "job.yaml")
-    assert "nothing looks wrong" in done.stdout
+    assert "no problems found" in done.stdout
     done = command("record", "job.yaml", "-o", "run.mcap")
     (note,) = [line for line in done.stderr.splitlines() if "declared" in line]
     assert "/arm has not declared the parameter 'ratee', so it has no effect; did you" in note

@@ -59,9 +59,7 @@ def unrecorded(rng: random.Random) -> Planted:
 def http(rng: random.Random) -> Planted:
     line = 'float(urllib.request.build_opener().open("http://127.0.0.1:{port}/").read())'
     a, b, truth = _asked(rng, "record", line)
-    return Planted(
-        a, b, replace(truth, first=(rf"{LIKELY}.*recv.*1\.5'.* in a, .*2\.5'.* in b",))
-    )
+    return Planted(a, b, replace(truth, first=(rf"{LIKELY}.*recv.*1\.5'.* in a, .*2\.5'.* in b",)))
 
 
 @fault("server that is not there")

@@ -57,7 +57,7 @@ def _event(found: Divergence, width: int) -> Section:
         if at_once:
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         if min(a.position, b.position) >= 0:
-            counted = f", its event {a.position + 1}"
+            counted = f", call {a.position + 1}"
             counted += f" (b: {b.position + 1})" if a.position != b.position else ""
             title += counted if len(title) + len(counted) <= width else ""
         if not at_once or a.flags != b.flags or not found.messages:
@@ -158,7 +158,8 @@ def _calls(found: Divergence, width: int) -> Section:
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
         rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
     if len(rows) == 2:  # one call on one line, and its place
-        rows[0] = cut(line(("external call: ", Style.TITLE), *rows[0][1:]), width)
+        differs = " that differs" * (found.calls[0].a != found.calls[0].b)
+        rows[0] = cut(line((f"external call{differs}: ", Style.TITLE), *rows[0][1:]), width)
         return Section((), rows, 2, "", least=1, rank=rank)
     title = "external calls"
     return Section(line((title, Style.TITLE)), rows, 8, "lines", least=3, rank=rank)
@@ -199,12 +200,12 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
 def _before(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
     """Return the last events before: of both runs, and of the node where that says more."""
     keep = options.context if options.context > CONTEXT else 2
-    sections = [_listed("before it", found.before_a, found.before_b, width, keep, least=1)]
+    sections = [_listed("events before it", found.before_a, found.before_b, width, keep, least=1)]
     seen = {event.index for event in (*found.before_a, *found.before_b)}
     own = (*found.same_node_a, *found.same_node_b)
     some = found.a or found.b
     if some is not None and any(event.index not in seen for event in own):
-        title = f"before it in {printable(some.entity.node) or 'the run'}"
+        title = f"earlier events of {printable(some.entity.node) or 'the run'}"
         sections.append(_listed(title, found.same_node_a, found.same_node_b, width, keep, least=0))
     return sections
 
@@ -287,8 +288,8 @@ def _brief(event: EventSummary | None, width: int) -> str:
 
 
 def moved_text(moved_ns: int) -> str:
-    """Return how much later a message came in b: ``later by 4 ms``."""
-    return f"{'later' if moved_ns > 0 else 'earlier'} by {format_duration(abs(moved_ns))}"
+    """Return how much later a message came in b: ``4 ms later in b``."""
+    return f"{format_duration(abs(moved_ns))} {'later' if moved_ns > 0 else 'earlier'} in b"
 
 
 def _reaches(found: Divergence, width: int) -> Section:

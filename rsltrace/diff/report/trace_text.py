@@ -146,14 +146,15 @@ def _afterwards(diff: Diff, width: int) -> Section:
         diverged = count.differing + count.only_a + count.only_b
         if diverged:
             of = diverged + count.matching
-            rows.append(cut(line(f"  {diverged} of {of}  {printable(str(count.entity))}"), width))
+            entity = printable(str(count.entity))
+            rows.append(cut(line(f"  {diverged} of {of} differ  {entity}"), width))
     return Section((), rows, least, "entities", least, rank=9, fixed=least)
 
 
 def _settings(diff: Diff, width: int) -> Section:
     if not diff.settings:
         return NOTHING
-    title: Piece = ("job and environment differ", Style.TITLE)
+    title: Piece = ("settings that differ", Style.TITLE)
     room = max((width - 40) // 2, 16)
     table = [
         [
@@ -190,5 +191,5 @@ def _values(setting: Setting, room: int) -> tuple[str, str]:
 def _next(found: Divergence, others: int, width: int, *, hidden: bool = False) -> Section:
     count = f"more than {others}" if hidden else str(others)
     word = "divergence" if count == "1" else "divergences"
-    more = [f"{count} further independent {word}: {ALL_HINT}"] if others else []
+    more = [f"{count} more independent {word}: {ALL_HINT}"] if others else []
     return next_section(found.next_step, *more, width=width)

@@ -168,13 +168,13 @@ def _(what: DifferentOrder, of: Judgement) -> str:
 @says(EventInOneRun)
 def _(what: EventInOneRun, of: Judgement) -> str:
     has, has_not = _has(of)
-    text = f"{_at(_one(of))} happened only in {has}"
+    text = f"{_at(_one(of))} is only in {has}"
     if what.loss is not None:
         return f"{text}: {sentence(what.loss)}"
     if what.periods_ns is not None:
         return f"{text}: timer period {durations(*what.periods_ns)}"
     if what.instead is not None:
-        return f"{text}; {has_not} continued with {_at(what.instead)}"
+        return f"{text}; the next event in {has_not} is {_at(what.instead)}"
     return text
 
 
@@ -455,20 +455,20 @@ def _(why: CauseKind, of: Judgement) -> str:
 @says(CauseKind.READY_AT_ONCE)
 def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
-        return f"both were ready at the same simulated time, and {because}"
+        return f"both callbacks were ready at the same simulated time, and {because}"
     return (
-        "both were ready at the same simulated time, and the tie was broken differently (by order "
-        "of creation, subscription or delivery)"
+        "both callbacks were ready at the same simulated time, and the tie was broken differently "
+        "(by order of creation, subscription or delivery)"
     )
 
 
 @says(CauseKind.NOTHING_MADE_IT_RUN)
 def _(why: CauseKind, of: Judgement) -> str:
     if because := because_of(of.settings):
-        return f"nothing before it differs, but {because}"
+        return f"no earlier event differs, but {because}"
     one = _one(of)
     has = _has(of)[0]
-    text = f"nothing before it differs, and the trace does not show why it ran in {has}"
+    text = f"no earlier event differs, and the trace does not show why it ran in {has}"
     who = f"the {one.entity.kind} itself" if one.entity.kind in NO_CALLBACKS else one.entity.node
     return f"{text}: {who} is not deterministic" if who else text
 
@@ -507,9 +507,9 @@ def _(why: NotDelivered, of: Judgement) -> str:
 @says(NoEarlierDifference)
 def _(why: NoEarlierDifference, of: Judgement) -> str:
     if because := because_of(of.settings):
-        return f"nothing before it differs, but {because}"
+        return f"no earlier event differs, but {because}"
     doubt = "what sets its time" if why.doubt == "time" else _itself(why.doubt)
-    text = f"nothing before it differs: {doubt} is not deterministic"
+    text = f"no earlier event differs: {doubt} is not deterministic"
     if why.state_unknown:
         text += (
             f", or the state of {_one(of).entity.node} already differed (to record it, set "
