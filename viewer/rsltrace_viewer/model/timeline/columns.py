@@ -70,7 +70,8 @@ class EventColumn:
     """A column of the event list.
 
     ``width`` returns its cells, 0 to leave it out, ``_REST`` for all that is left. It is shown if
-    it leaves ``spare`` cells for the columns after it (None: always). ``style`` names the style of
+    it leaves ``spare`` cells for the columns after it (None: always): the widths of those that
+    must not be lost. ``style`` names the style of
     its cells in ``terminal/widgets/timeline.py``.
     """
 
