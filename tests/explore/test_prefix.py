@@ -121,7 +121,7 @@ def test_a_search_forks_and_what_it_finds_is_repeated_from_the_beginning(
     assert done.returncode == 1, done.stderr
     assert re.search(r"^24 runs forked from the plain one$", done.stdout, re.MULTILINE)
     assert "made from the beginning" not in done.stdout
-    again = shlex.split(re.search(r"again: rsltrace (.*)", done.stdout)[1])
+    again = shlex.split(re.search(r"reproduce: rsltrace (.*)", done.stdout)[1])
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")
     assert repeated.returncode == 1
     refused = command("explore", job, "--resume", "--fork-after", "0.5s", "-o", tmp_path / "found")

@@ -156,7 +156,7 @@ def test_what_a_main_has_read_is_the_likely_cause(
         job = rsltrace.load_job(tmp_path / "job.yaml")
         rsltrace.record(job, tmp_path / f"{name}.mcap")
     found = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    cause = "main prog:main read WHO, aaa in a and bbb in b, at prog.py:3"
+    cause = "main prog:main read WHO (aaa in a, bbb in b) at prog.py:3"
     assert cause in found.sentence
     assert "not deterministic" not in found.divergences[0].root_sentence
 
