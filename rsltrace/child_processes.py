@@ -18,11 +18,13 @@ from typing import Any
 # from the working directory.
 _PROGRAM = """
 import ctypes, os, sys
-prctl = getattr(ctypes.CDLL(None), 'prctl', None)
-if prctl is not None:
-    prctl(1, 9)
-if os.getppid() != int(sys.argv.pop(1)):
-    sys.exit(137)
+parent = sys.argv.pop(1)
+if parent:
+    prctl = getattr(ctypes.CDLL(None), 'prctl', None)
+    if prctl is not None:
+        prctl(1, 9)
+    if os.getppid() != int(parent):
+        sys.exit(137)
 sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
 import runpy
 module = sys.argv.pop(1)
@@ -33,21 +35,25 @@ OWN_FOLDER = Path(__file__).resolve().parents[1]
 """The folder that this package is in."""
 
 
-def rsltrace_command(words: Sequence[str], module: str = "rsltrace") -> list[str]:
+def rsltrace_command(
+    words: Sequence[str], module: str = "rsltrace", *, killed_with_parent: bool = True
+) -> list[str]:
     """Return a command line of this installation of rsltrace, which runs ``module`` as a program.
 
-    Its process ends with the present one.
+    The kernel kills its process with the present one, unless it ends by itself then, because it has
+    something to clear away.
     """
-    return [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(OWN_FOLDER), module, *words]
+    parent = str(os.getpid()) if killed_with_parent else ""
+    return [sys.executable, "-c", _PROGRAM, parent, str(OWN_FOLDER), module, *words]
 
 
 def start_connected(
-    module: str, words: Sequence[str] = (), **options: Any
+    module: str, words: Sequence[str] = (), *, killed_with_parent: bool = True, **options: Any
 ) -> tuple[subprocess.Popen[bytes], socket.socket]:
     """Start a module of rsltrace as a program; return its process and this end of a socket to it.
 
     The number of the other end is the program's first word. Nothing comes from standard input.
-    ``options`` are those of ``subprocess.Popen``.
+    ``killed_with_parent`` is as for ``rsltrace_command``, ``options`` as for ``subprocess.Popen``.
 
     :raises OSError: if no process can be made.
     """
@@ -55,7 +61,9 @@ def start_connected(
     with there:
         try:
             process = subprocess.Popen(
-                rsltrace_command([str(there.fileno()), *words], module),
+                rsltrace_command(
+                    [str(there.fileno()), *words], module, killed_with_parent=killed_with_parent
+                ),
                 stdin=subprocess.DEVNULL,
                 pass_fds=(there.fileno(),),
                 **options,

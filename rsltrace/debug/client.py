@@ -84,7 +84,10 @@ class DebugSession:
     def _open(self, spec: dict[str, Any]) -> None:
         try:
             self._process, ours = start_connected(
-                "rsltrace.debug.supervisor", [json.dumps(spec)], stdout=subprocess.DEVNULL
+                "rsltrace.debug.supervisor",
+                [json.dumps(spec)],
+                killed_with_parent=False,  # it kills what the session has started
+                stdout=subprocess.DEVNULL,
             )
         except OSError as error:
             raise DebugError(f"no process can be made for the session: {error}") from error

@@ -224,7 +224,7 @@ class TopicRule(StopRule):
             if name not in fields:
                 near = nearest(name, fields)
                 hint = f"did you mean {near!r}?" if near else f"there are {', '.join(fields)}"
-                hint = hint if fields else "what comes before it is not a message"
+                hint = hint if fields else "the part before it is not a message"
                 raise JobError(
                     f"stop.topic.exit_code: {self.value.name} is a {type(message).__qualname__} "
                     f"without the field {path!r}: {hint}",

@@ -187,7 +187,7 @@ def test_a_crash_prints_the_line_and_the_file_says_that_it_was_cut_off(tmp_path:
     assert 'crash_node.py", line 11 in tick' in done.stderr
     info = command("info", "run.mcap")
     assert info.returncode == 0
-    assert "cut off: the file has no end" in info.stdout
+    assert "truncated: the run was killed" in info.stdout
     assert "--set record.segment_events=1" in info.stdout
     with rsltrace.Trace.open(tmp_path / "run.mcap") as trace:
         assert (trace.complete, trace.event_count) == (False, 0)

@@ -263,7 +263,7 @@ def test_what_cannot_be_searched_is_said(
 @pytest.mark.parametrize(
     ("files", "said"),
     [
-        ({"README__md": "more"}, "do the same"),
+        ({"README__md": "more"}, "have the same run"),
         pytest.param(
             {"steps__py": "self.get_logger().info(str(time.time_ns()))"},
             "the job is not deterministic at",

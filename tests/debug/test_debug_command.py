@@ -198,7 +198,7 @@ def test_a_run_that_does_something_else_is_a_status(folder: Path, tmp_path: Path
 def test_what_a_trace_names_runs_only_if_somebody_agrees(folder: Path, tmp_path: Path) -> None:
     done = script(tmp_path, ["step"], source=str(folder / "run.mcap"))
     assert done.returncode == 2
-    assert "nothing was run; --trust runs it" in done.stderr
+    assert "nothing was run; use --trust if" in done.stderr
     assert "(rsltrace)" not in done.stdout
 
 

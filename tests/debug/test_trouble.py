@@ -187,7 +187,7 @@ def test_killed_children_are_noticed_and_made_again(folder: Path) -> None:
         state = session.evaluate("filter.state")
         for pid in children_of(session):
             os.kill(pid, signal.SIGKILL)
-        with pytest.raises(DebugError, match=r"ended by SIGKILL; the session is back at 600"):
+        with pytest.raises(DebugError, match=r"killed by SIGKILL; the session is back at 600"):
             session.step()
         assert session.position.index == 600
         assert session.evaluate("filter.state") == state

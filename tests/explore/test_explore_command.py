@@ -79,7 +79,7 @@ def test_what_becomes_of_runs_that_do_not_end_well(
     }[how]
     assert [one.kind for one in failures] == [kind, kind]
     assert all(re.fullmatch(key, one.key) for one in failures)
-    assert "the job fails as it is" in done.stdout
+    assert "the job fails in its default order" in done.stdout
 
 
 @pytest.mark.long

@@ -362,7 +362,7 @@ def test_what_the_run_was_recorded_with_is_in_the_fitted_job(known: Known, tmp_p
     assert job.execution.default is None
     assert (
         "recorded with --set nodes.0.parameters.gain=2, --set guard=false, which the "
-        "fitted job does not have" in done.stderr
+        "fitted job lacks" in done.stderr
     )
 
 
@@ -376,9 +376,14 @@ def test_a_job_that_is_put_together_has_not_changed(
     job.write_text(f"base: job.yaml\n{text}")
     record(load_job(job, overrides=["stop.duration=1s"]), tmp_path / "short.mcap")
     native = as_native(tmp_path / "short.mcap", tmp_path / "short_native.mcap")
-    assert "another job" not in known.fit(str(native), "-o", str(tmp_path / "f.yaml")).stderr
+    assert (
+        "is not the job of the run"
+        not in known.fit(str(native), "-o", str(tmp_path / "f.yaml")).stderr
+    )
     job.write_text(f"base: job.yaml\n{text}min_time_step: 1us\n")
-    assert "another job" in known.fit(str(native), "-o", str(tmp_path / "g.yaml")).stderr
+    assert (
+        "is not the job of the run" in known.fit(str(native), "-o", str(tmp_path / "g.yaml")).stderr
+    )
 
 
 @pytest.mark.long
@@ -409,7 +414,7 @@ def test_a_picture(known: Known) -> None:
     drawn_text = picture.read_text()
     assert drawn_text.count('<g id="axes_') == len(look(Path(native)).links) + 6
     bad = known.fit(native, str(known.folder / "job.yaml"), "--plot", str(known.folder / "fit.gif"))
-    assert (bad.exit_code, bad.stderr.count("a picture is one of .png, .svg, .pdf")) == (2, 1)
+    assert (bad.exit_code, bad.stderr.count("the file name must end in .png, .svg, .pdf")) == (2, 1)
 
 
 def test_without_the_libraries_the_message_says_what_to_install(
@@ -438,10 +443,10 @@ def test_mistakes(known: Known, tmp_path: Path) -> None:
     (tmp_path / "native.mcap").symlink_to(native)
     alone = known.fit(str(tmp_path / "native.mcap"))
     assert alone.exit_code == 2
-    assert "(truth.yaml) is neither beside it nor here" in alone.stderr
+    assert "(truth.yaml) is neith" in alone.stderr
     itself = known.fit(native, job, "-o", job, "--force")
     assert itself.exit_code == 2
-    assert "is the job itself" in itself.stderr
+    assert "is the job that the fitted one extends" in itself.stderr
     there = known.fit(native, job, "-o", job)
     assert (there.exit_code, "--force replaces it" in there.stderr) == (2, True)
     for words in (["--check", native], ["--simulated", "x.mcap"]):

@@ -287,7 +287,7 @@ def test_a_process_that_does_not_come_back_is_named(
             told.touch()
 
     monkeypatch.setattr(watchdog, "LOOK_EVERY_S", 0.2)
-    monkeypatch.setattr(watchdog, "_say", say)
+    monkeypatch.setattr(watchdog, "tell", say)
     assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
     (note,) = (note for note in notes if "/busy" in note)
     assert re.match(r"process \S*busy\S* \(pid \d+\), in /busy: timer timer 1, has not come", note)

@@ -231,7 +231,7 @@ def test_edits_that_change_nothing(folder: Path) -> None:
         ("10: message.dta = 1.0", "has no dta (it has data); did you mean 'data'?"),
         ("10: message.data = 'text'", "must be a float"),
         ('1s: node("/filter").stat = 1', "has no attribute 'stat'; did you mean 'state'?"),
-        ('1s: node("/fliter").state = 1', "is no node of"),
+        ('1s: node("/fliter").state = 1', "is not a node in"),
         ('1s: topic("/spede").data = 1.0', "has no publisher"),
         ('1s: parameters("/source")["gian"] = 1.0', "has no parameter 'gian'"),
         ('1s: parameters("/pair")["limit"] = 9.0', "refuses limit = 9.0: too much"),

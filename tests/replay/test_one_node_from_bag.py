@@ -155,8 +155,8 @@ def test_the_command(robot: Path) -> None:
     [
         (["--bag", "bag"], "need --node"),
         (["--all"], "need --node"),
-        (["--node", "filter", "--until", "3"], "go without --node"),
-        (["--node", "filter", "--bag", "bag", "--until-diverged"], "goes without --bag"),
+        (["--node", "filter", "--until", "3"], "have no effect with --node"),
+        (["--node", "filter", "--bag", "bag", "--until-diverged"], "has no effect with --bag"),
     ],
 )
 def test_options_that_do_not_go_together(robot: Path, words: list[str], said: str) -> None:

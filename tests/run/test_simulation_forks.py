@@ -133,7 +133,7 @@ def test_what_goes_wrong_in_a_fork_is_raised_and_the_original_goes_on(tmp_path: 
             sim.fork(lambda sim: 1 // 0)
         with pytest.raises(RunError, match="cannot leave the copy"):
             sim.fork(lambda sim: sim)
-        with pytest.raises(RunError, match="died of SIGKILL"):
+        with pytest.raises(RunError, match="killed by SIGKILL"):
             sim.fork(lambda sim: os.kill(os.getpid(), 9))
         with pytest.raises(OutputError):
             sim.fork(lambda sim: sim.run(), there)

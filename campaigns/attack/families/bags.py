@@ -32,7 +32,7 @@ def _ask(rng: Random, case: Case, *, differs: bool = False, single: str = "") ->
     folder = case.folder
     put_robot(folder)
     (folder / "play.yaml").write_text(_JOB)
-    case.names = ("hostile", "play.yaml", "--by is for recordings")
+    case.names = ("hostile", "play.yaml", "--by needs a recording")
     target = single or "hostile"
     sides = rng.choice((("original", target), (target, "original")))
     commands = [
