@@ -119,7 +119,7 @@ def test_a_search_forks_and_what_it_finds_is_repeated_from_the_beginning(
     words = ["--budget", 25, "--jobs", 1, "--fork-after", "0.45s", "-q"]
     done = command("explore", job, *words, "-o", tmp_path / "found")
     assert done.returncode == 1, done.stderr
-    assert re.search(r"^24 runs forked from the plain one$", done.stdout, re.MULTILINE)
+    assert re.search(r"^24 runs forked from the default run$", done.stdout, re.MULTILINE)
     assert "made from the beginning" not in done.stdout
     again = shlex.split(re.search(r"reproduce: rsltrace (.*)", done.stdout)[1])
     repeated = command(*again, "-q", "-o", tmp_path / "again.mcap")

@@ -448,7 +448,7 @@ def test_mistakes(known: Known, tmp_path: Path) -> None:
     assert itself.exit_code == 2
     assert "is the job that the fitted one extends" in itself.stderr
     there = known.fit(native, job, "-o", job)
-    assert (there.exit_code, "--force replaces it" in there.stderr) == (2, True)
+    assert (there.exit_code, "use --force to replace it" in there.stderr) == (2, True)
     for words in (["--check", native], ["--simulated", "x.mcap"]):
         assert known.fit(native, job, *words).exit_code == 2
     wrong = known.fit(native, job, "-o", str(tmp_path / "f.yaml"), "--check", str(known.simulated))
