@@ -290,7 +290,8 @@ def test_a_process_that_does_not_come_back_is_named(
     monkeypatch.setattr(watchdog, "tell", say)
     assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
     (note,) = (note for note in notes if "/busy" in note)
-    assert re.match(r"process \S*busy\S* \(pid \d+\), in /busy: timer timer 1, has not returned", note)
+    pattern = r"rsltrace: note: process \S*busy\S* \(pid \d+\), in /busy: timer timer 1, has "
+    assert re.match(pattern, note)
     assert "stands still at 0.500000000 s. Ctrl-C" in note
 
 

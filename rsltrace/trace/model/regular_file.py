@@ -53,11 +53,11 @@ def replacement_of(path: Path) -> Iterator[Path]:
     """Give a path to write to; its file takes the place of ``path`` when the block ends well.
 
     So nobody sees half a file, and what was there stays if writing fails. It keeps its mode, and a
-    symbolic link still points to it; one that points nowhere is replaced.
+    symbolic link still points to it.
 
     :raises OSError: if the file cannot take the place.
     """
-    final = Path(os.path.realpath(path)) if path.exists() else path
+    final = Path(os.path.realpath(path))
     work = final.with_name(f".{final.name}.part-{os.getpid()}")
     try:
         yield work
