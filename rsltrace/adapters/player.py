@@ -1,4 +1,4 @@
-"""The door for recordings: messages of bags are published at their recorded times, without polling.
+"""The adapter for recordings: publishes messages of bags at their recorded times, without polling.
 
 It knows no client library: a recorded topic has a type by name, and whoever opens it says how the
 recorded bytes become canonical CDR.

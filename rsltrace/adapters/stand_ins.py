@@ -1,4 +1,4 @@
-"""The door for those who were in a recording and are not here: they do again what they sent.
+"""The adapter for those who were in a recording and are not here: they do again what they sent.
 
 A stand-in has the name and the endpoints of a recorded participant, so nodes find the graph that
 they found then, and what it sends takes the same links with the same draws. It runs no code; what

@@ -173,7 +173,7 @@ def _check_free(folder: Path) -> None:
 
 
 def _check_ends(repository: GitRepository, good: Any, bad: Any) -> None:
-    """RevisionCheck the two ends of the search.
+    """Check the two ends of the search.
 
     :raises BisectError: they are the same commit, or in the wrong order.
     """

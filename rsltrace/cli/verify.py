@@ -196,6 +196,8 @@ def _verify(
 
 def _two(result: VerifyResult) -> list[PerturbedRun]:
     second = result.trouble or result.other
+    if result.hidden is not None:
+        second = result.hidden.run
     return [result.first] if second is None or second is result.first else [result.first, second]
 
 

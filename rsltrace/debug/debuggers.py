@@ -159,7 +159,6 @@ def _under_pdb(copy: DebuggedCopy, address: str) -> Calls:
 
 
 def _under_debugpy(copy: DebuggedCopy, port: int) -> Calls:
-
     with copy.outside():
         _end_when_told(copy)
         editor = DebugpyServer(port, copy.outside)

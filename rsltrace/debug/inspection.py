@@ -322,9 +322,9 @@ def _timers_of(node: Any) -> list[Any]:
 
 
 def stacks(run: StoppedRun) -> list[str]:
-    stacks = run.session.world.runtime
-    waits = [one.waits_for() for one in stacks.coroutines.suspended]
-    return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
+    runtime = run.session.world.runtime
+    waits = [one.waits_for() for one in runtime.coroutines.suspended]
+    return waits + [blocked.waits_for() for blocked in runtime.runners.blocked]
 
 
 def graph(run: StoppedRun) -> dict[str, Any]:

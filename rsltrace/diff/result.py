@@ -30,7 +30,8 @@ class Divergence(Judgement):
     """One place where the runs diverge. ``independent`` ones follow from no earlier one.
 
     ``chain`` is the way from the root to it. ``before_a``/``before_b`` are the last events before
-    it in each run, ``same_node_*`` the last ones in the same node.
+    it in each run, ``same_node_*`` the last ones in the same node. ``next_step`` is a command that
+    shows or reproduces the place, in the viewer if ``next_opens_viewer``.
     """
 
     chain: tuple[CauseStep, ...] = ()
@@ -40,6 +41,7 @@ class Divergence(Judgement):
     same_node_b: tuple[EventSummary, ...] = ()
     reaches: tuple[AffectedTopic, ...] = ()
     next_step: str = ""
+    next_opens_viewer: bool = False
     calls: tuple[CallDifference, ...] = ()
 
     @property

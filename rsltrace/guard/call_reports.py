@@ -6,16 +6,14 @@ functions that have no audit event, and the class of ``os.environ``.
 
 from __future__ import annotations
 
-import gc  # noqa: F401  (loaded, so that its functions can be replaced)
 import hashlib
+import importlib
 import os
 import re
-import resource  # noqa: F401
-import signal  # noqa: F401
 import sqlite3  # a node may import it during the run; it is replaced by then
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from types import FrameType
 from typing import Any
@@ -39,7 +37,7 @@ from rsltrace.trace.model.finding import READ_BY, GuardMode, NondeterminismSourc
 REPORTED_MODULES = frozenset(
     name.rpartition(".")[0] for name, rule in RULES.items() if rule.reports is not None
 )
-"""Modules with such functions; the run replaces them at once, or when a node imports the module."""
+"""Modules with such functions: those of Python are loaded for it, others are seen when they are."""
 
 
 def report_functions(stack: ExitStack, module: str) -> None:
@@ -333,6 +331,9 @@ def reported_calls() -> Iterator[None]:
     """Report calls until the block ends."""
     report_audit_events()
     with ExitStack() as stack:
+        for module in sorted(REPORTED_MODULES & sys.stdlib_module_names):
+            with suppress(ImportError):  # not on every system
+                importlib.import_module(module)
         for module in sorted(REPORTED_MODULES & sys.modules.keys()):
             report_functions(stack, module)
         redirect(stack, sqlite3.connect, _connecting)

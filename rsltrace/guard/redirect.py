@@ -179,7 +179,8 @@ def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) ->
 def redirect_function(
     stack: ExitStack, module: Any, name: str, make: Callable[[Any], Callable[..., Any]]
 ) -> None:
-    """Redirect a function of C or Python, if the module has it, wherever it is bound."""
+    """Redirect a function, if the module has it: one of C wherever it is bound, one of Python in
+    every loaded module that has it under this name."""
     function = getattr(module, name, None)
     if isinstance(function, BuiltinFunctionType):
         redirect(stack, function, make)

@@ -85,6 +85,8 @@ class Rule:
         if self.source is None or self.treatment not in (Treatment.VIRTUAL, Treatment.DETECTED):
             return self.treatment, self.does
         mode = policy.modes[self.source]
+        if mode is GuardMode.RECORD and self.reports is not None and self.restore is None:
+            mode = GuardMode.WARN  # the call is only reported
         if self.treatment is Treatment.DETECTED and mode is GuardMode.VIRTUAL:
             mode = GuardMode.WARN
         elif self.treatment is Treatment.VIRTUAL and answers(self.source, mode):
@@ -220,7 +222,7 @@ _INTERPRETER = replace(
 _PID = Rule(
     "pid",
     _V,
-    "is the node's own number, the same in every run",
+    "is a number of the run's, the same in every run",
     "a parameter of the node",
     NondeterminismSource.PID,
 )
@@ -416,12 +418,8 @@ RULES: dict[str, Rule] = {
         "multinomial poisson",
     ),
     **_classes(_THREAD, "threading", "Thread Timer"),
-    **_calls(
-        _THREAD,
-        "_thread",
-        "start_new_thread start_joinable_thread",
-        reports=NondeterminismSource.THREAD,
-    ),
+    **_calls(_THREAD, "_thread", "start_new_thread", reports=NondeterminismSource.THREAD),
+    **_calls(_SIGNAL, "_thread", "start_joinable_thread", instead="threading.Thread"),
     **_classes(_THREAD, "concurrent.futures", "ThreadPoolExecutor"),
     **_classes(_THREAD, "concurrent.futures.thread", "ThreadPoolExecutor"),
     **_classes(_THREAD, "multiprocessing.pool", "ThreadPool"),

@@ -86,8 +86,7 @@ def wait_recorded(
                 text = "null"
                 break
     finally:
-        # the run ends: None: the run ends before the answer comes, and a re-run waits as long for
-        # it.
+        # None: the run ends before the answer comes, and a re-run waits as long for it.
         guard.report(source, GuardMode.RECORD, call, finding_value(number, steps, text), frame)
     return decoded(text)
 

@@ -65,7 +65,7 @@ class NativeResult:
 @dataclass(frozen=True, slots=True)
 class ProcessorTime:
     """Processor time in nanoseconds: ``callbacks_ns`` of the nodes with rclpy and the middleware
-    (and what observes them in their threads), ``beside_ns`` of telling of it, the pen's aside."""
+    (and what observes them in their threads), ``beside_ns`` of reporting it."""
 
     callbacks_ns: int
     beside_ns: int = 0

@@ -130,7 +130,7 @@ class SpanWriter(threading.Thread):
     def __init__(
         self, source: SpanSource, recorder: Recorder, clocks: ClockPair, base_dir: Path
     ) -> None:
-        super().__init__(name="rsltrace pen", daemon=True)
+        super().__init__(name="rsltrace span writer", daemon=True)
         self._source = source
         self._recorder = recorder
         self._clocks = clocks

@@ -24,8 +24,7 @@ from rsltrace.forking import (
     why_not,
 )
 from rsltrace.job import FaultSpec, Job
-from rsltrace.run.branching import why_no_branch as why_no_branch
-from rsltrace.run.branching import why_no_branches
+from rsltrace.run.branching import why_no_branch, why_no_branches
 from rsltrace.run.inputs import check_output
 from rsltrace.run.session import RunResult, RunSession
 from rsltrace.trace.writer import TraceWriter

@@ -313,6 +313,10 @@ class RunSession:
             if switches_at_lines(self.job):
                 self.world.switch_at_lines(loop, node_packages(self.job.nodes))
 
+    def _trace_size(self) -> int:
+        writer = self._writer or self._recorded_by
+        return 0 if writer is None else writer.size
+
     def _import_targets(self) -> None:
         """Import stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
@@ -320,7 +324,7 @@ class RunSession:
             StopInputs(
                 job,
                 self.start_ns,
-                trace_size=lambda: 0 if self._writer is None else self._writer.size,
+                trace_size=self._trace_size,
                 outside_events=world.domain.dispatcher.outside_events,
             )
         )

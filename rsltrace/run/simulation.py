@@ -371,7 +371,7 @@ class Simulation:
         *,
         depth: int | None = 1000,
     ) -> TopicTap:
-        """Listen to a topic from outside: the Tap keeps the last ``depth`` messages (None: all).
+        """Listen to a topic from outside: it keeps the last ``depth`` messages (None: all).
 
         ``callback(message)`` is called at the end of the time step in which it was published. The
         nodes do not notice, and the trace is the same as without.

@@ -17,13 +17,22 @@ if TYPE_CHECKING:
 
 
 class _Samples:
-    """Those of one node."""
+    """Those of one node: ``event`` is the last one before each."""
 
     def __init__(self, state: NodeState) -> None:
         self.state = state
         self.events = 0
-        self.next = 1
         self.taken: list[tuple[int, dict[str, str]]] = []
+
+    def take(self, event: int) -> None:
+        """Take one, if the node is still there and its state can be read: code of the user's may
+        do that (``rsltrace_state``)."""
+        try:
+            hashes = self.state.attribute_hashes()
+        except Exception:
+            hashes = {}
+        if hashes:
+            self.taken.append((event, {name: f"{value:x}" for name, value in hashes.items()}))
 
 
 class StateSamples(EventObserver):
@@ -34,35 +43,35 @@ class StateSamples(EventObserver):
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
-        self._nodes: dict[str, _Samples] = {}
+        self._nodes: dict[Any, _Samples] = {}
 
     def after_event(self) -> None:
         """Take a sample if it is time for one of the event's node."""
         node = self._dispatcher.event.node
         if getattr(node, "wrapper", None) is None:  # nobody's, a main's, or in another process
             return
-        samples = self._nodes.get(node.key)
+        samples = self._nodes.get(node)
         if samples is None:
             samples = _Samples(NodeState(self._dispatcher, node, keeps=False))
-            self._nodes[node.key] = samples
+            self._nodes[node] = samples
         samples.events += 1
-        if samples.events == samples.next:
-            samples.next *= 2
-            self._take(samples)
+        if not samples.events & (samples.events - 1):  # a power of two
+            samples.take(self._last_event())
 
     def take_last(self) -> None:
         """Take the samples of the end of the run, while the nodes are there."""
         for samples in self._nodes.values():
-            self._take(samples)
+            samples.take(self._last_event())
 
-    def _take(self, samples: _Samples) -> None:
-        recorder: Any = self._dispatcher.recorder
-        hashes = samples.state.attribute_hashes()
-        samples.taken.append(
-            (recorder.index - 1, {name: f"{value:x}" for name, value in hashes.items()})
-        )
+    def _last_event(self) -> int:
+        recorder = self._dispatcher.recorder
+        assert recorder is not None, "samples are for a trace"
+        return recorder.index - 1
 
     def as_metadata(self) -> dict[str, str]:
-        """Return what a trace keeps (docs/trace-format.md)."""
-        taken = {name: samples.taken for name, samples in self._nodes.items()}
+        """Return what a trace keeps (docs/trace-format.md). A node that has started again has the
+        samples of all its lives."""
+        taken: dict[str, list[tuple[int, dict[str, str]]]] = {}
+        for node, samples in self._nodes.items():
+            taken.setdefault(node.key, []).extend(samples.taken)
         return {"samples": json.dumps(taken, sort_keys=True, separators=(",", ":"))}

@@ -15,7 +15,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,6 @@ from rsltrace.adapters.workspace.cache import same_place
 from rsltrace.child_processes import Done, Processes, how_ended
 from rsltrace.guard.pin import THREAD_VARIABLES
 from rsltrace.trace.format import METADATA_STATES
-from rsltrace.trace.reader import Trace
 
 HASH_SEED = "hash seed"
 FOLDER = "working directory"
@@ -198,7 +197,15 @@ def record_perturbed(
     path = path or folder / f"{_name(around)}.mcap"
     words = record_words([*arguments, "--sample-states"], path)
     done = run_in(around, words, folder, processes=processes, timeout_s=timeout_s)
-    return perturbed_run(around, path, done)
+    found = perturbed_run(around, path, done)
+    return replace(found, states=_states_in(found.path)) if found.digest else found
+
+
+def _states_in(path: Path) -> str:
+    from rsltrace.trace.reader import Trace  # which loads numpy
+
+    with Trace.open(path) as trace:
+        return trace.metadata(METADATA_STATES).get("samples", "")
 
 
 def run_in(
@@ -267,13 +274,7 @@ def perturbed_run(around: Perturbation, path: Path, done: Done) -> PerturbedRun:
         digest, failure = "", f"it {how_ended(done.exit_code)}"
     elif not digest and not failure:
         failure = f"it ended with exit status {done.exit_code} and no trace"
-    states = _states_in(path) if digest and path.is_file() else ""
-    return PerturbedRun(around, path, digest, events, done.exit_code, failure, done.errors, states)
-
-
-def _states_in(path: Path) -> str:
-    with Trace.open(path) as trace:
-        return trace.metadata(METADATA_STATES).get("samples", "")
+    return PerturbedRun(around, path, digest, events, done.exit_code, failure, done.errors)
 
 
 def _result_in(output: str) -> dict[str, Any]:

@@ -33,14 +33,14 @@ class HiddenDifference:
     """Two runs of equal events that left the state of a ``node`` different.
 
     ``attribute`` is one of the node's that differs in the first sample that does, taken after
-    ``event`` of run ``run``. ``traces`` are of two more such runs, with the states after all
+    ``event`` of ``run``. ``traces`` are of two more such runs, with the states after all
     events; None if these two happened to be the same.
     """
 
     node: str
     attribute: str
     event: int
-    run: int
+    run: PerturbedRun
     traces: tuple[PerturbedRun, PerturbedRun] | None
 
 
@@ -146,8 +146,7 @@ class DeterminismTest:
             for name, perturbed in (("a", first.perturbation), ("b", around))
         )
         differ = one.digest and two.digest and one.digest != two.digest
-        number = other.perturbation.number
-        hidden = HiddenDifference(node, attribute, event, number, (one, two) if differ else None)
+        hidden = HiddenDifference(node, attribute, event, other, (one, two) if differ else None)
         return replace(narrowed, other=None, hidden=hidden)
 
     @contextmanager
@@ -212,8 +211,13 @@ class DeterminismTest:
         """Try a second unperturbed run, then each perturbation alone."""
         first, other = found.first, found.other
         assert other is not None
+        of_events = other.outcome != first.outcome
+
+        def differs(run: PerturbedRun) -> bool:
+            return run.outcome != first.outcome if of_events else run.kept != first.kept
+
         again = self._record(Perturbation(0, {}, "again"))
-        if again.kept != first.kept:
+        if differs(again):
             self._forget(again)
             return replace(found, narrowed=True, by_itself=True)
         self._forget(again)
@@ -222,9 +226,7 @@ class DeterminismTest:
             return found
         with self._pool() as pool:
             runs = list(pool.map(self._record, map(other.perturbation.only, kinds)))
-        provoked = tuple(
-            kind for kind, run in zip(kinds, runs, strict=True) if run.kept != first.kept
-        )
+        provoked = tuple(kind for kind, run in zip(kinds, runs, strict=True) if differs(run))
         for run in runs:
             self._forget(run)
         return replace(found, narrowed=True, provoked_by=provoked)

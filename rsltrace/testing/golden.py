@@ -128,8 +128,8 @@ def _write(run: Path, golden: Path) -> bool:
         raise OutputError(f"the golden trace {golden} cannot be written: it is {kind}")
     try:
         golden.parent.mkdir(parents=True, exist_ok=True)
-        if not golden.exists():
-            golden.unlink(missing_ok=True)  # a link that points nowhere
+        if golden.is_symlink():  # what it points to may be another test's, too
+            golden.unlink()
         with replacement_of(golden) as work:
             shutil.copyfile(run, work)
     except OSError as error:

@@ -25,7 +25,7 @@ from rsltrace.trace.format import (
     SEGMENT_DTYPE,
 )
 from rsltrace.trace.mcap import chunk as mcap_chunk
-from rsltrace.trace.mcap import reader as mcap_summary
+from rsltrace.trace.mcap import reader as mcap_reader
 from rsltrace.trace.mcap.checksum import crc32
 from rsltrace.trace.mcap.records import (
     CHUNK_BYTES_MAX,
@@ -63,7 +63,7 @@ def damage_error(source: ByteSource, offset: int, what: str, why: object) -> Tra
 def read_body(source: ByteSource, span: RecordSpan, opcode: int, what: str) -> bytes:
     """Return the body of the record at ``span``. Raises TraceError if it is not such a record."""
     try:
-        return mcap_summary.read_body(source, span, opcode)
+        return mcap_reader.read_body(source, span, opcode)
     except DamageError as error:
         raise damage_error(source, span.offset, what, error) from error
 
@@ -118,7 +118,7 @@ def read_metadata(source: ByteSource, span: RecordSpan, *, checked: bool = False
 
 
 def messages_in(records: bytes) -> Iterator[tuple[int, int]]:
-    """Yield (channel, offset) of the messages of a chunk, in order. Raises Damaged."""
+    """Yield (channel, offset) of the messages of a chunk, in order. Raises DamageError."""
     for number, (opcode, start, end) in enumerate(records_in(records)):
         if number >= _RECORDS_PER_CHUNK_MAX:
             raise DamageError("it holds more records than a chunk of a trace")
@@ -165,7 +165,7 @@ class TraceIndex:
 
     ``checksums``: its own metadata have some. ``summary_start`` is the end of the data section (0:
     unknown). ``chunks_with`` returns the chunks with messages of some channels, in file order; only
-    payloads need these, a long run has thousands. It may raise Damaged.
+    payloads need these, a long run has thousands. It may raise DamageError.
     """
 
     complete: bool
@@ -179,7 +179,7 @@ class TraceIndex:
     segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
     chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
 
-    def take(self, summary: mcap_summary.McapSummary) -> None:
+    def take(self, summary: mcap_reader.McapSummary) -> None:
         """Add what the records of the file say."""
         self.metadata, self.attachments = summary.metadata, summary.attachments
         for channel_id, schema_id, topic, _, metadata in summary.channels.values():
@@ -204,7 +204,7 @@ def read_header(source: ByteSource) -> tuple[McapHeader, int]:
             f"{source.name} is not a trace (it is {what}); a trace is what `rsltrace record` writes"
         )
     try:
-        return mcap_summary.read_header(source)
+        return mcap_reader.read_header(source)
     except TruncatedFile as error:
         raise TraceFormatError(
             f"{source.name} ends in its first record: nothing can be read of it"
@@ -218,7 +218,7 @@ def read_summary(source: ByteSource) -> TraceIndex:
     header, _ = read_header(source)
     index = TraceIndex(complete=True, header=header)
     try:
-        footer = mcap_summary.read_footer(source)
+        footer = mcap_reader.read_footer(source)
     except DamageError as error:
         raise damage_error(source, source.size, "the footer before the end", error) from error
     # Other writers may leave out the summary, or its CRC.
@@ -226,7 +226,7 @@ def read_summary(source: ByteSource) -> TraceIndex:
         raise not_a_trace_error(source, index)
     index.summary_start = footer.summary_start
     try:
-        summary = mcap_summary.read_summary(source, footer)
+        summary = mcap_reader.read_summary(source, footer)
     except DamageError as error:
         raise damage_error(source, footer.summary_start, "the summary", error) from error
     index.take(summary)

@@ -110,7 +110,7 @@ def check_records(source: ByteSource, index: TraceIndex) -> None:
 
 
 def _add_unique(summary: McapSummary, opcode: int, body: bytes) -> None:
-    """Add a channel or schema. Raises Damaged if its id has another definition."""
+    """Add a channel or schema. Raises DamageError if its id has another definition."""
     if opcode == Opcode.SCHEMA:
         schema = parse_schema(body)
         is_only = summary.schemas.setdefault(schema.id, schema) == schema

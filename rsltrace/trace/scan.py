@@ -97,7 +97,7 @@ class _Scanner:
         return index
 
     def _take(self, opcode: int, span: RecordSpan) -> None:
-        """Add a record. Raises Damaged."""
+        """Add a record. Raises DamageError."""
         if opcode == Opcode.CHUNK:
             self._chunk(span)
             return

@@ -144,17 +144,17 @@ _SEGMENTS_CACHED = 4
 
 
 def events_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
-    """Return the events of a chunk as EVENT_DTYPE, shape (n,), in place. Raises Damaged."""
+    """Return the events of a chunk as EVENT_DTYPE, shape (n,), in place. Raises DamageError."""
     return _bodies(records, EVENT_MESSAGE_DTYPE, EVENT_DTYPE, channel_id)
 
 
 def outputs_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
-    """Return the outputs of a chunk as OUTPUT_DTYPE, shape (n,), in place. Raises Damaged."""
+    """Return the outputs of a chunk as OUTPUT_DTYPE, shape (n,), in place. Raises DamageError."""
     return _bodies(records, OUTPUT_MESSAGE_DTYPE, OUTPUT_DTYPE, channel_id)
 
 
 def check_numbered(events: npt.NDArray[np.void], first: int) -> None:
-    """Raise Damaged unless the events are numbered ``first``, ``first + 1``, …"""
+    """Raise DamageError unless the events are numbered ``first``, ``first + 1``, …"""
     numbers = np.arange(first, first + len(events), dtype=np.uint64)
     if not np.array_equal(events["index"], numbers):
         raise DamageError(f"its events are not numbered from {first} on")
@@ -273,7 +273,7 @@ def segment_row(
 
 
 def event_of(row: np.void, name: str = "trace") -> EventRecord:
-    """Return a row of EVENT_DTYPE, from the file ``name``, as an Event. Raises TraceError."""
+    """Return a row of EVENT_DTYPE, from the file ``name``, as an EventRecord. Raises TraceError."""
     chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
         row.item()
     )

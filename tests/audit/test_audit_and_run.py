@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from rsltrace.guard.audit.audit import audit_path
-from rsltrace.guard.rules import Treatment
-from rsltrace.job import Job, NodeSpec, StopSpec
+from rsltrace.guard.rules import RULES, Treatment
+from rsltrace.job import GuardSpec, Job, NodeSpec, StopSpec
+from rsltrace.job.parts.guard import policy_of
 from rsltrace.run import run
 from rsltrace.trace.model.finding import GuardMode
 
@@ -88,3 +89,11 @@ def test_the_guard_treats_each_call_as_the_audit_says(tmp_path: Path) -> None:
             assert said[n].treatment is Treatment.DETECTED, call
             assert any(one.source.value == said[n].kind and one.is_finding for one in met), call
     assert "audited_calls" not in sys.modules
+
+
+def test_what_the_run_only_reports_is_not_promised_as_recorded() -> None:
+    """Also where a job has all recorded that can be."""
+    policy = policy_of(GuardSpec(environment="record", process="record", file="record"))
+    for name in ("os.getpgid", "os.statvfs", "gc.get_objects"):
+        assert RULES[name].treated(policy)[0] is Treatment.DETECTED, name
+    assert RULES["os.uname"].treated(policy)[0] is Treatment.RECORDED

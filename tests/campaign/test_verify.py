@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Any, cast
 
@@ -19,8 +20,8 @@ import pytest
 from rsltrace.child_processes import Done
 from rsltrace.cli.output import verify_text
 from rsltrace.search import perturb
-from rsltrace.search.perturb import KINDS, perturbation, perturbed_run
-from rsltrace.search.verify import VerifyResult
+from rsltrace.search.perturb import KINDS, Perturbation, PerturbedRun, perturbation, perturbed_run
+from rsltrace.search.verify import DeterminismTest, VerifyResult
 
 pytestmark = pytest.mark.ros
 
@@ -94,6 +95,33 @@ def test_what_differs_and_is_not_published_is_found_in_the_run_in_which_it_begin
     told = json.loads(rsltrace("verify", made, "--runs", "2", "--json").stdout)
     assert told["agrees"]
     assert told["hidden"]["attribute"] == "drawn"
+
+
+def test_what_provokes_other_events_is_found_beside_states_that_always_differ(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    number = count()
+
+    def record(around: Perturbation) -> PerturbedRun:
+        digest = around.values.get(perturb.TIME_ZONE, "")
+        return PerturbedRun(around, tmp_path / "x", digest or "-", 1, 0, "", "", str(next(number)))
+
+    series = DeterminismTest((), tmp_path)
+    monkeypatch.setattr(series, "_record", record)
+    first, other = record(perturbation(0)), record(perturbation(1))
+    found = series._narrowed(VerifyResult(first, 2, (), (), other=other), 0.1)
+    assert (found.by_itself, found.provoked_by) == (False, (perturb.TIME_ZONE,))
+
+
+def test_a_hidden_difference_has_the_commands_that_repeat_it(
+    rsltrace: Command, job: WriteJob
+) -> None:
+    made = job("self.order = list({'a', 'b', 'c', 'd', 'e', 'f'})", AS_IT_IS)
+    done = rsltrace("verify", made, "--runs", "2", "--no-pin")
+    assert done.returncode == 0, done.stderr
+    assert "the state of /n differs: its attribute order" in done.stdout
+    assert "caused by: hash seed alone" in done.stdout
+    assert "--run 1 --only 'hash seed'" in done.stdout
 
 
 @pytest.mark.parametrize("before", ["", "Input x: ", '{"digest": 1\n{"', "many\nlines {}\n"])

@@ -184,3 +184,17 @@ def test_at_many_random_positions_going_back_is_exact(job: str, tmp_path: Path) 
         pytest.skip("needs ROS 2's test_msgs")
     positions = int(os.environ.get("RSLTRACE_POSITIONS", "30"))
     check(tmp_path, {**JOBS, **MORE}[job](tmp_path), positions, random.Random(job))
+
+
+@pytest.mark.long
+def test_a_run_that_the_size_of_its_trace_ended_ends_again(tmp_path: Path) -> None:
+    (tmp_path / "ticking.py").write_text(
+        "from rclpy.node import Node\n\n\nclass Ticking(Node):\n    def __init__(self):\n"
+        "        super().__init__('ticking')\n        self.create_timer(0.001, lambda: None)\n"
+    )
+    job = tmp_path / "job.yaml"
+    job.write_text("nodes: [{node: ticking:Ticking}]\nstop: {size: 200kB}\n")
+    record(load_job(job), tmp_path / "run.mcap")
+    with DebugSession(tmp_path / "run.mcap", trust=True) as session:
+        stopped = session.go_on()
+        assert (stopped.reason, stopped.text) == ("end", "a trace of 200kB")

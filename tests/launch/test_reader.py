@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -231,7 +233,7 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
     assert (fine.name, fine.start_after) == ("fine", None)
     assert len(launched.unsupported) == 8
     assert launched.ignored == [
-        "a.launch.xml:11:3: prefix, env A: it runs in the process of rsltrace"
+        "a.launch.xml:11:3: launch-prefix, env A: it runs in the process of rsltrace"
     ]
 
 
@@ -423,3 +425,40 @@ def test_the_document_names_all_that_is_read() -> None:
         assert f"`{action}`" in text, action
     for name in set(SUBSTITUTIONS) - {"optenv"}:
         assert f"`$({name})`" in text or f"`$({name} …)`" in text, name
+
+
+def test_the_file_of_an_include_does_not_depend_on_its_arguments(read: Any, write: Any) -> None:
+    for name in "ab":
+        write(f'<launch><node pkg="demo" exec="from_{name}"/></launch>', f"{name}.launch.xml")
+    launched = read(
+        '<launch><arg name="robot" default="a"/><include file="$(var robot).launch.xml">'
+        '<arg name="robot" value="b"/></include></launch>',
+        "whole.launch.xml",
+    )
+    assert [node.executable for node in launched.nodes] == ["from_a"]
+
+
+def test_a_pipe_is_no_content(read: Any, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(JobError, match="a named pipe, not a regular file"):
+        read(f'<launch><let name="a" value="$(file-content {tmp_path}/pipe)"/></launch>')
+
+
+def test_a_parameter_file_in_the_folder_of_temporary_ones_is_one_as_any(
+    read: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    (tmp_path / "rate.yaml").write_text("talker: {ros__parameters: {rate: 1.5}}\n")
+    launched = read(
+        '<launch><node pkg="demo" exec="talker"><param from="rate.yaml"/></node></launch>'
+    )
+    (node,) = launched.nodes
+    assert [str(one.path) for one in node.parameters] == [str(tmp_path / "rate.yaml")]
+
+
+def test_what_a_process_is_not_given_has_its_name_in_the_file(read: Any) -> None:
+    launched = read('<launch><node pkg="demo" exec="a" launch-prefix="gdb"/><executable/></launch>')
+    assert launched.nodes[0].surroundings.without == ("launch-prefix",)
+    assert str(launched.unsupported[0]).endswith(
+        "a process: other programs do not run in a simulation"
+    )

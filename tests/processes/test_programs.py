@@ -184,6 +184,30 @@ def test_no_compiler_outlives_an_interrupted_build(tmp_path: Path) -> None:
         time.sleep(0.02)
 
 
+def test_an_interrupt_while_a_compiler_is_started_leaves_none() -> None:
+    """A mask does not keep the signal out: the thread of a numerical library takes it."""
+    code = """
+import os, signal, subprocess, time
+from rsltrace.adapters.processes import build
+
+class Popen(subprocess.Popen):
+    def __init__(self, *words, **options):
+        super().__init__(*words, **options)
+        print(self.pid)
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.05)
+
+build.subprocess.Popen = Popen
+build._run([["sleep", "600"]])
+"""
+    with subprocess.Popen(
+        [sys.executable, "-uc", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as building:
+        pid = int(building.communicate(timeout=100)[0])
+    assert building.returncode != 0
+    assert not _group_lives(pid)
+
+
 def _group_lives(pid: int) -> bool:
     return any(_group_of(path) == pid for path in Path("/proc").glob("[0-9]*/stat"))
 

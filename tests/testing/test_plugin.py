@@ -88,6 +88,20 @@ def test_update_writes_only_what_is_another_run(tmp_path: Path) -> None:
     assert [path.name for path in golden.parent.iterdir()] == ["golden.mcap"]
 
 
+@pytest.mark.parametrize("there", [False, True])
+def test_an_update_takes_the_place_of_a_link(tmp_path: Path, there: bool) -> None:
+    """What it points to may be the golden trace of another test, too."""
+    shared = tmp_path / "shared.mcap"
+    if there:
+        shared.write_bytes(A.read_bytes())
+    (tmp_path / "golden.mcap").symlink_to(shared)
+    assert assert_matches_golden(B, tmp_path / "golden.mcap", update=True)
+    assert not (tmp_path / "golden.mcap").is_symlink()
+    assert (tmp_path / "golden.mcap").read_bytes() == B.read_bytes()
+    assert shared.exists() == there
+    assert not there or shared.read_bytes() == A.read_bytes()
+
+
 def test_a_golden_trace_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:
     golden = tmp_path / "golden.mcap"
     makers: list[Callable[[Path], object]] = [Path.mkdir]

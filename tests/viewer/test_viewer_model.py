@@ -86,6 +86,13 @@ def test_columns_never_exceed_the_width(run: Run, width: int, signs: bool) -> No
     assert {"index", "mark"} <= {column.name for column, _ in row}
 
 
+@pytest.mark.parametrize("width", range(10, 200))
+def test_a_column_that_does_not_fit_is_followed_by_what_it_did_alone(width: int) -> None:
+    names = [column.name for column, _ in layout(ListSpace(width, 5, 12, 12), {}).columns]
+    every = [column.name for column, _ in layout(ListSpace(300, 5, 12, 12), {}).columns]
+    assert names == every[: len(names) - 1] + every[-1:] or names == every[: len(names)]
+
+
 def test_a_column_is_one_line_of_the_table(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     letters = EventColumn(
         "length", "length", width=lambda _: 6, text=lambda row, _: str(len(row.event.node))

@@ -20,6 +20,7 @@ from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 
@@ -125,14 +126,25 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
 def test_a_type_of_that_name_with_other_fields_is_shown_as_any() -> None:
     made = make_dataclass("Made", ["size"], namespace={"__msgtype__": "sensor_msgs/msg/Image"})
     assert message_values(made(size=7)) == "7"
+    scan = make_dataclass(
+        "Made", ["ranges"], namespace={"__msgtype__": "sensor_msgs/msg/LaserScan"}
+    )
+    assert "a" in message_values(scan(ranges=["a"]))
 
 
 def test_values_that_vary_on_a_topic_come_first() -> None:
     def battery(percentage: float) -> Any:
         return message(a=1, b=2, c=3, d=4, e=5, present=True, percentage=percentage, cell=0)
 
-    varying = varying_values(battery(percentage) for percentage in (0.5, 0.0))
+    def decode(data: bytes) -> Any:
+        if data == b"damaged":
+            raise TraceError("it cannot be read")
+        return battery(float(data))
+
+    payloads = [b"0.5", None, b"damaged", b"0.0", b"1" * (1 << 20)]
+    varying = varying_values("a/msg/Battery", payloads, decode)
     assert varying == {"percentage"}
+    assert not varying_values("sensor_msgs/msg/JointState", payloads, decode)  # it has a summary
     assert message_values(battery(0.0), varying) == "percentage=0 a=1 b=2 c=3 d=4"
     assert message_values(message(x=0.0, ω=1.0), {"x"}) == "x=0 ω=1"
 

@@ -312,7 +312,8 @@ def _set_remap(element: Element) -> Action:
 
 
 def _executable(element: Element) -> Action:
-    return nodes.ExecuteProcess(cmd=[_text(element, "cmd") or "?"])
+    command = _text(element, "cmd")
+    return nodes.ExecuteProcess(cmd=[] if command is None else [command])
 
 
 # Nodes and components.

@@ -37,7 +37,7 @@ class ProcessProgram:
 
 @dataclass(frozen=True, slots=True)
 class TypeLookup:
-    """Where the door gets types from, which it knows by name only."""
+    """Where the adapter gets types from, which it knows by name only."""
 
     message: Callable[[str], MessageType]
     service: Callable[[str], ServiceType]

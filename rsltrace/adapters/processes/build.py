@@ -15,6 +15,7 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -201,12 +202,24 @@ def _run(commands: Iterable[list[str]]) -> None:
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Let nothing come between the start of a process and the note of it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
+    """Let nothing come between the start of a process and the note of it.
+
+    A mask of signals would not do: the thread of a numerical library takes them, and Python raises
+    in the main thread all the same.
+    """
+    came: list[int] = []
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(signal.getsignal(number)):
+                before[number] = signal.signal(number, lambda number, frame: came.append(number))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for each in came:
+            signal.raise_signal(each)
 
 
 def _started(command: list[str]) -> subprocess.Popen[str]:

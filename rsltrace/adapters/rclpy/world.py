@@ -77,7 +77,7 @@ class World:
         """The entries in the order of their construction."""
         self.starts = EntryStarts(self.runtime, self.construct)
         self.start_process: Callable[[JobEntry, tuple[int, int]], None]
-        """EntryStarts an entry that runs as a process of its own, as one event."""
+        """Start an entry that runs as a process of its own, as one event."""
 
     def __enter__(self) -> World:
         runtime = self.runtime

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.search.perturb import CORE_TYPE, KERNEL
-from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
     from rsltrace.search.perturb import PerturbedRun
@@ -87,7 +86,7 @@ def _hidden(result: VerifyResult, found: HiddenDifference, command: str, folder:
     """Return what to say of runs of equal events in which a node did not keep the same."""
     lines = [
         f"The events agree, but the state of {found.node} differs: its attribute "
-        f"{found.attribute}, after event {found.event} of run {found.run}.",
+        f"{found.attribute}, after event {found.event} of run {found.run.perturbation.number}.",
         _provoked(result, command),
     ]
     if found.traces is None:
@@ -102,6 +101,7 @@ def _compared(
     """Return the lines of a comparison, and whether the guard knows what made the runs differ."""
     from rsltrace.diff import diff_files
     from rsltrace.diff.report import render
+    from rsltrace.trace.reader import Trace
 
     diff = diff_files(str(_place(first, folder)), str(_place(other, folder)))
     lines = render(diff).rstrip().splitlines()
@@ -148,7 +148,7 @@ def _hidden_values(found: HiddenDifference | None) -> dict[str, object] | None:
         "node": found.node,
         "attribute": found.attribute,
         "event": found.event,
-        "run": found.run,
+        "run": found.run.perturbation.number,
     }
 
 

@@ -99,6 +99,7 @@ class Explainer:
             settings=root.settings,
             reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
             next_step=first.next_step,
+            next_opens_viewer=first.next_opens_viewer,
         )
 
     def is_covered(self, item: EventPair) -> bool:
@@ -115,6 +116,7 @@ class Explainer:
             judgement,
             chain=(CauseStep(judgement.a, judgement.b),),
             next_step=self._next_step(judgement),
+            next_opens_viewer=self._opens_viewer(judgement),
         )
         return self._with_context(bare, index, index)
 
@@ -284,6 +286,7 @@ class Explainer:
             calls=calls,
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
+            next_opens_viewer=self._opens_viewer(judgement),
         )
         return self._with_context(bare, place_a, place_b)
 
@@ -313,6 +316,16 @@ class Explainer:
         ]
         return tuple(sorted(reaches, key=lambda reach: (reach.after_ns, reach.topic)))
 
+    def _has_other_settings(self, judgement: Judgement) -> bool:
+        if judgement.verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER) or not self.settings:
+            return False
+        return judgement.verdict is Verdict.ENVIRONMENT or _told_to_differ(self.settings)
+
+    def _opens_viewer(self, judgement: Judgement) -> bool:
+        """Return whether the next step is a look at both runs; the viewer opens no addresses."""
+        is_remote = any("://" in run.trace.name for run in (self.run_a, self.run_b))
+        return self._has_other_settings(judgement) and not is_remote
+
     def _next_step(self, judgement: Judgement) -> str:
         view = judgement.a or judgement.b
         assert view is not None
@@ -320,10 +333,10 @@ class Explainer:
         verdict = judgement.verdict
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
-        if self.settings and (verdict is Verdict.ENVIRONMENT or _told_to_differ(self.settings)):
-            if "://" in f"{path_a} {path_b}":  # which the viewer does not open
-                return f"rsltrace diff {path_a} {path_b} --all"
+        if self._opens_viewer(judgement):
             return f"rsltrace view {path_a} {path_b}"
+        if self._has_other_settings(judgement):
+            return f"rsltrace diff {path_a} {path_b} --all"
         if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
@@ -377,7 +390,7 @@ _SHARED = {
 }
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
-"""Verdicts where recording the job again helps: it shows which run is the usual one."""
+"""Roots of which recording the job again helps: it shows which run is the usual one."""
 
 _LINKS: dict[int, CauseLinkKind] = {
     OutputKind.MESSAGE: CauseLinkKind.PUBLISHED,

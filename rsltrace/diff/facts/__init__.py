@@ -1,7 +1,7 @@
 """What the comparison of two runs finds out, as frozen values: no text that a person reads.
 
     evidence    what differs: settings, events, fields, messages, calls, states
-    causes      what a divergence is (``What``) and where it comes from (``Why``, ``LikelyCause``)
+    causes      what a divergence is (``DivergenceKind``) and where it comes from (``CauseKind``)
     remarks     what else to know of a comparison (``Remark``), and its answer (``Outcome``)
 
 Whatever decides reads these: alignment and causes make them, ``rsltrace.diff.sentences`` puts them

@@ -84,7 +84,7 @@ class TopicDiff:
     """How the messages of one topic compare; ``first`` is None if nothing but tolerance is between.
 
     ``equal`` messages are the same bit for bit in every field that is compared, ``tolerated`` ones
-    within tolerance, ``ignored`` ones except for ignored fields, ``moved`` ones the same
+    within tolerance, ``ignored`` ones but for fields that are ignored, ``moved`` ones the same
     but in another order. The other counts never include these. ``type_b`` differs from ``type_a``
     only where the recordings disagree about the topic's type.
     """
@@ -108,7 +108,7 @@ class TopicDiff:
 
     @property
     def agreeing(self) -> int:
-        """How many messages are equal, or are so within tolerance and except for ignored fields."""
+        """How many messages are equal, also within tolerance or but for fields that are ignored."""
         return self.equal + self.tolerated + self.ignored
 
 

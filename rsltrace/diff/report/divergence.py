@@ -158,7 +158,7 @@ def _calls(found: Divergence, width: int) -> Section:
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
         rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
     if len(rows) == 2:  # one call on one line, and its place
-        differs = " that differs" * (found.calls[0].a != found.calls[0].b)
+        differs = " that differs" * found.calls[0].differs
         rows[0] = cut(line((f"external call{differs}: ", Style.TITLE), *rows[0][1:]), width)
         return Section((), rows, 2, "", least=1, rank=rank)
     title = "external calls"

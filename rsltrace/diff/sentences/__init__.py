@@ -2,7 +2,8 @@
 
 ``sentence(fact, of)`` looks up the sentence for a fact: by its class, or itself for a member of an
 enum. ``of`` is what the fact belongs to (a ``Judgement`` or a ``Diff``). The modules of this
-package fill the table: ``divergence``, ``runs``, and ``values`` for what is inside of sentences.
+package fill the table: ``divergence``, ``runs``, and ``values`` for what is inside of sentences,
+each with ``@says`` for a function and at its end for what fits into one line.
 """
 
 from __future__ import annotations

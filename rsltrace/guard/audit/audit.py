@@ -1,4 +1,4 @@
-"""AuditReport a path or a job: from files to findings."""
+"""Audit a path or a job: from files to findings."""
 
 from __future__ import annotations
 
@@ -294,7 +294,7 @@ ModuleFolders = Callable[[Iterable[Path]], list[Path]]
 
 
 def audit_path(path: Path) -> AuditReport:
-    """AuditReport a Python file, or all files below a folder, with the guard's defaults.
+    """Audit a Python file, or all files below a folder, with the guard's defaults.
 
     :raises JobError: if there is nothing to audit.
     """
@@ -309,7 +309,7 @@ def audit_path(path: Path) -> AuditReport:
 def audit_job(
     job: Job, executable: Executables, module_folders: ModuleFolders | None = None
 ) -> AuditReport:
-    """AuditReport the modules of a job's nodes, and their imports below its search path.
+    """Audit the modules of a job's nodes, and their imports below its search path.
 
     ``module_folders`` returns the folders of the modules of packages' executables.
 

@@ -83,21 +83,21 @@ def _opening(real: Callable[..., int]) -> Any:
         guard = recording_guard(NondeterminismSource.FILE, frame) if wanted else None
         if guard is None:
             return real(path, flags, *more, **options)
-        open_raw: list[int] = []
+        opened: list[int] = []
 
         def is_folder() -> bool:
-            open_raw.append(real(path, flags, *more, **options))
-            return stat.S_ISDIR(os.fstat(open_raw[0]).st_mode)
+            opened.append(real(path, flags, *more, **options))
+            return stat.S_ISDIR(os.fstat(opened[0]).st_mode)
 
         call = f"os.open({os.fsdecode(path)!r})"
         folder = bool(guard.record(NondeterminismSource.FILE, call, is_folder, frame))
-        if not open_raw:  # a folder is the run's own, or its listing is not recorded anyway
-            open_raw.append(
+        if not opened:  # a folder is the run's own, or its listing is not recorded anyway
+            opened.append(
                 real(path, flags, *more, **options) if folder else unconnected_descriptor(flags)
             )
-        guard.descriptors.drop(open_raw[0])
-        guard.descriptors.add(open_raw[0], NondeterminismSource.FILE, is_folder=folder)
-        return open_raw[0]
+        guard.descriptors.drop(opened[0])
+        guard.descriptors.add(opened[0], NondeterminismSource.FILE, is_folder=folder)
+        return opened[0]
 
     return open_
 

@@ -182,37 +182,40 @@ def _formatting(
 
 def _now(real: Any) -> Any:
     def now(cls: type[datetime], tz: Any = None) -> datetime:
-        return _datetime(cls, real, "now", tz, (tz,), caller())
+        guard, bound = engaged(), real.__get__(None, cls)
+        if guard is None:
+            return bound(tz)  # type: ignore[no-any-return]
+        return _datetime(guard, cls, "now", tz, lambda: bound(tz), caller())
 
     return now
 
 
 def _utcnow(real: Any) -> Any:
     def utcnow(cls: type[datetime]) -> datetime:
-        return _datetime(cls, real, "utcnow", timezone.utc, (), caller()).replace(tzinfo=None)
+        guard, bound = engaged(), real.__get__(None, cls)
+        if guard is None:
+            return bound()  # type: ignore[no-any-return]
+        found = _datetime(guard, cls, "utcnow", timezone.utc, bound, caller())
+        return found.replace(tzinfo=None)
 
     return utcnow
 
 
 def _datetime(
+    guard: Guard,
     cls: type[datetime],
-    real: Any,
     name: str,
     tz: Any,
-    arguments: tuple[Any, ...],
+    real: Callable[[], datetime],
     frame: FrameType,
 ) -> datetime:
     """Answer a class method of ``datetime`` that was called at ``frame``."""
-    guard, bound = engaged(), real.__get__(None, cls)
 
     def virtual(now_ns: int) -> datetime:
         whole = cls.fromtimestamp(now_ns // _NS, tz)
         return whole.replace(microsecond=now_ns % _NS // 1000)
 
-    if guard is None:
-        return bound(*arguments)  # type: ignore[no-any-return]
-    call = f"datetime.{name}()"
-    return clock_call(guard, frame, call, virtual, lambda: bound(*arguments))  # type: ignore[no-any-return]
+    return clock_call(guard, frame, f"datetime.{name}()", virtual, real)  # type: ignore[no-any-return]
 
 
 def numpy_now(function: Any, text: str, *more: Any) -> Any:

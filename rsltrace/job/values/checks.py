@@ -104,7 +104,7 @@ def named_parts(
 
 
 def check_names(names: Iterable[object], rule: Callable[[str], None]) -> None:
-    """Raise ``Problems`` with every key of a mapping that is not text that ``rule`` accepts."""
+    """Raise ``JobProblems`` with every key of a mapping that is not text that ``rule`` accepts."""
     problems = ProblemCollector()
     for name in names:
         with problems.at(str(name), at_key=True):

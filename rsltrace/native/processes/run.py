@@ -129,7 +129,7 @@ class MultiProcessRun(NativeRun):
     """Each entry of the job in a process of its own; what they tell is merged into one trace."""
 
     def open(self, stack: ExitStack, output: Path, *, force: bool, echo: bool) -> None:
-        """ProcessStart the processes up to where they could begin, then create the trace."""
+        """Start the processes up to where they could begin, then create the trace."""
         self.merge = SpanMerger()
         self.starts = StartQueue()
         self.children: list[ObservedProcess] = []
@@ -342,7 +342,7 @@ class MultiProcessRun(NativeRun):
         child.go()
 
     def _start_again(self) -> None:
-        """ProcessStart what has ended and is to come again."""
+        """Start what has ended and is to come again."""
         now_ns = time.monotonic_ns()
         with self._news:
             due = [what for at_ns, what in self._restarts if at_ns <= now_ns]

@@ -107,11 +107,11 @@ class RevisionRunner:
         cwd = self.folder
         cwd.mkdir(parents=True, exist_ok=True)
         path = self.worktree.folder / f"{name}.mcap"
-        command_check = rsltrace_command(record_words(self.arguments, path))
+        command = rsltrace_command(record_words(self.arguments, path))
         if can_fix_addresses():
-            command_check = ["setarch", "-R", *command_check]
+            command = ["setarch", "-R", *command]
         done = self.processes.run(
-            command_check, cwd=cwd, env=self._environment(), timeout_s=self.timeout_s
+            command, cwd=cwd, env=self._environment(), timeout_s=self.timeout_s
         )
         return perturbed_run(Perturbation(0, {}), path, done)
 

@@ -85,7 +85,7 @@ class BisectSearch:
         """Whether a run in which a node raises is judged, not skipped: one end raises, too."""
 
     def find(self) -> BisectResult:
-        """BisectSearch.
+        """Search.
 
         :raises BisectError: an end does not run, is not good or bad, or is nondeterministic.
         """

@@ -254,7 +254,7 @@ class _PausedRun:
         answer_and_end(lambda: self._made(task, TrialOptions(**task["wants"])), self._answer_at)
 
     def _made(self, task: dict[str, Any], wants: TrialOptions) -> dict[str, Any]:
-        from rsltrace.run.branching import why_no_branch as why_no_branch
+        from rsltrace.run.branching import why_no_branch
         from rsltrace.search.explore.outcome import result_of_run
 
         began = time.perf_counter()

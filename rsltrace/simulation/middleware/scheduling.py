@@ -174,7 +174,7 @@ class ExecutionTimes(EventObserver):
         self._counts: dict[tuple[str, str, str], int] = {}
 
     def before_event(self, call: EventCall) -> bool:
-        """RandomDecision the execution time, and charge it when the callback is over."""
+        """Draw the execution time, and charge it when the callback is over."""
         event, charge = self._dispatcher.event, self._loop.charge
         duration = None
         if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):

@@ -44,7 +44,7 @@ class ChunkMessage(NamedTuple):
 def read_chunk(
     source: ByteSource, span: RecordSpan, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
 ) -> bytes:
-    """Return the records of the chunk at ``span``. Raises Damaged.
+    """Return the records of the chunk at ``span``. Raises DamageError.
 
     Chunks larger than ``size_max`` are refused before decompression. MCAP allows a CRC of 0 (none)
     and extra fields at the end of a record; ``strict`` does not.
@@ -108,8 +108,8 @@ def _unlz4(data: memoryview, size: int) -> bytes:
 
 
 def message_at(records: bytes, offset: int, of_channel: int) -> ChunkMessage:
-    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none of that
-    channel."""
+    """Return the message record at ``offset`` of a chunk. Raises DamageError if there is
+    none of that channel."""
     if offset + _MESSAGE_BYTES_MIN > len(records):
         raise DamageError(f"no message fits at {offset} of the chunk")
     opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
@@ -127,7 +127,7 @@ def cut_messages(
     """Return (log time, number, data) of the wanted messages of a chunk, by time and then position.
 
     ``wanted`` maps channel ids to numbers. ``with_publish_time`` puts it before the data (8 bytes,
-    little-endian). Raises Damaged when a record is cut off.
+    little-endian). Raises DamageError when a record is cut off.
     """
     # The publish time is the last field before the data.
     data_at = _MESSAGE_BYTES_MIN - (PUBLISH_TIME_BYTES if with_publish_time else 0)

@@ -34,13 +34,13 @@ from rsltrace.trace.mcap.records import (
 )
 from rsltrace.trace.mcap.source import ByteSource
 
-_WALK_BLOCK_BYTES = 1 << 20
+_BLOCK_BYTES = 1 << 20
 _TAIL_BYTES = 64 << 10
 _KNOWN = frozenset(map(int, Opcode))
 
 
 def read_body(source: ByteSource, span: RecordSpan, opcode: int) -> bytes:
-    """Return the body of the record at ``span``. Raises Damaged if it is another record."""
+    """Return the body of the record at ``span``. Raises DamageError if it is another record."""
     if not RECORD_HEAD.size <= span.length <= RECORD_BYTES_MAX:
         raise DamageError(f"its length is given as {span.length}")
     record = source.read_at(*span)
@@ -53,7 +53,7 @@ def read_body(source: ByteSource, span: RecordSpan, opcode: int) -> bytes:
 def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int, RecordSpan]]:
     """Yield opcode and span of the records between two offsets.
 
-    Raises Damaged at a record that is not whole.
+    Raises DamageError at a record that is not whole.
     """
     at = start
     while at < end:
@@ -70,8 +70,8 @@ def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int
 def whole_records(source: ByteSource) -> Iterator[tuple[int, RecordSpan]]:
     """Yield the whole records of a file without an end.
 
-    Raises Damaged unless the rest is the beginning of one more record: a truncated file ends inside
-    a record, or in zeros that a crash leaves.
+    Raises DamageError unless the rest is the beginning of one more record: a truncated file ends
+    inside a record, or in zeros that a crash leaves.
     """
     at = len(MAGIC)
     try:
@@ -104,8 +104,8 @@ def _damage_at(source: ByteSource, at: int) -> str:
 
 
 def _is_zero(source: ByteSource, at: int) -> bool:
-    for offset in range(at, source.size, _WALK_BLOCK_BYTES):
-        if any(source.read_at(offset, min(_WALK_BLOCK_BYTES, source.size - offset))):
+    for offset in range(at, source.size, _BLOCK_BYTES):
+        if any(source.read_at(offset, min(_BLOCK_BYTES, source.size - offset))):
             return False
     return True
 
@@ -146,7 +146,6 @@ _FOOTER = struct.Struct("<QQI")
 _FOOTER_BYTES = RECORD_HEAD.size + _FOOTER.size
 _BEFORE_CRC = RECORD_HEAD.size + 16
 _DATA_END_BYTES = RECORD_HEAD.size + 4
-_BLOCK_BYTES = 1 << 20
 _CHUNK_INDEX = int(Opcode.CHUNK_INDEX)
 _SCHEMA, _CHANNEL, _STATISTICS = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.STATISTICS)
 _ATTACHMENT_INDEX, _METADATA_INDEX = int(Opcode.ATTACHMENT_INDEX), int(Opcode.METADATA_INDEX)
@@ -175,7 +174,7 @@ class McapSummary:
     statistics: McapStatistics | None = None
 
     def add(self, opcode: int, body: bytes) -> None:
-        """Add a record other than a chunk index. Raises Damaged."""
+        """Add a record other than a chunk index. Raises DamageError."""
         if opcode == _SCHEMA:
             schema = parse_schema(body)
             self.schemas.setdefault(schema.id, schema)
@@ -194,7 +193,7 @@ class McapSummary:
                 self.metadata[entry.text()] = span
 
     def chunks(self, channels: frozenset[int] | None = None) -> Iterator[ChunkIndexEntry]:
-        """Yield the chunks, or those with messages of some channels. Raises Damaged."""
+        """Yield the chunks, or those with messages of some channels. Raises DamageError."""
         for body in self._chunk_indexes:
             if channels is None or not channels.isdisjoint(channels_of_chunk_index(body)):
                 yield parse_chunk_index(body)
@@ -209,7 +208,7 @@ def has_end(source: ByteSource) -> bool:
 
 
 def read_header(source: ByteSource) -> tuple[McapHeader, int]:
-    """Return the header and the offset behind it. Raises Damaged."""
+    """Return the header and the offset behind it. Raises DamageError."""
     offset = len(MAGIC)
     if source.size < offset + RECORD_HEAD.size:
         raise TruncatedFile("it is cut off")
@@ -221,7 +220,7 @@ def read_header(source: ByteSource) -> tuple[McapHeader, int]:
 
 
 def read_footer(source: ByteSource) -> McapFooter:
-    """Return the footer of a file that has an end. Raises Damaged."""
+    """Return the footer of a file that has an end. Raises DamageError."""
     offset = source.size - len(MAGIC) - _FOOTER_BYTES
     body = read_body(source, RecordSpan(offset, _FOOTER_BYTES), Opcode.FOOTER)
     start, _, crc = _FOOTER.unpack(body)
@@ -231,7 +230,7 @@ def read_footer(source: ByteSource) -> McapFooter:
 
 
 def read_summary(source: ByteSource, footer: McapFooter) -> McapSummary:
-    """Return the summary. Raises Damaged."""
+    """Return the summary. Raises DamageError."""
     length = footer.offset - footer.summary_start
     if length > SUMMARY_BYTES_MAX:
         raise DamageError(f"it has {length} bytes, more than {SUMMARY_BYTES_MAX}")
@@ -258,7 +257,7 @@ def data_crc(source: ByteSource, end: int) -> int:
 
 
 def check_data(source: ByteSource, end: int) -> None:
-    """Raise Damaged unless the data section that ends at ``end`` matches its CRC."""
+    """Raise DamageError unless the data section that ends at ``end`` matches its CRC."""
     at = end - _DATA_END_BYTES
     body = read_body(source, RecordSpan(at, _DATA_END_BYTES), Opcode.DATA_END)
     if data_crc(source, at) != int.from_bytes(body, "little"):

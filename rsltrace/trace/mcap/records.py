@@ -100,7 +100,7 @@ class RecordSpan(NamedTuple):
 
 
 class RecordFields:
-    """Reads fields from the front of a record's body. Every method raises Damaged at its end."""
+    """Reads fields from the front of a record's body; at its end, all methods raise DamageError."""
 
     __slots__ = ("_data", "position")
 
@@ -223,7 +223,7 @@ class ChunkIndexEntry(NamedTuple):
 
 
 def parse_header(body: bytes) -> McapHeader:
-    """Parse a Header record. All parsers raise Damaged."""
+    """Parse a Header record. All parsers raise DamageError."""
     fields = RecordFields(body)
     return McapHeader(fields.text(), fields.text())
 
@@ -273,7 +273,7 @@ def channels_of_chunk_index(body: bytes) -> list[int]:
 
 
 def records_in(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield (opcode, start, end) of the bodies of the records in ``data``. Raises Damaged."""
+    """Yield (opcode, start, end) of the bodies of the records in ``data``. Raises DamageError."""
     at, size, unpack = 0, len(data), RECORD_HEAD.unpack_from
     while at < size:
         if at + _HEAD_BYTES > size:

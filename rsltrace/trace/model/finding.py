@@ -92,7 +92,9 @@ NEVER_CALLED: dict[str, tuple[str, ...]] = {
 ``wait_for_ready_callbacks``."""
 
 
-_KEPT = 10
+# Calls that waited until the end of a run.
+
+_WAITS_KEPT = 10
 _HELD_KEPT = 1000
 
 
@@ -108,7 +110,7 @@ class EndlessWait:
 
 def encode_waits(waits: Iterable[EndlessWait]) -> dict[str, str]:
     """Return the entry of a run's result for its endless waits."""
-    kept = [(one.since_ns, one.text, one.held[:_HELD_KEPT]) for one in waits][:_KEPT]
+    kept = [(one.since_ns, one.text, one.held[:_HELD_KEPT]) for one in waits][:_WAITS_KEPT]
     return {"waits": json.dumps(kept)} if kept else {}
 
 

@@ -98,7 +98,7 @@ class McapIndex:
 
 
 def scan_file(source: ByteSource, start: int, end: int, index: McapIndex) -> None:
-    """Fill ``index`` by walking the file, reading every chunk once. Raises Damaged."""
+    """Fill ``index`` by walking the file, reading every chunk once. Raises DamageError."""
     index.start_ns, index.end_ns = 2**64 - 1, 0
     scan_records(source, start, end, index, skip_chunks=False)
     if not index.parts:
@@ -108,7 +108,7 @@ def scan_file(source: ByteSource, start: int, end: int, index: McapIndex) -> Non
 def scan_records(
     source: ByteSource, start: int, end: int, index: McapIndex, *, skip_chunks: bool
 ) -> bool:
-    """Add the records between two offsets of a file to ``index``. Raises Damaged.
+    """Add the records between two offsets of a file to ``index``. Raises DamageError.
 
     With ``skip_chunks`` no chunk is read; finding one ends the walk with False.
     """
@@ -209,7 +209,7 @@ def intact_length(source: ByteSource) -> tuple[int, str]:
 def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
     """Return the index of an MCAP file.
 
-    Raises Damaged saying what is damaged and where, TruncatedFile when the end is missing; with
+    Raises DamageError saying what is damaged and where, TruncatedFile when the end is missing; with
     ``recover`` the index then covers what is whole.
     """
     if not has_end(source):

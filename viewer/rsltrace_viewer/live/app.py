@@ -195,7 +195,7 @@ class LiveApp(ViewerApp):
         self._say(stop.why)
 
     def action_escape(self) -> None:
-        """LiveStop what runs; otherwise end the nearest thing that can be ended."""
+        """Stop what runs; otherwise end the nearest thing that can be ended."""
         running = any(w.group == "live" and w.is_running for w in self.workers)
         if running and not self.prompt.asking and self._status.startswith("running"):
             with suppress(DebugError):

@@ -18,7 +18,7 @@ _BLOCK = 4096
 
 
 class RowList(Protocol):
-    """RowList of a timeline, numbered from 0."""
+    """Rows of a timeline, numbered from 0."""
 
     @property
     def count(self) -> int:

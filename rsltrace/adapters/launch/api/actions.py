@@ -79,13 +79,13 @@ class IncludeLaunchDescription(Action):
         self.launch_arguments = list(given.items() if isinstance(given, Mapping) else given)
 
     def execute(self, context: LaunchContext) -> Any:
-        """Set the arguments, and read the file."""
+        """Read the file, whose path does not depend on the arguments, and set these."""
+        source = self.launch_description_source
+        path = Path() if source.description is not None else Path(context.text(source.place))
         for name, value in self.launch_arguments:
             context.launch_configurations[context.text(name)] = context.text(value)
-        source = self.launch_description_source
         if source.description is not None:
             return [source.description]
-        path = Path(context.text(source.place))
         if not path.is_absolute():
             path = Path(os.path.abspath(path))
         package = missing_package(path)

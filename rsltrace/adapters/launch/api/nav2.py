@@ -18,6 +18,7 @@ from rsltrace.adapters.launch.api.basics import (
     as_substitutions,
 )
 from rsltrace.adapters.launch.model import truth, yaml_value
+from rsltrace.trace.model.regular_file import read_regular
 
 
 class _FileSubstitution(Substitution):
@@ -29,7 +30,7 @@ class _FileSubstitution(Substitution):
     def _text(self, context: LaunchContext) -> str:
         path = context.text(self.source_file)
         try:
-            return Path(path).read_text(encoding="utf-8")
+            return read_regular(Path(path)).decode()
         except OSError as error:
             raise SubstitutionFailure(f"cannot read {path}: {error.strerror}") from error
 

@@ -31,8 +31,8 @@ _WITHOUT_MEANING = frozenset(
 """How a process is run: nothing that a node could tell in a simulation."""
 
 _OF_PROCESSES = ("cwd", "env", "additional_env", "respawn", "respawn_delay", "respawn_max_retries")
-_WITHOUT = ("prefix", "shell")
-"""What processes are not given here: said, then left out."""
+_WITHOUT = {"prefix": "launch-prefix", "shell": "shell"}
+"""What processes are not given here, and its name in a note."""
 
 _RENAMED = {"node_executable": "executable", "node_name": "name", "node_namespace": "namespace"}
 
@@ -71,7 +71,7 @@ class ExecuteLocal(Action):
             folder=context.optional(options.get("cwd")) or "",
             respawn=respawn,
             own=(*(f"env {name}" for name in own), *(["cwd"] if "cwd" in options else [])),
-            without=tuple(name for name in _WITHOUT if name in options),
+            without=tuple(said for name, said in _WITHOUT.items() if name in options),
         )
 
     def _started(self, context: LaunchContext) -> None:
@@ -97,7 +97,7 @@ class ExecuteProcess(ExecuteLocal):
         except Exception as error:  # whatever a substitution of the user's own raises
             words = " ".join("".join(part.describe() for part in word) for word in self.cmd)
             why += f" (nor can its command be read: {as_job_error(error, '')})"
-        context.refuse(self.where, f"process {words!r:.200}", why)
+        context.refuse(self.where, f"process {words!r:.200}" if words else "a process", why)
         self._started(context)
 
 
@@ -168,7 +168,7 @@ class LifecycleNode(Node):
     def execute(self, context: LaunchContext) -> None:
         """Note the node."""
         super().execute(context)
-        if context.flag(self._autostart):
+        if self._package is not None and context.flag(self._autostart):
             context.refuse(
                 self.where,
                 f"autostart of {context.optional(self._package)}/{context.text(self._executable)}",

@@ -48,6 +48,10 @@ class Parameter:
         return context.text(self.name), self._value.evaluate(context)
 
 
+_TEMPORARY = re.compile(r"(tmp|launch_params_)[a-z0-9_]{8}(\..*)?")
+"""Names that ``tempfile`` gives: the launch file has written such a file itself."""
+
+
 class ParameterFile:
     """A file of parameters."""
 
@@ -77,7 +81,9 @@ class ParameterFile:
                 return context.text(parse_template(text))
 
             return substituted_parameters(path, replaced, full_name)
-        if Path(path).parent == Path(tempfile.gettempdir()):
+        if Path(path).parent == Path(tempfile.gettempdir()) and _TEMPORARY.fullmatch(
+            Path(path).name
+        ):
             return parameters_for(path, full_name)
         return scope.ParameterFilePath(path)
 

@@ -23,6 +23,7 @@ from rsltrace.adapters.launch.api.basics import (
 from rsltrace.adapters.launch.api.packages import prefix_of, share_of
 from rsltrace.adapters.launch.model import equal_texts, truth
 from rsltrace.errors import did_you_mean
+from rsltrace.trace.model.regular_file import read_regular
 
 
 def _word(value: bool) -> str:
@@ -222,7 +223,7 @@ class FileContent(Substitution):
         """Return the text."""
         path = context.text(self.path)
         try:
-            return Path(path).read_text(encoding="utf-8")
+            return read_regular(Path(path)).decode()
         except OSError as error:
             raise SubstitutionFailure(f"cannot read {path}: {error.strerror}") from error
 

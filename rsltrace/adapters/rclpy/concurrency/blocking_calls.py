@@ -203,7 +203,7 @@ def end_blocked(runtime: Runtime) -> None:
 
 
 class SimEvent:
-    """Stands in for ``threading.CurrentEvent`` in rclpy."""
+    """Stands in for ``threading.Event`` in rclpy."""
 
     def __init__(self, runtime: Runtime, what: str = "an event to be set") -> None:
         self._runtime = runtime

@@ -130,7 +130,7 @@ class CurrentEvent:
 
     What it sends leaves ``busy_ns`` later (execution times), and its executor is busy for
     ``took_ns``. A ``quiet`` event is recorded only if something comes of it. ``on_end`` is called
-    after it. ``node`` is an ``Owner`` or None.
+    after it. ``node`` is an ``EventOwner`` or None.
     """
 
     handle: Dispatchable | None = None

@@ -21,7 +21,7 @@ from rsltrace_viewer.model.plots.series import (
     topics_with_messages,
 )
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.message_values import samples
+from rsltrace_viewer.model.timeline.message_values import samples, too_large
 
 _NOTHING = Series(np.zeros(0), np.zeros(0), "")
 
@@ -74,12 +74,14 @@ class RunPlots:
         """Return some messages of a topic in each run, as many in each. Raises TraceError."""
         found = [(run.trace, channel) for run in self._runs if (channel := channel_of(run, topic))]
         count = min((trace.message_counts[channel.id] for trace, channel in found), default=0)
+        chosen = [
+            [trace.message(channel.id, number)[1] for trace, channel in found]
+            for number in samples(count, TELLING_MAX)
+        ]
+        small = [ones for ones in chosen if not too_large(found[0][1].type, max(map(len, ones)))]
         return [
-            [
-                trace.decode(channel, trace.message(channel.id, number)[1])
-                for number in samples(count, TELLING_MAX)
-            ]
-            for trace, channel in found
+            [trace.decode(channel, ones[place]) for ones in small]
+            for place, (trace, channel) in enumerate(found)
         ]
 
     def first(self) -> tuple[str, str]:

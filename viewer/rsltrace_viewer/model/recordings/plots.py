@@ -17,7 +17,7 @@ from rsltrace_viewer.model.plots.series import (
 )
 from rsltrace_viewer.model.recordings.recording import Recording, Topic
 from rsltrace_viewer.model.recordings.session import RecordingSession
-from rsltrace_viewer.model.timeline.message_values import samples
+from rsltrace_viewer.model.timeline.message_values import samples, too_large
 
 _RATE_BINS = 240
 
@@ -51,11 +51,19 @@ class RecordingPlots:
     def messages(self, topic: str) -> list[list[object]]:
         """Return some messages of a topic in each recording, as many in each. Raises TraceError."""
         found = self._of(topic)
-        kept = [[one for one in topic.data if one is not None] for _, topic in found]
-        numbers = samples(min(map(len, kept), default=0), TELLING_MAX)
+        count = min((len(topic.data) for _, topic in found), default=0)
+        chosen = [
+            [topic.data[number] for _, topic in found] for number in samples(count, TELLING_MAX)
+        ]
+        small = [
+            kept
+            for ones in chosen
+            if len(kept := [one for one in ones if one is not None]) == len(found)
+            and not too_large(found[0][1].type, max(map(len, kept)))
+        ]
         return [
-            [recording.decode(topic, data[number]) for number in numbers]
-            for (recording, topic), data in zip(found, kept, strict=True)
+            [recording.decode(topic, ones[place]) for ones in small]
+            for place, (recording, topic) in enumerate(found)
         ]
 
     def first(self) -> tuple[str, str]:

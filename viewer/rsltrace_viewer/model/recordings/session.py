@@ -287,11 +287,10 @@ class RecordingSession:
         count, found = self._known_varying.get(key, (0, frozenset()))
         if len(topic.data) >= 2 * max(count, 1):
             count = len(topic.data)
-            read = (topic.data[number] for number in samples(count, SAMPLES_MAX))
             found = varying_values(
-                recording.decode(topic, data)
-                for data in read
-                if data is not None and not too_large(topic.type, len(data))
+                topic.type,
+                (topic.data[number] for number in samples(count, SAMPLES_MAX)),
+                lambda data: recording.decode(topic, data),
             )
             self._known_varying[key] = count, found
         return found

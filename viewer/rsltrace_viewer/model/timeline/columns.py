@@ -232,13 +232,19 @@ def layout(space: ListSpace, names: Mapping[str, ShortNames]) -> ColumnLayout:
     """Return the columns that fit into a list. Narrow lists lose what is needed least."""
     left = space.width - GAP
     chosen = []
+    is_full = False
     for column in COLUMNS:
         width = column.width(space)
         if width == _REST:
             width = left - GAP if left > 3 else 0
-        if width and (column.spare is None or left - width - GAP >= column.spare):
-            chosen.append((column, width))
-            left -= width + GAP
+        if not width:
+            continue
+        if column.spare is not None:  # what follows one that does not fit is needed even less
+            is_full = is_full or left - width - GAP < column.spare
+            if is_full:
+                continue
+        chosen.append((column, width))
+        left -= width + GAP
     return ColumnLayout(space, tuple(chosen), names)
 
 

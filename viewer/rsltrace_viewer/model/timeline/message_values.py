@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
@@ -41,7 +41,8 @@ def message_values(message: object, varying: Collection[str] = ()) -> str:
     ``varying`` are the paths that ``varying_values`` found on its topic: they come first."""
     summary = _SUMMARIES.get(str(getattr(message, "__msgtype__", "")))
     if summary is not None:
-        with suppress(AttributeError):  # a type of this name with other fields
+        # A type of this name may have other fields, or the same ones with other types.
+        with suppress(AttributeError, TypeError, ValueError, IndexError):
             return printable(summary(message))
     return printable(_values(message, varying))
 
@@ -51,11 +52,23 @@ def too_large(type_name: str, size: int) -> bool:
     return size > (_FLAT_BYTES_MAX if type_name in _FLAT else _BYTES_MAX)
 
 
-def varying_values(messages: Iterable[object]) -> frozenset[str]:
-    """Return the paths of the values in which messages of one topic differ."""
+def varying_values(
+    type_name: str, payloads: Iterable[bytes | None], decode: Callable[[bytes], object]
+) -> frozenset[str]:
+    """Return the paths of the values in which messages of one topic differ.
+
+    Nothing is decoded of a type whose summary does not ask. Messages that are missing, too large or
+    damaged are left out.
+    """
     first: dict[str, str] = {}
     found: set[str] = set()
-    for message in messages:
+    for data in payloads if type_name not in _SUMMARIES else ():
+        if data is None or too_large(type_name, len(data)):
+            continue
+        try:
+            message = decode(data)
+        except RsltraceError:
+            continue
         values = dict(islice(_leaves(message, ""), _LEAVES_MAX))
         first = first or values
         found |= {path for path, value in values.items() if first.get(path) != value}
@@ -342,13 +355,11 @@ class RowValues:
         trace = self._run.trace
         known = self._varying.get(channel.id)
         if known is None:
-            count = 0 if channel.type in _SUMMARIES else trace.message_counts.get(channel.id, 0)
-            payloads = (
-                trace.payload(replace(output, sequence=n)) for n in samples(count, SAMPLES_MAX)
-            )
+            numbers = samples(trace.message_counts.get(channel.id, 0), SAMPLES_MAX)
+            found = (trace.payload(replace(output, sequence=number)) for number in numbers)
             known = self._varying[channel.id] = varying_values(
-                trace.decode(channel, one[2])
-                for one in payloads
-                if one is not None and not too_large(channel.type, len(one[2]))
+                channel.type,
+                (one and one[2] for one in found),
+                lambda data: trace.decode(channel, data),
             )
         return known

@@ -1,4 +1,4 @@
-"""ComponentRows of messages on their way from Rerun's loader to our recording.
+"""Rows of messages on their way from Rerun's loader to our recording.
 
 The chunks of a trace are cut where its events are, so those of a slow topic hold few rows each.
 Rows of one kind wait here until there are enough for a chunk: faster to write, and to view.
@@ -195,7 +195,7 @@ class ComponentRows:
 
 @dataclass(slots=True)
 class Waiting:
-    """ComponentRows of one sequence that wait to become one chunk."""
+    """Rows of one sequence that wait to become one chunk."""
 
     topic: str
     path: str

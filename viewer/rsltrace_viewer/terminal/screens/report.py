@@ -108,7 +108,7 @@ def _without_view(diff: Diff | BagDiff) -> Diff | BagDiff:
         return diff
 
     def without(one: Divergence) -> Divergence:
-        return replace(one, next_step="") if one.next_step.startswith("rsltrace view ") else one
+        return replace(one, next_step="") if one.next_opens_viewer else one
 
     return replace(
         diff,
