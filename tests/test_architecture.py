@@ -268,6 +268,7 @@ RUNS_CODE = {
     "rsltrace/adapters/rclpy/messages/interface_classes.py": "import_module",  # classes of messages
     "rsltrace/adapters/rclpy/messages/source_text.py": "compile exec",  # codecs
     "rsltrace/search/explore/worker.py": "import_module",  # what the last run has imported
+    "rsltrace/guard/call_reports.py": "import_module",  # modules of Python that rules name
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
     "rsltrace/guard/virtual/user_modules.py": "compile exec_module",  # the same, with our calls
     "rsltrace/guard/virtual/set_order.py": "pickle",  # makes its pickles of sets ordered
