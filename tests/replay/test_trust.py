@@ -136,7 +136,7 @@ def test_answers_from_outside_may_be_forged(
     """A node that unpickles a file would run what a trace says that the file holds."""
     code = "class Watch(Watch):\n    def got(self, m): os.environ.get('HOME')\n"
     recorded(f"{JOB}guard: {{environment: record}}\n", code)
-    with pytest.raises(ReplayError, match="answers from outside"):
+    with pytest.raises(ReplayError, match="recorded answers"):
         rsltrace.replay(here)
     assert rsltrace.replay(here, trust=True).is_whole
 

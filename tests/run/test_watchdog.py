@@ -279,7 +279,7 @@ def test_ctrl_c_twice_ends_a_busy_loop_with_a_whole_trace(tmp_path: Path) -> Non
         process.send_signal(signal.SIGINT)
         assert process.stderr is not None
         for line in process.stderr:
-            if "once more to force" in line:
+            if "repeat to force" in line:
                 process.send_signal(signal.SIGINT)
     assert process.returncode == 130
     with rsltrace.Trace.open(tmp_path / "run.mcap") as trace:

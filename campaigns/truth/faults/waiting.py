@@ -23,14 +23,14 @@ def slept_longer(rng: random.Random, world: World) -> Change:
 @behaviour("slept after it had published")
 def slept_after(rng: random.Random, world: World) -> Change:
     node = one_of(rng, world, "source", "relay")
-    truth = truth_of(node, first=(r"slept 3 ms in b and not in a",))
+    truth = truth_of(node, first=(r"slept 3 ms in b but not in a",))
     return Change(node, ["time.sleep(0.003)"], truth, "# after", rng.randint(1, 6))
 
 
 @behaviour("server that slept", service=True)
 def server_slept(rng: random.Random, world: World) -> Change:
     node = world.node("server")
-    truth = truth_of(node, first=(r"slept 4 ms in b and not in a", r"/ask\b.* 4 ms later in b"))
+    truth = truth_of(node, first=(r"slept 4 ms in b but not in a", r"/ask\b.* 4 ms later in b"))
     return Change(node, ["time.sleep(0.004)"], truth, "# before", rng.randint(1, 2))
 
 

@@ -205,7 +205,7 @@ def _times(a: EventSummary, b: EventSummary) -> str:
 
 
 def slept_text(slept: SleepTimes) -> str:
-    """Return ``slept 7 ms in b and not in a``."""
+    """Return ``slept 7 ms in b but not in a``."""
     if slept.a is not None and slept.b is not None:
         in_a, in_b = contrasting_durations(slept.a, slept.b)
         return f"slept {in_a} in a and {in_b} in b"
