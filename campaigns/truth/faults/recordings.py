@@ -67,7 +67,7 @@ def extra(rng: random.Random) -> Planted:
     at = rng.randrange(1, len(places))
     stamp = b[places[at]][0]
     b.insert(places[at], (stamp, topic, -77.5))
-    first = (rf"message {at} of b is extra",)
+    first = (rf"message {at} of b is not in a",)
     return _planted(Recordings(a, b, topic, {"only_b": 1}, first=first, place=at))
 
 
