@@ -214,7 +214,7 @@ def seed(rng: random.Random) -> Planted:
     b = a.copy()
     b.job["seed"] += 1
     says = (r"\bseed\b",)
-    never = tuple(text for text in NEVER if "chance" not in text)
+    never = tuple(text for text in NEVER if "random draws" not in text)
     return Planted(a, b, Truth(("draw",), says=says, never=never, independent=None))
 
 

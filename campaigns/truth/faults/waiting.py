@@ -16,7 +16,7 @@ def slept_longer(rng: random.Random, world: World) -> Change:
     lines = node.callbacks[0].lines
     place = lines.index("# before")
     lines[place : place + 1] = ["nap = 0.002", "# before", f"if self.n == {at}: time.sleep(nap)"]
-    truth = truth_of(node, verdicts=("timing",), first=(r"slept .*2 ms in a, 5 ms in b",))
+    truth = truth_of(node, verdicts=("timing",), first=(r"slept .*2 ms in a and 5 ms in b",))
     return Change(node, ["nap = 0.005"], truth, at=at)
 
 
