@@ -110,3 +110,9 @@ def test_what_is_known_names_classes() -> None:
 def test_what_campaigns_have_found(name: str, seed: int) -> None:
     outcomes = list(try_cases([(name, seed)]))
     assert not wrong(outcomes), wrong(outcomes)
+
+
+def test_code_of_a_main_that_changed_is_why_the_main_waited_otherwise() -> None:
+    """A main belongs to no node; the event beside it in the other run is of another node."""
+    outcomes = list(try_cases([("time limit of spin_once, in code", 731001)]))
+    assert not wrong(outcomes), wrong(outcomes)

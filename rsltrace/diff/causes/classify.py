@@ -105,7 +105,13 @@ class DivergenceCase:
     def blame(self, *, inside: bool = False, drawn: bool = False) -> bool:
         """Find which settings differ that can be the cause; False if there are none."""
         views = (self.a, self.b, self.other_a, self.other_b, self.cause_a, self.cause_b)
-        nodes = {view.node for view in views if view is not None}
+        involved = [view for view in views if view is not None]
+        nodes = {view.node for view in involved}
+        mains = {
+            v.entity.name.partition(":")[0]
+            for v in involved
+            if v.entity.kind == EntityKind.MAIN.label
+        }
         if any(map(_is_qos_event, self.messages)):
             nodes = set()  # which has made them is not known, but whose QoS has changed
         if self.changed is not None:
@@ -117,7 +123,9 @@ class DivergenceCase:
         settings = self.settings
         if self.one.kind is EventKind.BAG and not drawn:
             settings = [setting for setting in settings if setting.part in _OF_BAGS]
-        place = DivergenceSite(frozenset(nodes - {""}), constructing, inside, drawn)
+        place = DivergenceSite(
+            frozenset(nodes - {""}), constructing, inside, drawn, frozenset(mains)
+        )
         self.blamed[:] = self.relevance.of(settings, place)
         return bool(self.blamed)
 

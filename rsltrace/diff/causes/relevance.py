@@ -45,6 +45,8 @@ class DivergenceSite:
     constructing: bool = False
     inside: bool = False
     drawn: bool = False
+    mains: frozenset[str] = frozenset()
+    """The modules of the mains involved, which belong to no node."""
 
 
 @dataclass
@@ -78,6 +80,8 @@ class Relevance:
 
     def _is_code_of(self, module: str, place: DivergenceSite) -> bool:
         """Whether a module is one that the nodes may use: not that of other nodes alone."""
+        if any(module in self._used_by(main) for main in place.mains):
+            return True
         owners = {name for name, of in self._modules.items() if module in self._used_by(of)}
         return not owners or not place.nodes or bool(owners & place.nodes)
 
