@@ -36,7 +36,7 @@ _PARTS_MAX = 512
 def unfinished_path(path: Path) -> Path:
     """Return the path of the trace that will replace the one at ``path``, while it is written."""
     real = Path(os.path.realpath(path)) if path.is_symlink() else path
-    return real.with_name(f"{real.stem}.unfinished{real.suffix}")
+    return real.parent / f"{real.stem}.unfinished{real.suffix}"  # "." has no name to replace
 
 
 class Sink:
