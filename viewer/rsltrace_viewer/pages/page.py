@@ -1,0 +1,63 @@
+"""What all pages have in common: one file that loads nothing, in which every text stays text.
+
+Names and messages come from traces, and a trace may come from anybody. Jinja2 escapes each value,
+control characters are made visible, and the policy of the page lets nothing run or load but the
+style and the script that are part of this package.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable_lines, shortened
+
+_FOLDER = Path(__file__).parent / "templates"
+_TEXT_MAX = 60_000
+
+
+def render_page(template: str, **values: object) -> str:
+    """Return a page, ending in a newline."""
+    style, script = (_own(name) for name in ("style.css", "script.js"))
+    policy = (
+        f"default-src 'none'; style-src {_digest(style)}; script-src {_digest(script)}; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    made = _environment().get_template(template)
+    return made.render(values, style=style, script=script, policy=policy) + "\n"
+
+
+@cache
+def _environment() -> Environment:
+    made = Environment(
+        loader=FileSystemLoader(_FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_finalize,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters.update(duration=format_duration, seconds=format_seconds, cut=shortened)
+    return made
+
+
+def _finalize(value: object) -> object:
+    """Return what a template shows of a value."""
+    if value is None:
+        return ""
+    return shortened(printable_lines(value), _TEXT_MAX) if type(value) is str else value
+
+
+@cache
+def _own(name: str) -> Markup:
+    return Markup((_FOLDER / name).read_text(encoding="utf-8"))
+
+
+def _digest(text: str) -> Markup:
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return Markup(f"'sha256-{digest}'")
