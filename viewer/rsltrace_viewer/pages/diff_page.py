@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,9 +23,11 @@ from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, 
 from rsltrace.diff.result import BagDiff, Diff, Divergence
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.values import setting_name
+from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import contrasting_texts, format_seconds
 from rsltrace.trace.words.phrases import as_sentence
+from rsltrace_viewer.model.plots.runs import RunPlots
 from rsltrace_viewer.model.plots.series import PlotSource, difference, most_telling
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import CallbackCode, source_of
@@ -38,7 +40,6 @@ ROWS = 30
 _BEFORE = 8
 _VALUE_MAX = 80
 _PLOTS_MAX = 6
-_LINES_MAX = 60
 _IN_FULL_MAX = 5
 _VISIBLE = 0.02
 """Two curves that are closer than this part of their height look like one: a - b is drawn then."""
@@ -189,17 +190,16 @@ def _sources(a: Run, b: Run, diff: Diff) -> Iterator[CallbackCode]:
     """Yield the callback that diverged; of two different ones, both."""
     names = set()
     for run, event in zip((a, b), (diff.shown.a, diff.shown.b) if diff.shown else (), strict=False):
-        code = source_of(run, event.index) if event is not None else None
-        if code is not None and code.name not in names:
-            names.add(code.name)
-            yield code
+        with suppress(RsltraceError):  # the rows say what is damaged
+            code = source_of(run, event.index) if event is not None else None
+            if code is not None and code.name not in names:
+                names.add(code.name)
+                yield code
 
 
 def _plots(a: Run, b: Run, diff: Diff) -> Iterator[tuple[str, str, Markup]]:
     """Yield plots of fields that differ: those of the divergence, then one of each topic that it
     reaches; each with how far the runs are from each other."""
-    from rsltrace_viewer.model.plots.runs import RunPlots
-
     found = diff.shown
     if found is None:
         return
@@ -209,18 +209,22 @@ def _plots(a: Run, b: Run, diff: Diff) -> Iterator[tuple[str, str, Markup]]:
     chosen: list[PlotSource] = []
     named = [(one.topic, {field.path for field in one.fields}) for one in found.messages]
     for topic, paths in [*named, *((one.topic, set[str]()) for one in found.reaches)]:
-        fields = plots.fields(topic) if topic in known else []
-        differing = [
-            field for field in fields if field.field in paths and "stamp" not in field.field
-        ]
-        if not differing and fields and not any(one.name == topic for one in chosen):
-            differing = [most_telling(fields, plots.messages(topic))]
-        chosen += differing
+        with suppress(RsltraceError):
+            fields = plots.fields(topic) if topic in known else []
+            differing = [f for f in fields if f.field in paths and "stamp" not in f.field]
+            if not differing and fields and not any(one.name == topic for one in chosen):
+                differing = [most_telling(fields, plots.messages(topic))]
+            chosen += differing
     for source in list(dict.fromkeys(chosen))[:_PLOTS_MAX]:
-        *_, series = plots.series(source)
-        label, between = source.label, difference(series)
-        if between is not None and np.ptp(between.values) < _VISIBLE * np.ptp(series[0].values):
-            label, series = f"a − b of {label}", [between]
-        drawn = curves(series, label, plots.cursor_s())
-        if drawn is not None:
-            yield label, between.note if between is not None else "", drawn
+        with suppress(RsltraceError):
+            yield from _plot(plots, source)
+
+
+def _plot(plots: RunPlots, source: PlotSource) -> Iterator[tuple[str, str, Markup]]:
+    *_, series = plots.series(source)
+    label, between = source.label, difference(series)
+    if between is not None and np.ptp(between.values) < _VISIBLE * np.ptp(series[0].values):
+        label, series = f"a − b of {label}", [between]
+    drawn = curves(series, label, plots.cursor_s())
+    if drawn is not None:
+        yield label, between.note if between is not None else "", drawn

@@ -26,7 +26,7 @@ _LETTERS = {SHORT_KINDS[kind]: letter for kind, letter in KIND_LETTERS.items()}
 class OrderRow:
     """A row of aligned runs: its place, how its events compare, and their words.
 
-    ``moved_to`` is the place of the same event in the other run, ``here`` whether they diverge here.
+    ``moved_to`` is the place of the same event in the other run, ``here`` whether they diverge.
     """
 
     place: int
