@@ -61,10 +61,14 @@ def as_page(result: VerifyResult, folder: Path, again: Sequence[str]) -> str:
     rows += [
         (f"run {one.perturbation.number}", f"{one.digest}: {one.perturbation}") for one in differ
     ]
+    commands = list(again)
     if result.other is not None or result.hidden is not None:
-        rows.append(("cause", _provoked(result, again[-1])))
+        cause, *command = _provoked(result, again[-1]).splitlines()[:2]
+        name, _, text = cause.partition(": ")
+        rows.append((name, text))
+        commands += map(str.strip, command)
     traces = [_place(one, folder) for one in differ][: 2 * (len(differ) > 1)]
-    return search_page(_answer(result), rows, again, traces)
+    return search_page(_answer(result), rows, commands, traces)
 
 
 def as_values(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: bool) -> str:
