@@ -199,6 +199,19 @@ def test_nothing_in_a_trace_becomes_markup(
         assert names[0] == names[1]
 
 
+@pytest.mark.parametrize("words", [("diff", "a.mcap", "b.mcap"), ("info", "b.mcap")])
+def test_texts_of_any_length_make_no_large_page(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for sample, write in (("nondeterministic_callback", with_names), ("missing_event", with_logs)):
+        for side in "ab":
+            parts = mcap_parts.take_apart((SAMPLES / sample / f"{side}.mcap").read_bytes())
+            write(parts, "<" * 60_000)
+            (tmp_path / f"{side}.mcap").write_bytes(mcap_parts.put_together(parts))
+        contained(made(*words))
+
+
 def test_the_page_of_a_run_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(SAMPLES / "missing_event")
     text = made("info", "b.mcap")

@@ -11,13 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import printable, shortened
 from rsltrace_viewer.model.plots.series import Series
 
 WIDTH, HEIGHT = 420, 180
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34
 _BINS = 24
 _POINTS_MAX = 1500
+_TEXT_MAX = 80
 _STEPS = 200
 """Of a curve with more points, the least and the greatest in each of so many steps are drawn."""
 _ASIDE = 17
@@ -35,9 +36,9 @@ class _Chart:
         box = f"0 0 {WIDTH} {HEIGHT}"
         self.element = Element(
             "svg",
-            {"viewBox": box, "class": "chart", "role": "img", "aria-label": printable(says)},
+            {"viewBox": box, "class": "chart", "role": "img", "aria-label": _short(says)},
         )
-        SubElement(self.element, "title").text = printable(says)
+        SubElement(self.element, "title").text = _short(says)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Return where a point is drawn."""
@@ -91,7 +92,7 @@ class _Chart:
 
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
         place = {"x": f"{x:g}", "y": f"{y:g}", "text-anchor": anchor}
-        SubElement(self.element, "text", place).text = printable(text)
+        SubElement(self.element, "text", place).text = _short(text)
 
 
 def svg_of(element: Element) -> Markup:
@@ -182,6 +183,10 @@ def progress(new: Sequence[bool], failed: Sequence[bool]) -> Markup:
 def number(value: float) -> str:
     """Return a number in few digits."""
     return f"{value:.3g}"
+
+
+def _short(text: str) -> str:
+    return printable(shortened(text, _TEXT_MAX))
 
 
 def _wide(ends: tuple[float, float]) -> tuple[float, float]:

@@ -13,12 +13,12 @@ from functools import cache
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup
+from markupsafe import Markup, escape
 
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable_lines, shortened
+from rsltrace.trace.model.texts import printable_lines, shortened
 
 _FOLDER = Path(__file__).parent / "templates"
-_TEXT_MAX = 60_000
+_TEXT_MAX, _REPORT_MAX = 4000, 100_000
 
 
 def render_page(template: str, **values: object) -> str:
@@ -42,7 +42,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters.update(duration=format_duration, seconds=format_seconds, cut=shortened)
+    made.filters.update(cut=shortened, report=_report)
     return made
 
 
@@ -51,6 +51,11 @@ def _finalize(value: object) -> object:
     if value is None:
         return ""
     return shortened(printable_lines(value), _TEXT_MAX) if type(value) is str else value
+
+
+def _report(text: str) -> Markup:
+    """Return a text that may be longer than others."""
+    return escape(shortened(printable_lines(text), _REPORT_MAX))
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from itertools import groupby
 
 from markupsafe import Markup
@@ -13,7 +14,7 @@ from rsltrace.errors import RsltraceError, SetupError
 from rsltrace.simulation.middleware.overview import GraphEnd, GraphLink, GraphNode, GraphOverview
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS, is_built_in
-from rsltrace.trace.model.texts import format_duration
+from rsltrace.trace.model.texts import format_duration, shortened
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.logs import LEVEL_WARN
@@ -35,6 +36,7 @@ from rsltrace_viewer.pages.page import render_page
 from rsltrace_viewer.session import Session
 
 _ROWS_MAX = 100
+_NAME_MAX = 80
 _LOGS_MAX = 200
 _PLOTS_MAX = 8
 _SENDERS = {
@@ -123,7 +125,11 @@ def _logs(logs: Logs) -> Iterator[tuple[str, ...]]:
 
 def _graph(trace: Trace, draw: Callable[[GraphOverview], str]) -> Markup | None:
     """Draw who publishes and subscribes; None where what lays it out is not installed."""
-    entities = [one for one in trace.entities.values() if not is_built_in(one)]
+    entities = [
+        replace(one, name=shortened(one.name, _NAME_MAX), type=shortened(one.type, _NAME_MAX))
+        for one in trace.entities.values()
+        if not is_built_in(one)
+    ]
     nodes = [GraphNode(one.name, one.type, ()) for one in entities if one.kind is EntityKind.NODE]
 
     def key(one: Entity) -> tuple[str, str]:
@@ -145,7 +151,11 @@ def _graph(trace: Trace, draw: Callable[[GraphOverview], str]) -> Markup | None:
 def _ends(
     trace: Trace, group: Sequence[Entity], kinds: dict[EntityKind, str]
 ) -> tuple[GraphEnd, ...]:
-    return tuple(GraphEnd(trace.node_of(one).name) for one in group if one.kind in kinds)
+    return tuple(
+        GraphEnd(shortened(trace.node_of(one).name, _NAME_MAX))
+        for one in group
+        if one.kind in kinds
+    )
 
 
 def _plots(run: Run) -> Iterator[tuple[str, Markup]]:
