@@ -37,7 +37,7 @@ from rsltrace_viewer.session import Session
 
 _ROWS_MAX = 100
 _NAME_MAX = 80
-_LOGS_MAX = 200
+_LOGS_MAX = 100
 _PLOTS_MAX = 8
 _SENDERS = {
     EntityKind.PUBLISHER: "topic",
@@ -73,6 +73,11 @@ def run_page(
         for found in one.violations
     ]
     troubles = [one for one in troubles_of(run, overview, logs) if one.count]
+    bad = [one.first for one in troubles if one.bad]
+    bad += [found.event for one in checks.violated for found in one.violations]
+    first = min((one for one in bad if one is not None), default=None)
+    at = [] if first is None else ["--at", str(first)]
+    view = ["rsltrace", "view", trace.name]
     return render_page(
         "run.html",
         name=run.name,
@@ -95,7 +100,7 @@ def run_page(
         logs=[*_logs(logs)],
         log_count=len(logs.lines),
         plots=[*_plots(run)],
-        commands=[] if is_native(trace) else [shlex.join(["rsltrace", "view", trace.name])],
+        commands=[] if is_native(trace) else [shlex.join([*view, *at])],
     )
 
 
