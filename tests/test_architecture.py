@@ -218,7 +218,6 @@ _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "_watcher"): "of asyncio's policies",
     ("rsltrace/adapters/rclpy/concurrency/asyncio_loops.py", "step"): "a slot of RecordedPoll",
     ("rsltrace/adapters/rclpy/handles/logs.py", "_line"): "a field of a message",
-    ("rsltrace/search/explore/report/page.py", "tail"): "the text after an element of XML",
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "register"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "unregister"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/threads.py", "__init__"): "of the user's thread classes",

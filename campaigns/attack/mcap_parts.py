@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
-from itertools import chain
+from itertools import chain, takewhile
 
 import lz4.frame
 import xxhash
@@ -278,14 +278,27 @@ def change_messages(parts: list[Part], topic: str, change: object) -> int:
     nth = 0
     for part in chunks_with(parts, channel):
         rows = []
+        places, was, now = {}, 0, 0
         for opcode, body in inner(chunk_data(part)):
+            places[was] = now
+            was += HEAD.size + len(body)
             if opcode == Opcode.MESSAGE and body[:2] == struct.pack("<H", channel):
                 head, data = body[: MESSAGE_HEAD.size], body[MESSAGE_HEAD.size :]
                 body = head + change(data, nth)
                 nth += 1
+            now += HEAD.size + len(body)
             rows.append((opcode, body))
         set_chunk_data(part, joined(rows))
+        _move_messages(parts[parts.index(part) + 1 :], places)
     return nth
+
+
+def _move_messages(following: list[Part], places: dict[int, int]) -> None:
+    """Let the indexes behind a chunk say where its messages are now."""
+    for part in takewhile(lambda one: one.opcode == Opcode.MESSAGE_INDEX, following):
+        times = struct.iter_unpack("<QQ", part.body[6:])
+        moved = (struct.pack("<QQ", time, places.get(at, at)) for time, at in times)
+        part.body = part.body[:6] + b"".join(moved)
 
 
 def rehash(parts: list[Part]) -> str:

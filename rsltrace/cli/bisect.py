@@ -65,7 +65,8 @@ _BEFORE, _AFTER = "before.mcap", "after.mcap"
     "--output",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="DIR",
-    help=f"Keep the traces before and after the change in DIR ({_BEFORE}, {_AFTER}).",
+    help=f"Keep the traces before and after the change in DIR ({_BEFORE}, {_AFTER}), with a page "
+    "(report.html).",
 )
 @click.option("--force", is_flag=True, help="Replace existing traces in DIR.")
 @seed_option
@@ -242,7 +243,9 @@ def _report(
     found: BisectResult, runner: RevisionRunner, output: Path | None, *, as_json: bool
 ) -> int:
     """Print the result, keep the traces if wanted, and return the exit status."""
-    from rsltrace.cli.output.search_text import as_text, as_values
+    from rsltrace.cli.output.search_text import as_page, as_text, as_values
+    from rsltrace.cli.output.text_file import write_text
+    from rsltrace.search.explore.table import PAGE
 
     kept = None
     if output is not None:
@@ -250,6 +253,7 @@ def _report(
         shutil.copyfile(found.before.run.path, output / _BEFORE)
         shutil.copyfile(found.after.run.path, output / _AFTER)
         kept = (output / _BEFORE, output / _AFTER)
+        write_text(output / PAGE, as_page(found, runner.repository, kept))
     if as_json:
         say(json.dumps(as_values(found, runner.repository, kept)))
     else:

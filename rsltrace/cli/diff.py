@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rsltrace.diff.result import BagDiff, Diff
     from rsltrace.trace.reader import Trace
 
-_FORMATS = ("text", "json", "markdown", "junit", "github")
+_FORMATS = ("text", "json", "markdown", "junit", "github", "html")
 _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 200
 _HEIGHT_MIN = 21
 _PROMPTS = 3
@@ -275,15 +275,25 @@ def print_diffs(
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
-        write_text(output, render(one_or_all, form, options))
+        write_text(output, _rendered(diffs, form, options))
         say(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
     elif form != "text":
-        say(render(one_or_all, form, options), end="")
+        say(_rendered(diffs, form, options), end="")
     elif sys.stdout.isatty():
         width, height = _screen()
         _show(report_lines(one_or_all, options, width=width, height=height))
     else:
         say(_encodable(render(one_or_all, "text", options)), end="")
+
+
+def _rendered(diffs: Sequence[Diff | BagDiff], form: str, options: DiffOptions) -> str:
+    if form == "html":
+        from rsltrace_viewer.pages.diff_page import diff_page
+
+        return diff_page(diffs, options)
+    from rsltrace.diff.report import render
+
+    return render(diffs, form, options)
 
 
 def _screen() -> tuple[int, int]:

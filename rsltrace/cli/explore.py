@@ -21,6 +21,7 @@ from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
+from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
@@ -341,6 +342,8 @@ class _SearchReport:
 
     def report(self, job: Job) -> None:
         """Write the page and the table, and print the result."""
+        from rsltrace_viewer.pages.search_page import exploration_page
+
         from rsltrace.cli.output.search_text import search_lines
         from rsltrace.search.explore.report.exploration import Exploration, ReducedRun
         from rsltrace.search.explore.report.formats import (
@@ -349,7 +352,6 @@ class _SearchReport:
             junit_text,
             write_parquet,
         )
-        from rsltrace.search.explore.report.page import write_page
         from rsltrace.search.explore.table import PAGE, PARQUET, result_rows
 
         source, search = self._source, self._search
@@ -369,7 +371,8 @@ class _SearchReport:
             units={name: spec.unit for name, spec in job.metrics.items() if spec.unit},
         )
         try:
-            write_page(explored, self._folder / PAGE)
+            with replacement_of(self._folder / PAGE) as work:
+                work.write_text(exploration_page(explored), encoding="utf-8")
             with suppress(ExploreError):  # pyarrow is not installed
                 write_parquet(explored, self._folder / PARQUET)
         except OSError as error:

@@ -6,11 +6,13 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import click
 
+from rsltrace.cli.output.text_file import write_text
 from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.contents import TraceCounts, count_trace
@@ -38,6 +40,7 @@ from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.phrases import table
 
 NO_DIGEST = "none: no two native runs have the same times"
+_FORMATS = ("text", "json", "html")
 _CLOCKS = ("wall_ns", "steady_ns", "mode", "ignored")
 
 
@@ -129,7 +132,15 @@ _VALUE_MAX = 100
 
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
-@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(_FORMATS),
+    default="text",
+    show_default=True,
+    help="Format of the summary; html is a page for the browser.",
+)
+@click.option("--json", "form", flag_value="json", help="Print one JSON object.")
 @click.option(
     "--all", "show_all", is_flag=True, help="List every entity (--json always lists all)."
 )
@@ -138,7 +149,14 @@ _VALUE_MAX = 100
     is_flag=True,
     help="First verify all checksums, hashes and messages of the file.",
 )
-def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the summary to FILE.",
+)
+def info(trace: Path, form: str, show_all: bool, check: bool, output: Path | None) -> None:
     """Summarize TRACE: its digest, counts, nodes, and entities with their rates.
 
     Runs with the same digest are identical. A rate is events (for publishers: messages) per second
@@ -154,36 +172,49 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
                 opened.check()
                 check_contents(opened)
         counts = count_trace(opened)
-        if as_json:
-            say(json.dumps(_as_json(opened, counts), indent=2))
+        text = "\n".join(_as_text(opened, counts, show_all=show_all or form == "html"))
+        if form == "json":
+            text = json.dumps(_as_json(opened, counts), indent=2)
+        elif form == "html":
+            from rsltrace_viewer.pages.run_page import run_page
+
+            from rsltrace.cli.output.graph_svg import graph_svg
+
+            draw = partial(graph_svg, in_page=True)
+            text = run_page(opened, _facts(opened, counts), text, draw)
+        if output is None:
+            say(text)
         else:
-            say("\n".join(_as_text(opened, counts, show_all=show_all)))
+            write_text(output, f"{text}\n")
 
 
-def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
+def _facts(trace: Trace, counts: TraceCounts) -> list[tuple[str, str]]:
+    """Return what the run is, as names with values."""
     start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
     time = ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})")
     native = is_native(trace)
     if native:
         time = ("recorded", real_time(trace))
     size = f"{trace.size} bytes, format {FORMAT_VERSION}, {printable(trace.header.library)}"
-    lines = table(
-        (
-            ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
-            ("state", _state(trace)),
-            *(() if trace.complete or native else (("next", _TRUNCATED),)),
-            *(("waiting", text) for text in _waits(trace)),
-            ("digest", NO_DIGEST if native else trace.digest),
-            time,
-            ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
-            ("outputs", _by_kind(trace.output_count, counts.output_kinds, OutputKind)),
-        )
-    )
+    return [
+        ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
+        ("state", _state(trace)),
+        *(() if trace.complete or native else (("next", _TRUNCATED),)),
+        *(("waiting", text) for text in _waits(trace)),
+        ("digest", NO_DIGEST if native else trace.digest),
+        time,
+        ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
+        ("outputs", _by_kind(trace.output_count, counts.output_kinds, OutputKind)),
+    ]
+
+
+def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
+    lines = table(_facts(trace, counts))
     for title, mapping in (("job", trace.job), ("environment", trace.environment)):
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
             lines += ["", title, *table(rows)]
-    if native:
+    if is_native(trace):
         lines += native_lines(trace)
     if edits := edits_of(trace):
         lines += ["", "edits of this branch", *(f"  {printable(e)}" for e in edits)]

@@ -95,7 +95,7 @@ class JobArguments:
     "--keep",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Keep the traces of all runs in this folder.",
+    help="Keep the traces of all runs in this folder, with a page (report.html).",
 )
 @click.option(
     "--run", "number", type=click.IntRange(min=0), help="Repeat only the run of this number."
@@ -182,9 +182,13 @@ def _verify(
         keep.mkdir(parents=True, exist_ok=True)
         for trace in sorted(folder.glob("*.mcap")):
             shutil.move(trace, keep / trace.name)
-    from rsltrace.cli.output.verify_text import as_text, as_values
+    from rsltrace.cli.output.text_file import write_text
+    from rsltrace.cli.output.verify_text import as_page, as_text, as_values
+    from rsltrace.search.explore.table import PAGE
 
     again = [_again(given, perturbations, one.perturbation) for one in _two(result)]
+    if keep is not None and result.trouble is None:
+        write_text(keep / PAGE, as_page(result, keep, again))
     if as_json:
         say(as_values(result, place, again, kept=keep is not None))
     else:

@@ -161,6 +161,9 @@ def test_what_does_not_run_is_skipped_and_the_answer_is_a_range(
     )
     assert again.returncode == 1
     assert again.stdout.splitlines()[0] in done.stdout
+    page = (tmp_path / "kept/report.html").read_text()
+    assert "<h1>first changed at one of these 3 commits" in page
+    assert page.index("before.mcap") < page.index("after.mcap")
     refused = robot.bisect(
         "--good", good, "--bad", "HEAD", "job.yaml", "-o", str(tmp_path / "kept")
     )

@@ -159,6 +159,9 @@ def test_without_the_pin_the_hash_seed_shows(
     assert "not deterministic" in done.stdout
     assert "caused by: hash seed alone" in done.stdout
     assert "environment: hash_seed  0" in done.stdout, "the diff is printed"
+    page = (tmp_path / "kept/report.html").read_text()
+    assert f"<h1>{done.stdout.splitlines()[0]}</h1>" in page
+    assert "environment: hash_seed" in page
     lines = done.stdout.splitlines()
     for number in (0, 1):
         (at,) = (n for n, line in enumerate(lines) if line.startswith(f"run {number}: digest "))

@@ -15,6 +15,7 @@ from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
 from rsltrace.cli.main import cli
 from rsltrace.trace.model.texts import printable_lines
+from rsltrace.trace.reader import Trace
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x08\x9b31m\u202eevil\u2066"
@@ -36,7 +37,7 @@ def _hostile(source: Path, target: Path, *, schemas: bool) -> None:
     for part in parts:
         record = part.record if part.opcode in (Opcode.METADATA, Opcode.ATTACHMENT) else None
         if isinstance(record, records.Metadata) and not record.name.startswith("rosbag2"):
-            kept = ("digest", "version", "resolved")
+            kept = ("digest", "version", "resolved", "checksum")
             record.metadata = {
                 key: text if key in kept else text + ESCAPES
                 for key, text in record.metadata.items()
@@ -71,6 +72,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         sample = SAMPLES / "nondeterministic_callback" / f"{side}.mcap"
         _hostile(sample, folder / f"{side}.mcap", schemas=False)
         _hostile(sample, folder / f"{side}2.mcap", schemas=True)
+    with Trace.open(folder / "a2.mcap") as trace:
+        assert any(ESCAPES in entity.name for entity in trace.entities.values())
     bag = folder / f"bag{ESCAPES.replace('/', '')}"
     bag.mkdir()
     (bag / "metadata.yaml").write_text(f"rosbag2_bagfile_information: {ESCAPES}\n")
@@ -109,8 +112,9 @@ _TRACES = ("a.mcap", "a2.mcap", f"x{ESCAPES}.mcap")
         ("export", "a2.mcap", "-o", f"out{ESCAPES}"),
         *(
             ("diff", "a.mcap", "b.mcap", "--format", form)
-            for form in ("text", "markdown", "github")
+            for form in ("text", "markdown", "github", "html")
         ),
+        ("info", "a2.mcap", "--format", "html"),
         ("diff", "a2.mcap", "b2.mcap", "--all"),
         ("diff", "a2.mcap", "b2.mcap", "--abs", "*=1"),
         ("diff", "a.mcap", "b.mcap", "--check"),

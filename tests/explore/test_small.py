@@ -174,9 +174,11 @@ def test_a_folder_reproduces_the_run_also_when_it_is_moved_with_its_sources(
     assert reduced.parts.without == (0,)
     folder = robot / "found" / "first"
     decides = write_small(JobSource(str(robot / "job.yaml")), reduced, folder)
-    assert "subscription /b of /last: lost in a" in decides
+    assert "subscription /b of /last: no loss in a, lost in b" in decides
     text = (folder / "README.md").read_text()
     assert "two is last" in text
+    assert "rsltrace diff passing.mcap failing.mcap\n" in text
+    assert "\n  a  passing.mcap" in (folder / "diff.txt").read_text()
     assert "- the fault {drop: /b, message: 3}\n" in text
     assert "- it needs no idle\n" in text
     assert "seed" not in text

@@ -152,7 +152,7 @@ def test_the_action_passes_fails_and_keeps_what_it_made(robot: Path) -> None:
     jobs = "robots/**/job.yaml"
     ran = run_action(robot, jobs=jobs)
     assert ran.status == 0, ran.output
-    made = ["report.md", *(f"robots/a/job.{end}" for end in ("mcap", "md", "xml"))]
+    made = ["report.md", *(f"robots/a/job.{end}" for end in ("html", "mcap", "md", "xml"))]
     assert ran.uploaded == made
     assert "rsltrace: 1 jobs, 0 failed" in ran.output
     assert "identical" in ran.summary

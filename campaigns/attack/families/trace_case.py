@@ -14,7 +14,7 @@ from campaigns.attack.reading import content
 
 HOSTILE = "hostile.mcap"
 ORIGINAL = "original.mcap"
-FORMATS = ("text", "json", "markdown", "junit", "github")
+FORMATS = ("text", "json", "markdown", "junit", "github", "html")
 
 
 def attack_trace(

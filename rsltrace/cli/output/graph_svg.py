@@ -67,8 +67,9 @@ class _Edge:
     through: list[tuple[float, float]] = field(default_factory=list)
 
 
-def graph_svg(overview: GraphOverview) -> str:
-    """Return the picture of a graph, the same for the same graph.
+def graph_svg(overview: GraphOverview, *, in_page: bool = False) -> str:
+    """Return the picture of a graph, the same for the same graph; ``in_page`` leaves colours and
+    background to the page around it.
 
     :raises SetupError: if the library that lays it out is not installed.
     """
@@ -76,7 +77,7 @@ def graph_svg(overview: GraphOverview) -> str:
     if edges:
         _lay_out(boxes, edges)
     _place_alone(boxes, edges)
-    return "\n".join(_svg(boxes, edges)) + "\n"
+    return "\n".join(_svg(boxes, edges, in_page)) + "\n"
 
 
 def _boxes_and_edges(overview: GraphOverview) -> tuple[list[_Box], list[_Edge]]:
@@ -196,7 +197,7 @@ def _place_alone(boxes: list[_Box], edges: list[_Edge]) -> None:
         x += box.width + 30
 
 
-def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
+def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
     points = [(x, y) for edge in edges for x, y in edge.through]
     left = min([box.x - box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
     right = max([box.x + box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
@@ -208,16 +209,18 @@ def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
         f'viewBox="{left - _MARGIN:.1f} {top - _MARGIN:.1f} {width:.1f} {height:.1f}">'
     )
-    yield f"<style>{_STYLE}</style>"
+    if not in_page:
+        yield f"<style>{_STYLE}</style>"
     yield (
         '<defs><marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
         'markerHeight="7" orient="auto"><path d="M0 0 L8 4 L0 8 z" fill="#57606a"/>'
         "</marker></defs>"
     )
-    yield (
-        f'<rect x="{left - _MARGIN:.1f}" y="{top - _MARGIN:.1f}" width="{width:.1f}" '
-        f'height="{height:.1f}" fill="#ffffff"/>'
-    )
+    if not in_page:
+        yield (
+            f'<rect x="{left - _MARGIN:.1f}" y="{top - _MARGIN:.1f}" width="{width:.1f}" '
+            f'height="{height:.1f}" fill="#ffffff"/>'
+        )
     for edge in edges:
         yield _path(boxes[edge.source], boxes[edge.target], edge)
     for box in boxes:

@@ -35,16 +35,12 @@ def line_of(tried: TestedRevision) -> str:
 def as_text(found: BisectResult, repository: GitRepository, kept: Kept) -> str:
     """Return the report; ``kept`` are the paths of the traces, None if they are deleted."""
     first = found.first
+    lines = [_answer(found)]
     if first is not None:
-        lines = [f"first changed at {first}  ({first.author}, {first.date})"]
         if len(first.parents) > 1:
             lines.append(f"  a merge of {len(first.parents)} commits without the change")
         lines += _files(repository.changed_files(first))
     else:
-        count = len(found.candidates)
-        lines = [
-            f"first changed at one of these {count} commits; the skipped ones cannot tell which"
-        ]
         lines += [f"  {commit}" for commit in found.candidates]
     difference = _difference(found, kept)
     report = render(difference).rstrip().splitlines()
@@ -53,6 +49,23 @@ def as_text(found: BisectResult, repository: GitRepository, kept: Kept) -> str:
     lines += ["", *report]
     lines += [f"the traces are {kept[0]} and {kept[1]}"] if kept else []
     return "\n".join(lines)
+
+
+def _answer(found: BisectResult) -> str:
+    if (first := found.first) is not None:
+        return f"first changed at {first}  ({first.author}, {first.date})"
+    count = len(found.candidates)
+    return f"first changed at one of these {count} commits; the skipped ones cannot tell which"
+
+
+def as_page(found: BisectResult, repository: GitRepository, kept: tuple[Path, Path]) -> str:
+    """Return the report as a page. Raises TraceError."""
+    from rsltrace_viewer.pages.search_page import search_page
+
+    rows = [("tried", "\n".join(map(line_of, found.tried)))]
+    if found.first is not None:
+        rows.append(("changed files", "\n".join(_files(repository.changed_files(found.first)))))
+    return search_page(_answer(found), rows, (), kept)
 
 
 def as_values(found: BisectResult, repository: GitRepository, kept: Kept) -> dict[str, Any]:

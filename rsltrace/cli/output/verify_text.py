@@ -28,16 +28,14 @@ def as_text(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: b
     """Return the report; ``again`` are the commands that repeat the runs in question."""
     if result.trouble is not None:
         return _trouble(result, result.trouble, again[-1])
-    tried = _tried(result)
     perturbed = f"perturbed: {', '.join(result.kinds) or 'nothing'}"
     first, other = result.first, result.other
     if other is None:
-        ended = f" (each ended with exit status {first.exit_code})" if first.exit_code else ""
-        lines = [f"{tried}, one digest {first.digest}{ended}", perturbed]
+        lines = [_answer(result), perturbed]
         if result.hidden is not None:
             lines += ["", *_hidden(result, result.hidden, again[-1], folder)]
         return "\n".join([*lines, f"the traces are in {folder}"] if kept else lines)
-    lines = [f"not deterministic: {tried}, {len(result.digests)} digests", perturbed, ""]
+    lines = [_answer(result), perturbed, ""]
     for recorded, command in zip((first, other), again, strict=True):
         ended = f", exit status {recorded.exit_code}" if recorded.exit_code else ""
         around = recorded.perturbation
@@ -52,6 +50,25 @@ def as_text(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: b
     lines += ["", *report]
     lines += ["", f"the traces are in {folder}"] if kept else []
     return "\n".join(lines)
+
+
+def as_page(result: VerifyResult, folder: Path, again: Sequence[str]) -> str:
+    """Return the report as a page; the traces are in ``folder``. Raises TraceError."""
+    from rsltrace_viewer.pages.search_page import search_page
+
+    differ = [result.first] if result.other is None else [result.first, result.other]
+    rows = [("perturbed", ", ".join(result.kinds) or "nothing")]
+    rows += [
+        (f"run {one.perturbation.number}", f"{one.digest}: {one.perturbation}") for one in differ
+    ]
+    commands = list(again)
+    if result.other is not None or result.hidden is not None:
+        cause, *command = _provoked(result, again[-1]).splitlines()[:2]
+        name, _, text = cause.partition(": ")
+        rows.append((name, text))
+        commands += map(str.strip, command)
+    traces = [_place(one, folder) for one in differ][: 2 * (len(differ) > 1)]
+    return search_page(_answer(result), rows, commands, traces)
 
 
 def as_values(result: VerifyResult, folder: Path, again: Sequence[str], *, kept: bool) -> str:
@@ -156,9 +173,14 @@ def _place(recorded: PerturbedRun, folder: Path) -> Path:
     return folder / recorded.path.name
 
 
-def _tried(result: VerifyResult) -> str:
+def _answer(result: VerifyResult) -> str:
     many = "s" * (len(result.kinds) != 1)
-    return f"{result.runs} runs, {len(result.kinds)} perturbation{many}"
+    tried = f"{result.runs} runs, {len(result.kinds)} perturbation{many}"
+    if result.other is not None:
+        return f"not deterministic: {tried}, {len(result.digests)} digests"
+    first = result.first
+    ended = f" (each ended with exit status {first.exit_code})" if first.exit_code else ""
+    return f"{tried}, one digest {first.digest}{ended}"
 
 
 def _provoked(result: VerifyResult, command: str) -> str:

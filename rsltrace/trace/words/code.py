@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
@@ -25,6 +26,7 @@ _SENT = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST))
 _LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKind.ACTION))
 """Kinds of events that may run another function than their entity's callback."""
 _PLACES_SHOWN = 3
+_LINE_DIGITS = 9
 
 
 def code_place(trace: Trace, event: EventRecord) -> str:
@@ -121,10 +123,10 @@ def code_file(trace: Trace, place: str) -> tuple[Path, int] | None:
     """
     name, _, line = place.rpartition(":")
     path = PurePosixPath(name)
-    if not line.isdecimal() or path.is_absolute() or ".." in path.parts:
+    if not line.isdecimal() or len(line) > _LINE_DIGITS or path.is_absolute() or ".." in path.parts:
         return None
     for folder in _folders(trace):
-        if (folder / path).is_file():
+        if os.path.isfile(folder / path):  # False of a name that no file can have, too
             return folder / path, int(line)
     return None
 

@@ -69,7 +69,7 @@ def _lines(
         yield f"rsltrace view failing.mcap --at {failing.failure.event}"
         yield f"rsltrace debug failing.mcap  # then: goto {failing.failure.event}"
     if passing is not None:
-        yield "rsltrace diff failing.mcap passing.mcap"
+        yield "rsltrace diff passing.mcap failing.mcap"
     yield "```"
     yield ""
     yield "Besides the job, this run needs the following to fail:"
@@ -197,7 +197,7 @@ def _diff(folder: Path) -> tuple[str, str]:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.report import render
 
-    found: Any = diff_files(folder / FAILING, folder / PASSING)
+    found: Any = diff_files(folder / PASSING, folder / FAILING)
     text: str = render(found, "text", DiffOptions())
     return _OF_FOLDER.sub(r"\1", text), found.sentence
 

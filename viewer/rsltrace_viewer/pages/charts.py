@@ -1,18 +1,26 @@
-"""Charts as SVG elements: a histogram, points over a setting, progress over the runs."""
+"""Charts as SVG: curves of fields, a histogram, points over a setting, progress over the runs."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
 from itertools import accumulate
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element, SubElement, tostring
 
-from rsltrace.trace.model.texts import printable
+import numpy as np
+import numpy.typing as npt
+from markupsafe import Markup
+
+from rsltrace.trace.model.texts import printable, shortened
+from rsltrace_viewer.model.plots.series import Series
 
 WIDTH, HEIGHT = 420, 180
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34
 _BINS = 24
 _POINTS_MAX = 1500
+_TEXT_MAX = 80
+_STEPS = 200
+"""Of a curve with more points, the least and the greatest in each of so many steps are drawn."""
 _ASIDE = 17
 """Columns in which points over a text are spread."""
 
@@ -27,9 +35,10 @@ class _Chart:
         self._x, self._y = _wide(x), _wide(y)
         box = f"0 0 {WIDTH} {HEIGHT}"
         self.element = Element(
-            "svg", {"viewBox": box, "role": "img", "aria-label": printable(says)}
+            "svg",
+            {"viewBox": box, "class": "chart", "role": "img", "aria-label": _short(says)},
         )
-        SubElement(self.element, "title").text = printable(says)
+        SubElement(self.element, "title").text = _short(says)
 
     def at(self, x: float, y: float) -> tuple[float, float]:
         """Return where a point is drawn."""
@@ -72,16 +81,57 @@ class _Chart:
         drawn = " ".join("{:g},{:g}".format(*self.at(x, y)) for x, y in points)
         SubElement(self.element, "polyline", {"points": drawn, "class": kind})
 
+    def upright(self, x: float) -> None:
+        """Draw a line from bottom to top."""
+        across = self.at(x, self._y[0])[0]
+        self._line(across, HEIGHT - _BOTTOM, across, _TOP)
+
     def _line(self, x1: float, y1: float, x2: float, y2: float) -> None:
         ends = {"x1": f"{x1:g}", "y1": f"{y1:g}", "x2": f"{x2:g}", "y2": f"{y2:g}"}
         SubElement(self.element, "line", ends)
 
     def _text(self, x: float, y: float, text: str, anchor: str) -> None:
         place = {"x": f"{x:g}", "y": f"{y:g}", "text-anchor": anchor}
-        SubElement(self.element, "text", place).text = printable(text)
+        SubElement(self.element, "text", place).text = _short(text)
 
 
-def histogram(values: Sequence[tuple[float, bool]], name: str) -> Element:
+def svg_of(element: Element) -> Markup:
+    """Return an element as a part of a page."""
+    return Markup(tostring(element, encoding="unicode"))
+
+
+def curves(series: Sequence[Series], name: str, cursor_s: float | None) -> Markup | None:
+    """Draw a value over time, of one run or of two; None if there are no two points. The vertical
+    line is at ``cursor_s``."""
+    drawn = [
+        (kind, [*zip(one.times[shown].tolist(), one.values[shown].tolist(), strict=True)])
+        for kind, one in zip("ab", series, strict=False)
+        if len(shown := _telling(one))
+    ]
+    points = [point for _, curve in drawn for point in curve]
+    if len(points) < 2:
+        return None
+    times, values = zip(*points, strict=True)
+    chart = _Chart((min(times), max(times)), (min(values), max(values)), name)
+    for kind, curve in drawn:
+        chart.path(curve, kind)
+    if cursor_s is not None and min(times) <= cursor_s <= max(times):
+        chart.upright(cursor_s)
+    chart.axes("time in s")
+    return svg_of(chart.element)
+
+
+def _telling(one: Series) -> npt.NDArray[np.intp]:
+    """Return the places of the points to draw."""
+    finite = np.flatnonzero(np.isfinite(one.values) & np.isfinite(one.times))
+    if len(finite) <= 2 * _STEPS:
+        return finite
+    steps = np.array_split(finite, _STEPS)
+    ends = [step[find(one.values[step])] for step in steps for find in (np.argmin, np.argmax)]
+    return np.unique(ends)
+
+
+def histogram(values: Sequence[tuple[float, bool]], name: str) -> Markup:
     """Draw the distribution of a metric; failed runs are stacked on the others."""
     low, high = _wide((min(v for v, _ in values), max(v for v, _ in values)))
     counts = [[0, 0] for _ in range(_BINS)]
@@ -96,10 +146,10 @@ def histogram(values: Sequence[tuple[float, bool]], name: str) -> Element:
         if bad:
             chart.bar(low + index * width, width, good, bad, "bad")
     chart.axes(name)
-    return chart.element
+    return svg_of(chart.element)
 
 
-def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()) -> Element:
+def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()) -> Markup:
     """Draw a metric over a setting; ``places`` are the texts that x counts from 0."""
     points = [one for one in points if math.isfinite(one[0]) and math.isfinite(one[1])]
     x = (min(p[0] for p in points), max(p[0] for p in points))
@@ -116,10 +166,10 @@ def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()
     chart.axes(
         f"{y_name} over {x_name}", [(float(index), said) for index, said in enumerate(places)]
     )
-    return chart.element
+    return svg_of(chart.element)
 
 
-def progress(new: Sequence[bool], failed: Sequence[bool]) -> Element:
+def progress(new: Sequence[bool], failed: Sequence[bool]) -> Markup:
     """Draw, over the runs, how many were new and how many failed."""
     chart = _Chart((0, len(new)), (0, max(sum(new), sum(failed), 1)), "new and failed runs so far")
     for flags, kind in ((new, "good"), (failed, "bad")):
@@ -127,12 +177,16 @@ def progress(new: Sequence[bool], failed: Sequence[bool]) -> Element:
         totals = [(0, 0), *enumerate(accumulate(map(int, flags)), 1)]
         chart.path([*totals[::step], totals[-1]], kind)
     chart.axes("runs")
-    return chart.element
+    return svg_of(chart.element)
 
 
 def number(value: float) -> str:
     """Return a number in few digits."""
     return f"{value:.3g}"
+
+
+def _short(text: str) -> str:
+    return printable(shortened(text, _TEXT_MAX))
 
 
 def _wide(ends: tuple[float, float]) -> tuple[float, float]:

@@ -1,0 +1,256 @@
+"""The pages for the browser say what the traces say, and nothing in a trace becomes markup."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from mcap import records
+from mcap.opcode import Opcode
+
+from campaigns.attack import mcap_parts
+from campaigns.attack.families.texts import with_strings
+from rsltrace.cli.main import cli
+from rsltrace.diff import diff_files
+from rsltrace.diff.traces.aligned_runs import AlignedRuns
+from rsltrace.trace.model.texts import format_seconds
+from rsltrace.trace.reader import Trace
+
+SAMPLES = Path(__file__).parents[2] / "sample_traces"
+PAIRS = sorted(path.parent for path in SAMPLES.glob("*/a.mcap"))
+VOID = frozenset(("meta", "br", "img", "link"))
+MARKUP = """</td></pre><script>alert(1)</script><img src=x onerror="alert(1)">'&{{7*7}}"""
+_ROW_VALUE = re.compile(r"(-?[\d.e+-]+) → (-?[\d.e+-]+)")
+_CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
+
+
+class Page(HTMLParser):
+    """The tags of a page with their attributes, its text, and the cells of its tables."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.text = ""
+        self.rows: list[list[str]] = []
+        self.classes: list[str] = []
+        self._open: list[str] = []
+        self.feed(text)
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+        if tag not in VOID:
+            self._open.append(tag)
+        if tag == "tr":
+            self.rows.append([])
+            self.classes.append(dict(attrs).get("class") or "")
+        elif tag in ("td", "th"):
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+        if self._open[-1:] and "tr" in self._open and self.rows[-1]:
+            self.rows[-1][-1] += data
+
+
+def made(*words: str) -> str:
+    """Return the page that a command prints."""
+    result = CliRunner().invoke(cli, [*words, "--format", "html"])
+    assert result.exit_code in (0, 1), result.output
+    return result.output
+
+
+def contained(text: str) -> None:
+    """Check that a page is small, loads nothing and runs nothing but its own script."""
+    page = Page(text)
+    assert len(text) < 1_000_000
+    names = {name for name, _ in page.attributes}
+    assert not names & {"src", "href", "style", "srcset", "action"}
+    assert not [name for name in names if name.startswith("on")]
+    assert [page.tags.count(tag) for tag in ("script", "style", "img", "link")] == [1, 1, 0, 0]
+    policy = next(value or "" for name, value in page.attributes if name == "content")
+    assert policy.startswith("default-src 'none'; ")
+    for tag in ("script", "style"):
+        (own,) = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.S)
+        assert not re.search(r"url\(|@import|https?:|fetch|XMLHttp", own)
+        digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}';" in policy
+
+
+@pytest.mark.parametrize("folder", PAIRS, ids=lambda path: path.name)
+def test_rows_fields_and_order_are_those_of_the_traces(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    text = made("diff", "a.mcap", "b.mcap")
+    contained(text)
+    page, diff = Page(text), diff_files("a.mcap", "b.mcap")
+    assert diff.shown is not None
+    rows = [row for row in page.rows if len(row) == 8][1:]
+    assert len(rows) == 30
+    here = [row for row, kind in zip(page.rows, page.classes, strict=True) if "here" in kind]
+    with Trace.open("a.mcap") as a, Trace.open("b.mcap") as b:
+        runs = AlignedRuns(a, b)
+        stamps = [[e["stamp"] for block in t.events() for e in block] for t in (a, b)]
+        for number, event in ((1, diff.shown.a), (2, diff.shown.b)):
+            own = [int(row[number]) for row in rows if row[number]]
+            assert own == list(range(own[0], own[-1] + 1))  # each once, in order
+            if event is not None:
+                assert str(event.index) in [row[number] for row in here]
+        for sign, *numbers, time, _, _, _, did in rows:
+            indexes = [int(number) if number else None for number in numbers]
+            which = 0 if indexes[0] is not None else 1
+            index = indexes[which]
+            assert index is not None
+            assert time == format_seconds(int(stamps[which][index]))
+            place = runs.rows.place_of(index, of_b=bool(which))
+            assert runs.rows.row(place).sign.value == sign
+            pair = runs.rows.row(place).pair
+            fields = (
+                [f for one in runs.differences(*pair) for f in one.fields]
+                if all(side is not None for side in pair)
+                else []
+            )
+            for old, new in _ROW_VALUE.findall(did) if sign == "≠" else ():
+                assert any(
+                    float(old) == pytest.approx(float(f.a), rel=1e-3)
+                    and float(new) == pytest.approx(float(f.b), rel=1e-3)
+                    for f in fields
+                ), did
+    for message in diff.shown.messages:
+        for field in message.fields:
+            assert f"{field.a} → {field.b}" in page.text
+    assert (diff.shown.next_step or "rsltrace diff") in page.text
+    assert page.tags.count("button") >= 2
+
+
+def test_an_event_that_moved_stands_in_both_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(SAMPLES / "delayed_input")
+    rows = [row for row in Page(made("diff", "a.mcap", "b.mcap")).rows if len(row) == 8]
+    assert ["252", "", "+15 ms ↓ b 253"] in [[*r[1:3], r[7][:14]] for r in rows if r[0] == "~"]
+    assert ["", "253", "+15 ms ↑ a 252"] in [[*r[1:3], r[7][:14]] for r in rows if r[0] == "~"]
+
+
+def with_names(parts: list[mcap_parts.Part], extra: str) -> None:
+    """Put ``extra`` behind every name and the texts of the metadata."""
+    for part in parts:
+        record = part.record if part.opcode == Opcode.METADATA else None
+        if isinstance(record, records.Metadata) and not record.name.startswith("rosbag2"):
+            kept = ("digest", "version", "resolved", "checksum")
+            record.metadata = {
+                key: text if key in kept else text + extra for key, text in record.metadata.items()
+            }
+            part.record = record
+    for topic in ("/rsltrace/entities", "/rsltrace/findings", "/rsltrace/code_lines"):
+        mcap_parts.change_messages(
+            parts,
+            topic,
+            lambda data, nth, topic=topic: with_strings(
+                data, topic, lambda n, text: text and text + extra.encode() if n == 0 else text
+            ),
+        )
+
+
+def with_logs(parts: list[mcap_parts.Part], extra: str) -> None:
+    """Put ``extra`` into the texts that nodes log and answer."""
+    mcap_parts.change_messages(
+        parts,
+        "/rosout",
+        lambda data, nth: with_strings(data, "/rosout", lambda n, text: text and extra.encode()),
+    )
+
+
+@pytest.mark.parametrize("words", [("diff", "a", "b"), ("info", "b")])
+def test_nothing_in_a_trace_becomes_markup(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for sample, write in (
+        ("nondeterministic_callback", with_names),
+        ("missing_event", with_logs),
+    ):
+        pages = []
+        for extra in (MARKUP, "x" * len(MARKUP)):
+            name = extra.replace("/", "_")[:60]
+            paths = {side: f"{side}{name}.mcap" for side in "ab"}
+            for side, path in paths.items():
+                parts = mcap_parts.take_apart((SAMPLES / sample / f"{side}.mcap").read_bytes())
+                write(parts, extra)
+                (tmp_path / path).write_bytes(mcap_parts.put_together(parts))
+            text = made(words[0], *(paths[side] for side in words[1:]))
+            contained(text)
+            pages.append(Page(text))
+        assert MARKUP[:20] in pages[0].text
+        assert pages[0].tags == pages[1].tags
+        names = [[name for name, _ in page.attributes] for page in pages]
+        assert names[0] == names[1]
+
+
+@pytest.mark.parametrize("words", [("diff", "a.mcap", "b.mcap"), ("info", "b.mcap")])
+def test_texts_of_any_length_make_no_large_page(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for sample, write in (("nondeterministic_callback", with_names), ("missing_event", with_logs)):
+        for side in "ab":
+            parts = mcap_parts.take_apart((SAMPLES / sample / f"{side}.mcap").read_bytes())
+            write(parts, "<" * 60_000)
+            (tmp_path / f"{side}.mcap").write_bytes(mcap_parts.put_together(parts))
+        contained(made(*words))
+
+
+def test_the_page_of_a_run_has_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(SAMPLES / "missing_event")
+    text = made("info", "b.mcap")
+    contained(text)
+    page = Page(text)
+    with Trace.open("b.mcap") as trace:
+        assert trace.digest in page.text
+    assert ["warnings logged", "12", ""] in page.rows
+    assert "the gripper has not answered yet" in page.text
+    assert ["/picked", "std_msgs/msg/UInt32"] in [row[:2] for row in page.rows]
+    assert page.tags.count("marker") == 1  # the graph
+
+
+def test_several_runs_and_equal_ones_have_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(SAMPLES / "schedule")
+    text = made("diff", "a.mcap", "a.mcap", "b.mcap")
+    contained(text)
+    page = Page(text)
+    assert "1 of 2 runs diverges." in page.text
+    assert page.rows[2][:2] == ["b.mcap", "schedule"]
+    contained(made("diff", "a.mcap", "a.mcap"))
+
+
+@pytest.mark.skipif(_CHROMIUM is None, reason="needs chromium")
+@pytest.mark.long
+def test_a_browser_shows_them_and_has_nothing_to_complain_of(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(SAMPLES / "delayed_input")
+    assert _CHROMIUM is not None
+    for name, words in (("diff", ("diff", "a.mcap", "b.mcap")), ("info", ("info", "a.mcap"))):
+        path = tmp_path / f"{name}.html"
+        path.write_text(made(*words), encoding="utf-8")
+        flags = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-logging=stderr")
+        done = subprocess.run(
+            [_CHROMIUM, *flags, f"--user-data-dir={tmp_path / 'browser'}", "--dump-dom", str(path)],
+            capture_output=True,
+            text=True,
+            env={**os.environ, "HOME": str(tmp_path)},
+        )
+        assert "</svg>" in done.stdout
+        assert "CONSOLE" not in done.stderr  # what the policy refuses is told there

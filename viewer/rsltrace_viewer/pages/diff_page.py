@@ -1,0 +1,230 @@
+"""The page of a comparison: what happened, where, and what to do next; below it the evidence.
+
+The rows are those of the viewer: the same events in the same order, with the same words.
+"""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from rsltrace.diff.facts.evidence import EventSummary, FieldDifference
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import report_lines
+from rsltrace.diff.report.differences import distance_text, message_title
+from rsltrace.diff.report.divergence import event_text
+from rsltrace.diff.report.line import plain_text
+from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
+from rsltrace.diff.result import BagDiff, Diff, Divergence
+from rsltrace.diff.row_sign import RowSign
+from rsltrace.diff.sentences.values import setting_name
+from rsltrace.errors import RsltraceError
+from rsltrace.trace.model.operation import NODE_TOPICS
+from rsltrace.trace.model.texts import contrasting_texts, format_seconds
+from rsltrace.trace.words.phrases import as_sentence
+from rsltrace_viewer.model.plots.runs import RunPlots
+from rsltrace_viewer.model.plots.series import PlotSource, difference, most_telling
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.source import CallbackCode, source_of
+from rsltrace_viewer.pages.charts import curves
+from rsltrace_viewer.pages.order import OrderRow, lanes_svg
+from rsltrace_viewer.pages.page import render_page
+from rsltrace_viewer.session import Session
+
+ROWS = 30
+_BEFORE = 8
+_VALUE_MAX = 80
+_PLOTS_MAX = 6
+_IN_FULL_MAX = 5
+_VISIBLE = 0.02
+"""Two curves that are closer than this part of their height look like one: a - b is drawn then."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """What the page shows of two traces beside the diff itself: rows, lanes, source and plots."""
+
+    rows: Sequence[OrderRow] = ()
+    lanes: Markup | None = None
+    sources: Sequence[CallbackCode] = ()
+    plots: Sequence[tuple[str, str, Markup]] = ()
+
+
+def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions, title: str = "") -> str:
+    """Return the page of one or several runs against one; of several, the first few that differ in
+    full. The traces are opened again. Raises TraceError."""
+    failed = [diff for diff in diffs if diff.failed]
+    heading = as_sentence(diffs[0].sentence)
+    if len(diffs) > 1:
+        heading = as_sentence(how_many_fail(diffs) if failed else how_all_agree(diffs))
+    shown = diffs if len(diffs) == 1 else failed[:_IN_FULL_MAX]
+    return render_page(
+        "diff.html",
+        title=title,
+        heading=heading,
+        good=not failed,
+        several=[several_cells(diff) for diff in diffs] if len(diffs) > 1 else [],
+        columns=COLUMNS,
+        comparisons=[part_of(diff, options) for diff in shown],
+    )
+
+
+def part_of(diff: Diff | BagDiff, options: DiffOptions) -> dict[str, object]:
+    """Return what the template needs of one comparison. Raises TraceError."""
+    found = diff.shown if isinstance(diff, Diff) else None
+    words = [shlex.join(["rsltrace", word, diff.a.path, diff.b.path]) for word in ("diff", "view")]
+    following = found.next_step if found is not None else ""
+    return {
+        "diff": diff,
+        "sentence": as_sentence(diff.sentence),
+        "verdict": diff.verdict.value,
+        "runs": _runs(diff),
+        "found": found,
+        "where": _where(found),
+        "next": following,
+        "commands": [one for one in words if one != following],
+        "evidence": evidence_of(diff) if isinstance(diff, Diff) else Evidence(),
+        "fields": [*_fields(diff)],
+        "state": [(one.path, one.a, one.b) for one in found.state] if found is not None else [],
+        "calls": found.calls if found is not None else [],
+        "settings": [
+            (setting_name(one), *contrasting_texts(one.a or "-", one.b or "-", _VALUE_MAX))
+            for one in (diff.settings if isinstance(diff, Diff) else ())
+        ],
+        "report": "" if diff.identical else plain_text(report_lines(diff, options)),
+    }
+
+
+def _runs(diff: Diff | BagDiff) -> list[tuple[str, ...]]:
+    if isinstance(diff, BagDiff):
+        return [(s.path, f"{s.messages} messages", s.kind) for s in (diff.a, diff.b)]
+    return [
+        (s.path, f"{s.events} events", f"{format_seconds(s.end_ns)} s", s.digest, s.stop_reason)
+        for s in (diff.a, diff.b)
+    ]
+
+
+def _where(found: Divergence | None) -> list[tuple[str, str]]:
+    """Return where the runs diverge: the event of each, or the one of both."""
+    if found is None:
+        return []
+    sides = [_event(one) for one in (found.a, found.b)]
+    if sides[0] == sides[1]:
+        return [("in both", sides[0])]
+    return [*zip(("in a", "in b"), sides, strict=True)]
+
+
+def _event(event: EventSummary | None) -> str:
+    if event is None:
+        return "no such event"
+    code = f" ({event.code})" if event.code else ""
+    return f"{event_text(event)}, event {event.index} at {format_seconds(event.stamp_ns)} s{code}"
+
+
+def _fields(diff: Diff | BagDiff) -> Iterator[tuple[str, list[tuple[str, str, str, str]], int]]:
+    """Yield each message that differs, with its fields old and new, and how many more there are."""
+    if isinstance(diff, BagDiff):
+        if diff.first is not None:
+            rows = [_field(one) for one in diff.first.fields]
+            yield diff.first.topic, rows, diff.first.more_fields
+        return
+    for message in diff.shown.messages if diff.shown is not None else ():
+        rows = [_field(one) for one in message.fields]
+        if message.preview:
+            rows.append(("", message.preview, "", ""))
+        yield message_title(message), rows, message.more_fields
+
+
+def _field(one: FieldDifference) -> tuple[str, str, str, str]:
+    a, b = contrasting_texts(one.a, one.b, _VALUE_MAX)
+    return one.path, a, b, distance_text(one)
+
+
+def evidence_of(diff: Diff) -> Evidence:
+    """Read what the page shows of two traces that diverge. Raises TraceError."""
+    if diff.native is not None or diff.shown is None:
+        return Evidence()
+    with closing(Run.open(diff.a.path)) as a, closing(Run.open(diff.b.path)) as b:
+        rows = [*order_rows(Session(a, b), diff)]
+        return Evidence(rows, lanes_svg(rows), [*_sources(a, b, diff)], [*_plots(a, b, diff)])
+
+
+def order_rows(session: Session, diff: Diff) -> Iterator[OrderRow]:
+    """Yield the rows around the divergence that the diff shows. Raises TraceError."""
+    comparison, found = session.comparison, diff.shown
+    if comparison is None or found is None:
+        return
+    sides = [(one.index, other) for one, other in ((found.a, False), (found.b, True)) if one]
+
+    def places() -> list[int]:
+        return [comparison.place_of(index, other=other) for index, other in sides]
+
+    while not comparison.runs.done and any(
+        place < comparison.count and comparison.sign(place) is RowSign.UNKNOWN for place in places()
+    ):
+        session.take_block(comparison.runs.fetch())
+    here = min(places(), default=comparison.first_place or 0)
+    first = max(min(here - _BEFORE, comparison.count - ROWS), 0)
+    shown = range(first, min(first + ROWS, comparison.count))
+    for _ in session.read_values(shown):
+        pass
+    for place in shown:
+        row = comparison.row(place)
+        yield OrderRow(
+            place,
+            row.sign,
+            session.row(place).event,
+            None
+            if row.elsewhere is None
+            else comparison.place_of(row.elsewhere, other=row.b is None),
+            place in places(),
+        )
+
+
+def _sources(a: Run, b: Run, diff: Diff) -> Iterator[CallbackCode]:
+    """Yield the callback that diverged; of two different ones, both."""
+    names = set()
+    for run, event in zip((a, b), (diff.shown.a, diff.shown.b) if diff.shown else (), strict=False):
+        with suppress(RsltraceError):  # the rows say what is damaged
+            code = source_of(run, event.index) if event is not None else None
+            if code is not None and code.name not in names:
+                names.add(code.name)
+                yield code
+
+
+def _plots(a: Run, b: Run, diff: Diff) -> Iterator[tuple[str, str, Markup]]:
+    """Yield plots of fields that differ: those of the divergence, then one of each topic that it
+    reaches; each with how far the runs are from each other."""
+    found = diff.shown
+    if found is None:
+        return
+    some = found.a or found.b
+    plots = RunPlots((a, b), "", topic="", stamp_ns=some.stamp_ns if some else None, diff=diff)
+    known = [topic for topic in plots.topics() if topic not in NODE_TOPICS]
+    chosen: list[PlotSource] = []
+    named = [(one.topic, {field.path for field in one.fields}) for one in found.messages]
+    for topic, paths in [*named, *((one.topic, set[str]()) for one in found.reaches)]:
+        with suppress(RsltraceError):
+            fields = plots.fields(topic) if topic in known else []
+            differing = [f for f in fields if f.field in paths and "stamp" not in f.field]
+            if not differing and fields and not any(one.name == topic for one in chosen):
+                differing = [most_telling(fields, plots.messages(topic))]
+            chosen += differing
+    for source in list(dict.fromkeys(chosen))[:_PLOTS_MAX]:
+        with suppress(RsltraceError):
+            yield from _plot(plots, source)
+
+
+def _plot(plots: RunPlots, source: PlotSource) -> Iterator[tuple[str, str, Markup]]:
+    *_, series = plots.series(source)
+    label, between = source.label, difference(series)
+    if between is not None and np.ptp(between.values) < _VISIBLE * np.ptp(series[0].values):
+        label, series = f"a − b of {label}", [between]
+    drawn = curves(series, label, plots.cursor_s())
+    if drawn is not None:
+        yield label, between.note if between is not None else "", drawn
