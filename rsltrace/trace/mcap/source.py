@@ -6,6 +6,7 @@ import os
 import re
 import sys
 import threading
+from io import FileIO
 from pathlib import Path
 from typing import Protocol
 from urllib.parse import unquote, urlsplit
@@ -108,7 +109,7 @@ class FileSource:
                 raise error(
                     f"{path} is {kind}; it is read out of order, so save it to a file first"
                 )
-            self._file = open(path, "rb", buffering=0)  # noqa: SIM115  # closed by close()
+            self._file = FileIO(path, "rb")  # not ``open``, which a node of this run may break
         except FileNotFoundError as reason:
             raise error(f"{path} does not exist") from reason
         except OSError as reason:
