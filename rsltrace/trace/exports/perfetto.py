@@ -1,9 +1,9 @@
 """Export a trace for Perfetto (ui.perfetto.dev): TrackEvent packets of its protobuf format.
 
-A node is a group of tracks: one for each callback group (in native runs: for each thread), and more
-where callbacks overlap. A callback is a slice as long as it took: its execution time in a
-simulation, the measured duration in a native run. Most callbacks of a simulation take no time; they
-are instants, which Perfetto shows at every zoom. A made-up length would overlap with others.
+A node is a group of tracks: one for each callback group, and more where callbacks overlap. In a
+native run, each thread is a track. A callback is a slice as long as it took: its execution time in
+a simulation, the measured duration in a native run. Most callbacks of a simulation take no time;
+they are instants, which Perfetto shows at every zoom. A made-up length would overlap with others.
 
 The trace is read once, a segment at a time. Packets are not in the order of time: Perfetto sorts
 them, and keeps packets of equal time in the order of the file.
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from rsltrace.errors import OutputError, SetupError, TraceError
 from rsltrace.trace.cdr import unpack_finding
 from rsltrace.trace.exports.output_file import check_output_file
-from rsltrace.trace.format import METADATA_NATIVE, TOPIC_FINDINGS
+from rsltrace.trace.format import TOPIC_FINDINGS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (
     EventKind,
@@ -266,8 +266,6 @@ class _Export:
             entity.id for entity in trace.entities.values() if entity.kind is EntityKind.NODE
         }
         self._native = is_native(trace)
-        processes = trace.metadata(METADATA_NATIVE).get("processes", "1")
-        self._shared = self._native and processes == "1"  # threads are counted in each process
 
     def write(self, progress: Callable[[int, int], None]) -> None:
         """Write all packets."""
@@ -361,7 +359,7 @@ class _Export:
         if found is None:
             names, label = self._words.names, kind_label(EventKind, kind)
             name = f"{label} {names.name(entity or node)}".rstrip()
-            owner = names.node(node) if self._shared and entity else ""
+            owner = names.node(node) if self._native and entity else ""
             known = self._trace.entities.get(entity)
             group = printable(str(known.detail.get("group", ""))) if known is not None else ""
             found = f"{owner}: {name}" if owner else name, label, group
@@ -379,12 +377,12 @@ class _Export:
 
     def _lane(self, node: int, group: str, begin_ns: int, duration_ns: int) -> int:
         """Return a track of a callback group or thread that is free for that time."""
-        lanes = self._lanes.setdefault((0 if self._shared else node, group), [])
+        lanes = self._lanes.setdefault((0 if self._native else node, group), [])
         lane = next((lane for lane in lanes if lane.end_ns <= begin_ns), None)
         if lane is None and len(lanes) == _LANES_MAX:
             lane = lanes[-1]
         elif lane is None:
-            parent = 0 if self._shared else self._track(node)
+            parent = 0 if self._native else self._track(node)
             lane = _Lane(self._packets.track(group or "callbacks", parent))
             lanes.append(lane)
         lane.end_ns = begin_ns + duration_ns
