@@ -94,7 +94,7 @@ def read(path: Path) -> Shown:
                 list(one.flow_ids), list(one.terminating_flow_ids),
             )  # fmt: skip
             shown.marks.append(mark)
-            if one.category_iids:
+            if one.name_iid:  # stored once: of a callback
                 shown.callbacks.append(mark)
             if one.type == kinds.TYPE_SLICE_BEGIN:
                 assert not open_slices[one.track_uuid], "slices of one track overlap"

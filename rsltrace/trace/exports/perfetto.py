@@ -63,7 +63,7 @@ def require_perfetto() -> Any:
     """Return the module of Perfetto's messages. Raises SetupError if it is not installed."""
     try:
         from perfetto.protos.perfetto.trace import perfetto_trace_pb2
-    except ImportError as error:
+    except Exception as error:  # protobuf's own, if it is older than the definitions
         raise SetupError(
             f"Perfetto's definitions cannot be loaded ({error}); install them with: "
             "pip install 'rsltrace[perfetto]'"
@@ -110,7 +110,6 @@ class _Packets:
         self._event: Any = messages.TrackEvent
         self._tracks = 0
         self._names: dict[str, int] = {}
-        self._categories: dict[str, int] = {}
         first = self._add(0)
         first.sequence_flags = messages.TracePacket.SEQ_INCREMENTAL_STATE_CLEARED
         first.interned_data.debug_annotation_names.add(iid=1, name="event")
@@ -139,7 +138,6 @@ class _Packets:
         begin_ns: int,
         duration_ns: int,
         name: str,
-        category: str,
         event: int,
         effects: list[int],
         cause: int,
@@ -152,10 +150,12 @@ class _Packets:
         instant = self._event.TYPE_INSTANT
         kind = self._event.TYPE_SLICE_BEGIN if duration_ns else instant
         packet, one = self._track_event(track, begin_ns, kind)
-        one.name_iid = self._interned(packet, self._names, "event_names", name)
-        one.category_iids.append(
-            self._interned(packet, self._categories, "event_categories", category)
-        )
+        number = self._names.get(name)
+        if number is None:
+            number = self._names[name] = len(self._names) + 1
+            shown = shortened(name, _TEXT_MAX)
+            packet.interned_data.event_names.add(iid=number, name=shown)
+        one.name_iid = number
         one.debug_annotations.add(name_iid=1, uint_value=event)
         if effects:
             one.flow_ids.extend(effects)
@@ -190,13 +190,6 @@ class _Packets:
         if self._tracks:
             packet.sequence_flags = self._needs
         return packet
-
-    def _interned(self, packet: Any, known: dict[str, int], kind: str, name: str) -> int:
-        number = known.get(name)
-        if number is None:
-            number = known[name] = len(known) + 1
-            getattr(packet.interned_data, kind).add(iid=number, name=shortened(name, _TEXT_MAX))
-        return number
 
 
 @dataclass(slots=True)
@@ -256,7 +249,7 @@ class _Export:
         self._trace = trace
         self._packets = packets
         self._words = EventWords(trace)
-        self._names: dict[tuple[int, int, int], tuple[str, str, str]] = {}
+        self._names: dict[tuple[int, int, int], tuple[str, str]] = {}
         self._lanes: dict[tuple[int, str], list[_Lane]] = {}
         self._groups: dict[tuple[int, str], int] = {}
         self._queues: dict[int, _Counter] = {}
@@ -300,7 +293,7 @@ class _Export:
         for place, (index, begin_ns, entity, kind, linked) in enumerate(rows):
             own = outputs.get(index, [])
             node = self._node(entity, kind, own)
-            name, label, group = self._describe(kind, entity, node)
+            name, group = self._describe(kind, entity, node)
             if timings:
                 duration_ns, thread = timings[place]
                 duration_ns, group = min(duration_ns, _STAMP_MAX), f"thread {thread}"
@@ -312,7 +305,6 @@ class _Export:
                 begin_ns,
                 duration_ns,
                 name,
-                label,
                 index,
                 [effect + 1 for effect, _ in effects],
                 index + 1 if linked else 0,
@@ -350,19 +342,16 @@ class _Export:
         found = self._trace.entities.get(entity)
         return found.node if found is not None else 0
 
-    def _describe(self, kind: int, entity: int, node: int) -> tuple[str, str, str]:
-        """Return name and kind of a callback, and its callback group.
-
-        The name has the node if the track does not tell.
-        """
+    def _describe(self, kind: int, entity: int, node: int) -> tuple[str, str]:
+        """Return the name of a callback, with its node if the track does not tell, and its group."""
         found = self._names.get((kind, entity, node))
         if found is None:
-            names, label = self._words.names, kind_label(EventKind, kind)
-            name = f"{label} {names.name(entity or node)}".rstrip()
+            names = self._words.names
+            name = f"{kind_label(EventKind, kind)} {names.name(entity or node)}".rstrip()
             owner = names.node(node) if self._native and entity else ""
             known = self._trace.entities.get(entity)
             group = printable(str(known.detail.get("group", ""))) if known is not None else ""
-            found = f"{owner}: {name}" if owner else name, label, group
+            found = f"{owner}: {name}" if owner else name, group
             self._names[kind, entity, node] = found
         return found
 
