@@ -199,6 +199,19 @@ def test_execution_times_overlaps_and_waiting_messages(tmp_path: Path) -> None:
     assert rates == [(5, 100), (25, 0)]
 
 
+def test_a_callback_that_goes_on_is_no_message(tmp_path: Path) -> None:
+    with Opened(tmp_path / "run.mcap") as feeder:
+        node = feeder.entity(EntityKind.NODE, "/a")
+        subscription = feeder.entity(EntityKind.SUBSCRIPTION, "/x", node=node)
+        first = feeder.event(EventKind.TASK, node, START_NS)
+        for number, kind in enumerate((EventKind.RESUME, EventKind.SUBSCRIPTION), 1):
+            feeder.event(kind, subscription, START_NS + number * MS, cause=(first, 0))
+        feeder.writer.close(result={})
+    shown = exported(tmp_path / "run.mcap")
+    assert shown.counters["/a > /x waiting"] == [(START_NS, 1), (START_NS + 2 * MS, 0)]
+    assert arrows(shown) == {(0, 1), (0, 2)}
+
+
 def test_a_native_run_has_threads_with_real_durations(tmp_path: Path) -> None:
     with Opened(tmp_path / "run.mcap") as feeder:
         feeder.writer.add_metadata(METADATA_NATIVE, {"mode": "native"})

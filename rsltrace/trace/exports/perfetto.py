@@ -49,7 +49,7 @@ _EVENTS_AHEAD = 32 * 4096
 _PACKETS_TOGETHER = 4096
 _TEXT_MAX = 1000
 _SEQUENCE = 1
-_QUEUES = frozenset((EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT))
+_RECEIVING = (int(EventKind.SUBSCRIPTION), int(EventKind.SERVICE), int(EventKind.CLIENT))
 _NOTED = frozenset((OutputKind.LOG, OutputKind.EXCEPTION))
 _OUTPUTS = [int(kind) for kind in (*_NOTED, OutputKind.MESSAGE, OutputKind.DRAW, OutputKind.ENTITY)]
 _STAMP_MAX = 1 << 62
@@ -147,8 +147,7 @@ class _Packets:
         ``event`` is its number in the trace. ``effects`` and ``cause`` (0: none) are the numbers of
         the arrows that begin and end here.
         """
-        instant = self._event.TYPE_INSTANT
-        kind = self._event.TYPE_SLICE_BEGIN if duration_ns else instant
+        kind = self._event.TYPE_SLICE_BEGIN if duration_ns else self._event.TYPE_INSTANT
         packet, one = self._track_event(track, begin_ns, kind)
         number = self._names.get(name)
         if number is None:
@@ -221,7 +220,7 @@ class _Chunk:
 
 
 def _chunks(trace: Trace) -> Iterator[_Chunk]:
-    """Yield the segments; ``effects`` are (event, entity) by the event that caused it."""
+    """Yield the segments; ``effects`` are (event, receiving entity or 0) by what caused it."""
     waiting: deque[_Chunk] = deque()
     effects: dict[int, list[tuple[int, int]]] = {}
     ahead = 0
@@ -229,10 +228,9 @@ def _chunks(trace: Trace) -> Iterator[_Chunk]:
         first = waiting[0].events["index"][0] if waiting else events["index"][0]
         causes = events["cause_event"]
         linked = (causes >= first) & (causes < events["index"])  # NO_EVENT is larger than any
-        for cause, index, entity in zip(
-            *(events[name][linked].tolist() for name in ("cause_event", "index", "entity")),
-            strict=True,
-        ):
+        receivers = np.where(np.isin(events["kind"], _RECEIVING), events["entity"], 0)
+        columns = (causes, events["index"], receivers)
+        for cause, index, entity in zip(*(one[linked].tolist() for one in columns), strict=True):
             effects.setdefault(cause, []).append((index, entity))
         waiting.append(_Chunk(events, outputs, linked, effects))
         ahead += len(events)
@@ -313,7 +311,7 @@ class _Export:
             left_ns = begin_ns if timings else begin_ns + duration_ns
             for _, receiver in effects:
                 self._change(left_ns, receiver, 1)
-            if linked:
+            if linked and kind in _RECEIVING:
                 self._change(begin_ns, entity, -1)
             for output in own:
                 if output.kind is OutputKind.MESSAGE:
@@ -343,7 +341,7 @@ class _Export:
         return found.node if found is not None else 0
 
     def _describe(self, kind: int, entity: int, node: int) -> tuple[str, str]:
-        """Return the name of a callback, with its node if the track does not tell, and its group."""
+        """Return the name of a callback, with its node in a native run, and its group."""
         found = self._names.get((kind, entity, node))
         if found is None:
             names = self._words.names
@@ -378,8 +376,7 @@ class _Export:
         return lane.track
 
     def _change(self, stamp_ns: int, entity: int, by: int) -> None:
-        found = self._trace.entities.get(entity)
-        if found is not None and found.kind in _QUEUES:
+        if entity and entity in self._trace.entities:
             heappush(self._changes, (stamp_ns, _QUEUE, entity, by))
 
     def _count_until(self, stamp_ns: int) -> None:
