@@ -1,7 +1,8 @@
-"""``rsltrace export``: the messages of a trace as a rosbag2 bag."""
+"""``rsltrace export``: a trace as a rosbag2 bag, for Perfetto, and as a layout for Foxglove."""
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
@@ -18,48 +19,97 @@ EXIT_TRUNCATED = 1
     "--bag",
     "-o",
     type=click.Path(path_type=Path),
-    required=True,
     metavar="FOLDER",
-    help="Write the bag to this folder: metadata.yaml and one MCAP file.",
+    help="Write the messages to this folder as a bag: metadata.yaml and one MCAP file.",
 )
 @click.option(
-    "--topic", "topics", multiple=True, metavar="GLOB", help="Export only these topics. Repeatable."
+    "--perfetto",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write callbacks, causes, topic rates, waiting messages, logs, findings and exceptions to "
+    "this file, for ui.perfetto.dev. Needs pip install 'rsltrace[perfetto]'.",
 )
 @click.option(
-    "--exclude", multiple=True, metavar="GLOB", help="Leave out these topics. Repeatable."
+    "--layout",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a layout (.json) for Foxglove and Lichtblick to this file: plots of what varies, "
+    "state transitions, 3D, log. Open TRACE with it.",
 )
-@click.option("--force", is_flag=True, help="Replace an existing bag.")
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="GLOB",
+    help="Export only these topics (bag, layout). Repeatable.",
+)
+@click.option(
+    "--exclude",
+    multiple=True,
+    metavar="GLOB",
+    help="Leave out these topics (bag, layout). Repeatable.",
+)
+@click.option("--force", is_flag=True, help="Replace an existing bag or file.")
 def export(
-    trace: Path, bag: Path, topics: tuple[str, ...], exclude: tuple[str, ...], force: bool
+    trace: Path,
+    bag: Path | None,
+    perfetto: Path | None,
+    layout: Path | None,
+    topics: tuple[str, ...],
+    exclude: tuple[str, ...],
+    force: bool,
 ) -> int:
-    """Write the messages of TRACE to a plain rosbag2 bag.
+    """Write TRACE for other tools: a plain rosbag2 bag, a Perfetto file, a Foxglove layout.
 
-    Timestamps are simulated times. The bag appears only when it is complete. It lacks messages
-    whose payloads the job did not record (record: in the job).
+    Give at least one of --bag, --perfetto and --layout. Timestamps are simulated times. An output
+    appears only when it is complete. A bag lacks messages whose payloads the job did not record
+    (record: in the job).
 
-    Exit status: 0 if the bag is complete, 1 if TRACE is truncated because its run was killed. The
-    bag then ends where the trace does.
+    Exit status: 0 if the output is complete, 1 if TRACE is truncated because its run was killed.
+    The output then ends where the trace does.
     """
+    outputs = [path for path in (bag, perfetto, layout) if path is not None]
+    if not outputs:
+        raise click.UsageError("give --bag, --perfetto or --layout: what to write")
+    if len({os.path.realpath(path) for path in outputs}) < len(outputs):
+        raise click.UsageError("--bag, --perfetto and --layout need different names")
+    if (topics or exclude) and bag is None and layout is None:
+        raise click.UsageError("--topic and --exclude need --bag or --layout")
     from rsltrace.cli.output.search_progress import working
+    from rsltrace.trace.exports.layout import export_layout
+    from rsltrace.trace.exports.output_file import check_output_file
+    from rsltrace.trace.exports.perfetto import export_perfetto, require_perfetto
     from rsltrace.trace.reader import Trace
-    from rsltrace.trace.recordings.export import export_bag
+    from rsltrace.trace.recordings.export import check_bag_folder, export_bag
 
     with Trace.open(trace) as opened:
         whole, events, end = opened.complete, opened.event_count, format_seconds(opened.end_ns)
-    with working(f"writing {bag}") as progress:
-        count = export_bag(
-            trace,
-            bag,
-            topics=topics or ("*",),
-            exclude=exclude,
-            force=force,
-            progress=progress,
-        )
-    tell(f"wrote {bag}: {count} messages")
+    if perfetto is not None:
+        require_perfetto()
+        check_output_file(perfetto, [trace], force=force, example="run.pftrace")
+    if layout is not None:
+        check_output_file(layout, [trace], force=force, example="layout.json")
+    if bag is not None:
+        check_bag_folder(bag, force=force)
+    chosen = topics or ("*",)
+    if layout is not None:
+        panels = export_layout(trace, layout, topics=chosen, exclude=exclude, force=force)
+        tell(f"wrote {layout}: {panels} panels")
+    if perfetto is not None:
+        with working(f"writing {perfetto}") as progress:
+            written = export_perfetto(trace, perfetto, force=force, progress=progress)
+        tell(f"wrote {perfetto}: {written} events")
+    if bag is not None:
+        with working(f"writing {bag}") as progress:
+            count = export_bag(
+                trace, bag, topics=chosen, exclude=exclude, force=force, progress=progress
+            )
+        tell(f"wrote {bag}: {count} messages")
     if whole:
         return 0
+    what = "export" if bag is None else "bag"
     tell(
-        f"rsltrace: note: {trace} is truncated: the bag ends with it after {events} events, "
+        f"rsltrace: note: {trace} is truncated: the {what} ends with it after {events} events, "
         f"at {end} s"
     )
     return EXIT_TRUNCATED

@@ -37,7 +37,7 @@ _COMMANDS = {
     "analyze": "Compute worst-case response times of callback chains.",
     "view": "View a trace, or two side by side, in the terminal.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
-    "export": "Export the messages of a trace to a rosbag2 bag.",
+    "export": "Export a trace to a rosbag2 bag, Perfetto or a Foxglove layout.",
     "diff": "Show where two traces or recordings first diverge, and why.",
 }
 """Each is the function of its name in the module of its name, beside this one."""

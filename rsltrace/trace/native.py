@@ -6,13 +6,20 @@ it has the times of the callbacks.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING_DTYPE, TOPIC_TIMINGS
+from rsltrace.trace.format import (
+    CDR_HEADER,
+    METADATA_NATIVE,
+    TIMING,
+    TIMING_DTYPE,
+    TOPIC_TIMINGS,
+)
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
 from rsltrace.trace.model.texts import NS_PER_S
@@ -48,10 +55,8 @@ def timings(trace: Trace) -> npt.NDArray[np.void]:
     :raises TraceError: if the trace contains something else.
     """
     rows = bytearray()
-    for _, _, data in trace.messages(TOPIC_TIMINGS):
-        if data[:4] != CDR_HEADER or len(data) != 4 + TIMING_DTYPE.itemsize:
-            raise TraceError(f"{trace.name}: a timing in it cannot be read")
-        rows += data[4:]
+    for data in _packed_timings(trace):
+        rows += data
     found = np.frombuffer(bytes(rows), TIMING_DTYPE)[: trace.event_count]  # of a run that was cut
     if len(found) and (
         len(found) != trace.event_count
@@ -59,6 +64,25 @@ def timings(trace: Trace) -> npt.NDArray[np.void]:
     ):
         raise TraceError(f"{trace.name}: its timings are not those of its events")
     return found
+
+
+def iterate_timings(trace: Trace) -> Iterator[tuple[int, int]]:
+    """Yield duration in nanoseconds and thread of each event of a native run, in order.
+
+    :raises TraceError: if the trace contains something else.
+    """
+    for index, data in zip(range(trace.event_count), _packed_timings(trace), strict=False):
+        row = TIMING.unpack(data)
+        if row[0] != index:
+            raise TraceError(f"{trace.name}: its timings are not those of its events")
+        yield row[3], row[8]
+
+
+def _packed_timings(trace: Trace) -> Iterator[bytes]:
+    for _, _, data in trace.messages(TOPIC_TIMINGS):
+        if data[:4] != CDR_HEADER or len(data) != 4 + TIMING_DTYPE.itemsize:
+            raise TraceError(f"{trace.name}: a timing in it cannot be read")
+        yield data[4:]
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,7 +34,7 @@ READING: dict[str, Callable[[str], list[str]]] = {
     "info": lambda trace: ["info", trace, "--check"],
     "cat": lambda trace: ["cat", trace, "--json", "--payloads"],
     "diff": lambda trace: ["diff", trace, trace],
-    "export": lambda trace: ["export", trace, "-o", "bag"],
+    "export": lambda trace: ["export", trace, "-o", "bag", "--layout", "layout.json"],
     "rerun": lambda trace: ["rerun", trace, "-o", "view.rrd"],
 }
 

@@ -110,6 +110,7 @@ _TRACES = ("a.mcap", "a2.mcap", f"x{ESCAPES}.mcap")
         *(("latency", "a.mcap", *more) for more in ((), ("--format", "csv"), ("b.mcap",))),
         ("latency", "a.mcap", "--from", f"/scan{ESCAPES}"),
         ("export", "a2.mcap", "-o", f"out{ESCAPES}"),
+        ("export", "a2.mcap", "--layout", f"layout{ESCAPES}"),
         *(
             ("diff", "a.mcap", "b.mcap", "--format", form)
             for form in ("text", "markdown", "github", "html")

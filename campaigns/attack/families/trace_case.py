@@ -43,6 +43,7 @@ def attack_trace(
         ("cat", HOSTILE),
         ("cat", HOSTILE, "--json", "--payloads"),
         ("export", HOSTILE, "-o", "bag", "--force"),
+        ("export", HOSTILE, "--perfetto", "p.pftrace", "--layout", "layout.json", "--force"),
         ("diff", *sides),
         ("diff", *sides, "--check", "--format", rng.choice(FORMATS)),
         ("diff", HOSTILE, HOSTILE, "--all"),

@@ -71,13 +71,7 @@ def export_bag(
     folder = Path(os.path.abspath(folder))
     check_bag_folder(folder, force=force)
     with Trace.open(trace) as opened:
-        channels = [
-            channel
-            for _, channel in sorted(opened.channels.items())
-            if not channel.topic.startswith(PREFIX_OWN)
-            and any(fnmatchcase(channel.topic, glob) for glob in topics)
-            and not any(fnmatchcase(channel.topic, glob) for glob in exclude)
-        ]
+        channels = chosen_channels(opened, topics, exclude)
         counts = {channel.id: opened.message_counts.get(channel.id, 0) for channel in channels}
         distro = opened.environment.get("ros_distro", "")
     name = f"{folder.name}_0.mcap"
@@ -106,6 +100,19 @@ def export_bag(
         content = f"rosbag2_bagfile_information:\n{textwrap.indent(text, '  ')}"
         (work / NAME).write_text(content, encoding="utf-8")
     return sum(counts.values())
+
+
+def chosen_channels(
+    trace: Trace, topics: Sequence[str], exclude: Sequence[str]
+) -> list[ChannelInfo]:
+    """Return the channels of ROS topics that globs choose, by number."""
+    return [
+        channel
+        for _, channel in sorted(trace.channels.items())
+        if not channel.topic.startswith(PREFIX_OWN)
+        and any(fnmatchcase(channel.topic, glob) for glob in topics)
+        and not any(fnmatchcase(channel.topic, glob) for glob in exclude)
+    ]
 
 
 def _write(

@@ -13,7 +13,7 @@ import rerun as rr
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
-from rsltrace.trace.model.regular_file import not_replaceable
+from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for, joining_chunks
@@ -54,7 +54,7 @@ def export(
     ``force``) or cannot be written.
     """
     assert len(traces) in (1, 2)
-    _check_output(output, traces, force=force)
+    check_output_file(output, traces, force=force, example="run.rrd")
     with ExitStack() as stack:
         opened = [stack.enter_context(Trace.open(path)) for path in traces]
         for trace in opened if len(opened) == 2 else ():
@@ -124,17 +124,3 @@ def _send(
         for trace, run in zip(opened, shown, strict=True)
         for topic, why in run.left_out.items()
     ]
-
-
-def _check_output(output: Path, traces: Sequence[Path], *, force: bool) -> None:
-    if output.is_dir():
-        raise OutputError(f"{output} is a folder; name a file, such as {output / 'run.rrd'}")
-    for trace in traces:
-        if output.exists() and trace.exists() and output.samefile(trace):
-            raise OutputError(f"{output} is the trace itself; give the recording another name")
-    if kind := not_replaceable(output):
-        raise OutputError(f"{output} is {kind}; name a file, or remove it")
-    if output.exists() and not force:
-        raise OutputError(f"{output} exists; use --force to replace it, or another name")
-    if not output.absolute().parent.is_dir():
-        raise OutputError(f"the folder {output.parent} does not exist")

@@ -1,0 +1,1 @@
+"""A trace in formats of other tools: Perfetto's tracks, a layout for Foxglove and Lichtblick."""
