@@ -372,3 +372,28 @@ def test_the_trace_has_the_job_as_it_ran(rsltrace: Any, job_file: Any, tmp_path:
     (tmp_path / "again.yaml").write_text(text)
     again = rsltrace("record", "again.yaml", "-o", "again.mcap")
     assert again.stdout == done.stdout  # the same digest
+
+
+def test_the_working_directory_is_no_trace(rsltrace: Any, job_file: Any) -> None:
+    job_file(BOTH)
+    for words in ((), ("--force",)):
+        done = rsltrace("record", "job.yaml", "-o", ".", *words)
+        assert done.returncode == 2
+        assert done.stderr.endswith("trace .: it is a folder; name a file with -o\n")
+
+
+def test_a_run_whose_node_breaks_open_is_reported(rsltrace: Any, tmp_path: Path) -> None:
+    (tmp_path / "breaks.py").write_text(
+        "import builtins\n"
+        "from rclpy.node import Node\n"
+        "class Breaks(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('breaks')\n"
+        "        self.create_timer(0.5, self.tick)\n"
+        "    def tick(self):\n"
+        "        builtins.open = None\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'breaks:Breaks'}]\nstop: {duration: 1s}\n")
+    done = rsltrace("record", "job.yaml")
+    assert "Traceback" not in done.stderr
+    assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
