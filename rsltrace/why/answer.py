@@ -43,14 +43,13 @@ def why(trace: Trace, node: str, asked: str, at_ns: int | None = None) -> Reason
 
 def _solve(question: Question) -> Reason:
     """Look at the messages that may answer a question; take the first reason that holds."""
-    first: Reason | None = None
+    others = []
     for one in _each_message(question):
         reason = _first(one)
         if reason.is_reason:
             return reason
-        first = first or reason
-    assert first is not None
-    return first
+        others.append(reason)
+    return others[-1 if question.history.runs_of(question.entity.id) else 0]
 
 
 def _first(question: Question) -> Reason:
@@ -139,7 +138,10 @@ class Silent(Reason):
         return cls(*what, question=question, place=place, event=event)
 
     def words(self) -> str:
-        when = "" if self.last_ns is None else f" since {seconds_text(self.last_ns)} s"
+        when = (
+            "" if self.question.at_ns is None else f" until {seconds_text(self.question.at_ns)} s"
+        )
+        when = when if self.last_ns is None else f" since {seconds_text(self.last_ns)} s"
         why = f", because {self.cause.words()}" if self.cause else ""
         return f"{self.question.name} got nothing: {self.sender} has sent nothing{when}{why}"
 

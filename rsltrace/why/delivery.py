@@ -140,9 +140,8 @@ def _pusher(question: Question, message: Message) -> tuple[str, int, Message] | 
     connected = {one.id for one in question.senders if not question.mismatch(one)}
     sent = [m for m in question.messages if m.loss is None and m.event > made]
     sent = [one for one in sent if one.sender in connected]
-    for drop in decode_drops(trace.result):
-        if drop.entity != question.entity.id:
-            continue
+    drops = [one for one in decode_drops(trace.result) if one.entity == question.entity.id]
+    for drop in sorted(drops, key=lambda one: not one.in_outage):
         if drop.in_outage:
             held = [m for m in sent if m.sender == message.sender and m.left_ns < until_ns]
             holder = f"{question.sender} in an outage"

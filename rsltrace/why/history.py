@@ -178,7 +178,7 @@ class RunHistory:
         for entity, events in waiting.items():
             if self.trace.entity(entity).kind is not EntityKind.MAIN:  # which spins
                 for begun in events:
-                    yield Occupation(begun, entity, self.stamp(begun), _FOR_EVER, "waited")
+                    yield Occupation(begun, entity, self.stamp(begun), _FOR_EVER, "slept or waited")
 
     def main_of(self, node: int) -> int:
         """Return the main that made a node, 0 if none has."""
