@@ -14,7 +14,7 @@ from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import as_sentence, at_time, seconds_text
-from rsltrace.why.delivery import Late, LostByLink, PushedOut, RunEnded, Waiting
+from rsltrace.why.delivery import Busy, Late, LostByLink, PushedOut, RunEnded, Waiting
 from rsltrace.why.filters import NoTransform, UnmatchedStamps
 from rsltrace.why.graph import (
     CreatedLate,
@@ -120,13 +120,21 @@ class Silent(Reason):
         requests = [one for one in requests if one.sent_ns <= question.until_ns]
         if not requests:
             return cls._of(question, question.entity.id, None, None)
-        received = history.runs_of(question.entity.id)
+        received = [e for e in history.runs_of(question.entity.id) if not question.is_resumed(e)]
         if len(received) >= len(requests):
             return None
-        asked = Question(history, server, question.at_ns, requests[-1], question.depth + 1)
-        cause = _first(asked)
+        last = requests[-1]
+        cause: Reason | None = _first(
+            Question(history, server, message=last, depth=question.depth + 1)
+        )
+        if last.taken is not None and not question.is_silent(requests, question.until_ns):
+            return None
+        if isinstance(cause, AsExpected) and last.taken is not None:
+            began_ns = history.stamp(last.taken)
+            busy = Busy.between(Question(history, server), began_ns, question.until_ns)
+            cause = replace(busy, question=question) if busy else None
         last_ns = history.stamp(received[-1]) if received else None
-        return cls._of(question, server.id, last_ns, cause if cause.is_reason else None)
+        return cls._of(question, server.id, last_ns, cause)
 
     @classmethod
     def _of(
@@ -142,7 +150,7 @@ class Silent(Reason):
             "" if self.question.at_ns is None else f" until {seconds_text(self.question.at_ns)} s"
         )
         when = when if self.last_ns is None else f" since {seconds_text(self.last_ns)} s"
-        why = f", because {self.cause.words()}" if self.cause else ""
+        why = f", because {self.cause.clause()}" if self.cause else ""
         return f"{self.question.name} got nothing: {self.sender} has sent nothing{when}{why}"
 
     def because(self) -> Reason | None:

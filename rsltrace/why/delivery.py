@@ -79,7 +79,7 @@ class Busy(Reason):
 
     @classmethod
     def between(cls, question: Question, from_ns: int, to_ns: int) -> Busy | None:
-        """Return what kept the callback from running in a stretch of time."""
+        """Return what kept the callback from running for longest in a stretch of time."""
         one = question.occupation(from_ns, to_ns) if from_ns < to_ns else None
         if one is None:
             return None
@@ -88,14 +88,13 @@ class Busy(Reason):
         place = question.place_of(one.entity)
         return cls(*what, question=question, place=place, event=one.event)
 
-    @property
-    def cause(self) -> str:
+    def clause(self) -> str:
         itself = "an earlier callback of it" if self.by == self.question.name else self.by
         times = f"from {seconds_text(self.from_ns)} s to {seconds_text(self.to_ns)} s"
         return f"{itself} {self.verb} {times}"
 
     def words(self) -> str:
-        return f"{self.question.name} was {format_duration(self.late_ns)} late: {self.cause}"
+        return f"{self.question.name} was {format_duration(self.late_ns)} late: {self.clause()}"
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ class PushedOut(Reason):
 
     def words(self) -> str:
         whose = "its queue" if self.holder == self.question.name else f"the queue of {self.holder}"
-        why = f", because {self.busy.cause}" if self.busy else ""
+        why = f", because {self.busy.clause()}" if self.busy else ""
         return (
             f"{self.question.name} lost the message of {seconds_text(self.sent_ns)} s: {whose} "
             f"(depth {self.size}) was full, and the message of {seconds_text(self.by_ns)} s pushed "

@@ -33,6 +33,10 @@ class Reason:
         """Return a sentence without its full stop."""
         raise NotImplementedError
 
+    def clause(self) -> str:
+        """Return the reason as what follows "because" in the sentence of another one."""
+        return self.words()
+
     def because(self) -> Reason | None:
         """Return the reason behind this one, if there is one."""
         return None
