@@ -28,7 +28,7 @@ from rsltrace.why.reason import Reason
 from rsltrace.why.target import find_target
 from rsltrace.why.timers import ClockStands, TimerCancelled, TimerLate
 
-_MISSED_MAX = 1000
+_MISSED_MAX = 100
 _DEPTH_MAX = 8
 
 
@@ -120,7 +120,7 @@ class Silent(Reason):
         requests = [one for one in requests if one.sent_ns <= question.until_ns]
         if not requests:
             return cls._of(question, question.entity.id, None, None)
-        received = [e for e in history.runs_of(question.entity.id) if not question.is_resumed(e)]
+        received = history.calls_of(question.entity.id)
         if len(received) >= len(requests):
             return None
         last = requests[-1]
@@ -175,9 +175,7 @@ class AsExpected(Reason):
     @classmethod
     def find(cls, question: Question) -> Reason:
         history = question.history
-        runs = [e for e in history.runs_of(question.entity.id) if not question.is_resumed(e)]
-        if question.at_ns is not None:
-            runs = [event for event in runs if history.stamp(event) <= question.at_ns]
+        runs = history.calls_of(question.entity.id, question.until_ns)
         event = runs[-1] if runs else None
         what = (len(runs), None if event is None else history.stamp(event))
         return cls(*what, question=question, place=question.place, event=event)

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
@@ -18,6 +20,7 @@ from rsltrace.why.question import Question
 from rsltrace.why.reason import Reason
 
 _SHOWN = 3
+_SPOKEN = (OutputKind.LOG, OutputKind.EXCEPTION)
 _TEXT_MAX = 200
 _TF2 = re.compile(
     r"\"([^\"]+)\" passed to lookupTransform argument \w+ does not exist"
@@ -105,11 +108,12 @@ class NoTransform(Reason):
 
     @classmethod
     def find(cls, question: Question) -> Reason | None:
-        history = question.history
-        runs = [
-            e for e in history.runs_of(question.entity.id) if history.stamp(e) <= question.until_ns
-        ]
-        for event in runs if question.at_ns is None else runs[-1:]:
+        history, until_ns = question.history, question.until_ns
+        runs = history.runs_of(question.entity.id)
+        runs = [event for event in runs if history.stamp(event) <= until_ns]
+        spoke = history.outputs["event"][np.isin(history.outputs["kind"], _SPOKEN)]
+        runs = runs if question.at_ns is None else runs[-1:]
+        for event in sorted(set(runs) & set(spoke.tolist())):
             for said, place in _said(question, event):
                 if (found := _TF2.search(said)) is not None:
                     frame = next(filter(None, found.groups()))

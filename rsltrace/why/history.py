@@ -76,16 +76,26 @@ class RunHistory:
         parts = [np.array(outputs[names]) for outputs in trace.outputs()]
         self.outputs = np.concatenate(parts) if parts else np.zeros(0, [(n, "u8") for n in names])
         self.firsts = np.cumsum(self.events["outputs"], dtype=np.int64) - self.events["outputs"]
+        self._stamps = self.events["stamp"].astype(np.int64)
+        self._is_draw = self.outputs["kind"] == OutputKind.DRAW
+        self._messages: dict[tuple[int, ...], list[Message]] = {}
         ended = trace.result.get("ended_after", "")
         self.ended = int(ended) if ended.isdecimal() else len(self.events)
 
     def stamp(self, event: int) -> int:
-        return int(self.events["stamp"][event])
+        return int(self._stamps[event])
 
     def runs_of(self, *entities: int) -> list[int]:
         """Return the events of some entities before the end of the run."""
         mine = np.isin(self.events["entity"][: self.ended], entities)
         found: list[int] = np.flatnonzero(mine).tolist()
+        return found
+
+    def calls_of(self, entity: int, until_ns: int = _FOR_EVER) -> list[int]:
+        """Return the events with which an entity's callback began, until a time."""
+        mine = self.events[: self.ended]
+        began = (mine["entity"] == entity) & (mine["kind"] != EventKind.RESUME)
+        found: list[int] = np.flatnonzero(began & (mine["stamp"] <= until_ns)).tolist()
         return found
 
     def outputs_of(self, entities: list[int], kind: OutputKind) -> list[tuple[int, int, int]]:
@@ -103,14 +113,15 @@ class RunHistory:
 
     def messages(self, senders: list[Entity], receiver: int) -> list[Message]:
         """Return what some entities sent, and how it reached a receiver, in order of sending."""
-        if not senders:
-            return []
-        causes, numbers = self.events["cause_event"], self.events["cause_output"]
-        taken = {
-            (int(causes[one]), int(numbers[one])): one
-            for one in reversed(self.runs_of(receiver))
-            if self.events["kind"][one] != EventKind.RESUME
-        }
+        key = (receiver, *(one.id for one in senders))
+        if key not in self._messages:
+            self._messages[key] = self._find_messages(senders, receiver) if senders else []
+        return self._messages[key]
+
+    def _find_messages(self, senders: list[Entity], receiver: int) -> list[Message]:
+        calls = self.calls_of(receiver)
+        causes = (self.events[name][calls].tolist() for name in ("cause_event", "cause_output"))
+        taken = dict(zip(reversed(list(zip(*causes, strict=True))), reversed(calls), strict=True))
         sent = self.outputs_of([one.id for one in senders], _SENT[senders[0].kind])
         found = [self._sent(row, event, receiver) for row, event, _ in sent]
         return [replace(one, taken=taken.get((one.event, one.output))) for one in found]
@@ -121,7 +132,7 @@ class RunHistory:
         first = int(self.firsts[event])
         message = Message(event, row - first, sender, sent_ns, left_ns, left_ns)
         for draw in range(row + 1, first + int(self.events["outputs"][event])):
-            if self.outputs["kind"][draw] != OutputKind.DRAW:
+            if not self._is_draw[draw]:
                 break
             number = int(self.outputs["hash"][draw])
             if self.outputs["entity"][draw] != receiver:
@@ -135,7 +146,7 @@ class RunHistory:
 
     def _draws(self, kind: RandomDecision) -> Iterator[tuple[int, int, int]]:
         """Yield (event, entity, duration) of the draws of one kind."""
-        rows = self.outputs[self.outputs["kind"] == OutputKind.DRAW]
+        rows = self.outputs[self._is_draw]
         columns: list[npt.NDArray[np.uint64]] = [rows[n] for n in ("event", "entity", "hash")]
         for event, entity, number in zip(*(one.tolist() for one in columns), strict=True):
             duration_ns = decision_duration(number, kind)

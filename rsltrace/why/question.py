@@ -13,7 +13,7 @@ from typing import Any
 
 from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import Entity, EntityKind
-from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.words.code import entity_places
 from rsltrace.why.history import Message, Occupation, RunHistory
@@ -97,9 +97,10 @@ class Question:
     def mismatch(self, sender: Entity) -> tuple[str, str, str] | None:
         """Return the first policy that keeps a publisher from this subscription, what is offered
         and what is requested; None if they match."""
-        details = (sender.detail.get("qos"), self.entity.detail.get("qos"))
-        offered, requested = (Qos.from_summary(d) if isinstance(d, dict) else None for d in details)
-        if offered is None or requested is None:
+        details = (sender.detail.get("qos") or {}, self.entity.detail.get("qos") or {})
+        try:
+            offered, requested = map(Qos.from_summary, details)
+        except (KeyError, TypeError):  # it has no QoS, or another program wrote the trace
             return None
         policies = incompatible_policies(offered, requested)
         if not policies:
@@ -152,6 +153,3 @@ class Question:
             if f"/{path}".endswith(f"/{file}")
         ]
         return printable(text.rpartition("\n")[2]), places[-1] if places else ""
-
-    def is_resumed(self, event: int) -> bool:
-        return bool(self.history.events["kind"][event] == EventKind.RESUME)

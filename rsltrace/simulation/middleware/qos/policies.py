@@ -6,7 +6,6 @@ https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Quality-of-Service-Set
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -152,8 +151,11 @@ class Qos:
         return shown
 
     @staticmethod
-    def from_summary(shown: Mapping[str, object]) -> Qos:
-        """Return the profile that ``summary`` shows."""
+    def from_summary(shown: Any) -> Qos:
+        """Return the profile that ``summary`` shows.
+
+        :raises KeyError, TypeError: it is none.
+        """
         values: dict[str, Any] = {**_NO_LIMITS, **shown}
         for name, kind in _ENUMS.items():
             values[name] = kind[str(values[name]).upper()]
