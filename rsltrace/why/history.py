@@ -123,14 +123,17 @@ class RunHistory:
         causes = (self.events[name][calls].tolist() for name in ("cause_event", "cause_output"))
         taken = dict(zip(reversed(list(zip(*causes, strict=True))), reversed(calls), strict=True))
         sent = self.outputs_of([one.id for one in senders], _SENT[senders[0].kind])
-        found = [self._sent(row, event, receiver) for row, event, _ in sent]
-        return [replace(one, taken=taken.get((one.event, one.output))) for one in found]
+        return [self._sent(row, event, receiver, taken) for row, event, _ in sent]
 
-    def _sent(self, row: int, event: int, receiver: int) -> Message:
+    def _sent(
+        self, row: int, event: int, receiver: int, taken: dict[tuple[int, int], int]
+    ) -> Message:
         sender, sent_ns = int(self.outputs["entity"][row]), self.stamp(event)
         left_ns = sent_ns + self._executions.get(event, 0)
         first = int(self.firsts[event])
-        message = Message(event, row - first, sender, sent_ns, left_ns, left_ns)
+        output = row - first
+        by = taken.get((event, output))
+        message = Message(event, output, sender, sent_ns, left_ns, left_ns, taken=by)
         for draw in range(row + 1, first + int(self.events["outputs"][event])):
             if not self._is_draw[draw]:
                 break
