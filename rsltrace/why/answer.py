@@ -14,7 +14,7 @@ from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import as_sentence, at_time, seconds_text
-from rsltrace.why.delivery import Busy, Late, LostByLink, PushedOut, RunEnded, Waiting
+from rsltrace.why.delivery import Late, LostByLink, PushedOut, RunEnded, Unfinished, Waiting
 from rsltrace.why.filters import NoTransform, UnmatchedStamps
 from rsltrace.why.graph import (
     CreatedLate,
@@ -123,18 +123,12 @@ class Silent(Reason):
         received = history.calls_of(question.entity.id)
         if len(received) >= len(requests):
             return None
-        last = requests[-1]
-        cause: Reason | None = _first(
-            Question(history, server, message=last, depth=question.depth + 1)
-        )
-        if last.taken is not None and not question.is_silent(requests, question.until_ns):
+        last, asked = requests[-1], Question(history, server, question.at_ns)
+        if last.taken is not None and not question.is_silent(requests, question.time_ns):
             return None
-        if isinstance(cause, AsExpected) and last.taken is not None:
-            began_ns = history.stamp(last.taken)
-            busy = Busy.between(Question(history, server), began_ns, question.until_ns)
-            cause = replace(busy, question=question) if busy else None
+        cause = _first(replace(asked, message=last, depth=question.depth + 1))
         last_ns = history.stamp(received[-1]) if received else None
-        return cls._of(question, server.id, last_ns, cause)
+        return cls._of(question, server.id, last_ns, cause if cause.is_reason else None)
 
     @classmethod
     def _of(
@@ -199,6 +193,7 @@ REASONS: tuple[_Finder, ...] = (
     Waiting,
     TimerCancelled,
     ClockStands,
+    Unfinished,
     Silent,
     PushedOut,
     RunEnded,

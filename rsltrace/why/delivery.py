@@ -98,6 +98,32 @@ class Busy(Reason):
 
 
 @dataclass(frozen=True)
+class Unfinished(Reason):
+    """The callback itself began, and had not ended by then; or at the end of the run, which took
+    longer than ever before."""
+
+    since_ns: int
+
+    @classmethod
+    def find(cls, question: Question) -> Reason | None:
+        until_ns, own, message = question.time_ns, question.entity.id, question.message
+        calls = [one for one in question.history.occupations if one.entity == own]
+        open_ones = [one for one in calls if one.from_ns <= until_ns < one.to_ns]
+        if not open_ones or (message is not None and message.taken != open_ones[0].event):
+            return None
+        since_ns = open_ones[0].from_ns
+        longest_ns = max((c.to_ns - c.from_ns for c in calls if c.to_ns <= until_ns), default=0)
+        if question.at_ns is None and until_ns - since_ns <= 2 * longest_ns:
+            return None
+        event = open_ones[0].event
+        return cls(since_ns, question=question, place=question.place, event=event)
+
+    def words(self) -> str:
+        ended = f"had not ended {at_time(self.question.time_ns)}"
+        return f"{self.question.name} began {at_time(self.since_ns)} and {ended}"
+
+
+@dataclass(frozen=True)
 class PushedOut(Reason):
     """A full queue dropped the message for one sent at ``by_ns``; ``holder``: whose queue."""
 

@@ -164,7 +164,7 @@ class RunHistory:
         return {event: ns for event, entity, ns in drawn if entities[event] == entity}
 
     @cached_property
-    def _occupations(self) -> list[Occupation]:
+    def occupations(self) -> list[Occupation]:
         """All callbacks that took time: by execution times, because they waited, or by a fault."""
         entities = self.events["entity"]
         found = list(self._suspensions())
@@ -208,7 +208,7 @@ class RunHistory:
         node (if suspended, of its group), or of a node that ``shares`` its executor."""
         main, best = self.main_of(entity.node), None
         longest_ns = 0
-        for one in self._occupations:
+        for one in self.occupations:
             shared_ns = min(one.to_ns, to_ns) - max(one.from_ns, from_ns)
             if shared_ns > longest_ns:
                 other = self.trace.entity(one.entity)

@@ -51,11 +51,14 @@ class Question:
         return self.history.trace.end_ns
 
     @property
+    def time_ns(self) -> int:
+        """The time that is asked about: the end of the run if none was given."""
+        return self.end_ns if self.at_ns is None else self.at_ns
+
+    @property
     def until_ns(self) -> int:
         """The time until which the callback should have run."""
-        if self.message is not None:
-            return self.message.arrival_ns
-        return self.end_ns if self.at_ns is None else self.at_ns
+        return self.time_ns if self.message is None else self.message.arrival_ns
 
     def named(self, entity_id: int) -> str:
         """Return an entity as part of a sentence: ``subscription /a of /slow``."""

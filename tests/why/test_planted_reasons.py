@@ -162,6 +162,11 @@ PLANTED = [
     Planted("waits", "caller", "on_time", "waiting", "service call, of /nobody", "service"),
     Planted("waits", "sleeper", "numbers", "busy", "timer Sleeper.on_time of /sleeper", "sleeps"),
     Planted(
+        *("waits", "sleeper", "on_time", "unfinished", "timer Sleeper.on_time", "sleeps"),
+        at="500ms",
+        says="began at 0.45 s and had not ended at 0.5 s",
+    ),
+    Planted(
         *("waits", "crashes", "numbers", "node_ended", "/crashes ended at 0.35 s", "Worker"),
     ),
     Planted("waits", "hangs", "numbers", "busy", "node /hangs hung from 0.35 s", "Worker"),
