@@ -216,7 +216,11 @@ def sentence(reason: Reason) -> str:
 
 
 def evidence(reason: Reason) -> Iterator[str]:
-    """Yield the lines that show what the trace says."""
+    """Yield the lines that show what the trace says, printable."""
+    yield from map(printable, _evidence(reason))
+
+
+def _evidence(reason: Reason) -> Iterator[str]:
     question, history = reason.question, reason.question.history
     if messages := question.messages:
         taken = sum(one.taken is not None for one in messages)

@@ -37,7 +37,8 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     found = [one for one in there if _is_meant(one, asked)]
     if len({str(one.detail.get("filter") or (one.kind, one.name)) for one in found}) > 1:
         listed = ", ".join(f"{one.id} ({one.kind.label} {printable(one.name)})" for one in found)
-        raise TraceError(f"{called[0]} has several {printable(asked)}; give a number: {listed}")
+        text = f"{called[0]} has several {asked}; give a number: {listed}"
+        raise TraceError(printable(text))
     if found:
         made = [e for e in found if at_ns is None or e.created_ns <= at_ns]
         return Question(history, (made or found)[-1], at_ns)
@@ -86,4 +87,5 @@ def _not_begun(history: RunHistory, node: str) -> Reason | None:
 def _fail(trace: Trace, what: str, word: str, names: list[str]) -> NoReturn:
     near, there = near_name(word, names), ", ".join(dict.fromkeys(names[:12])) or "none"
     hint = f"did you mean {near!r}?" if near else f"there are {there}"
-    raise TraceError(f"{trace.name} has no {what} that is called {printable(word)!r}; {hint}")
+    text = f"has no {what} that is called {word!r}; {hint}"
+    raise TraceError(f"{trace.name} {printable(text)}")
