@@ -183,10 +183,10 @@ def _outage_end(question: Question, message: Message) -> int:
     """Return the end of the outage in which a message was sent, 0 if there was none."""
     trace, topic = question.history.trace, question.entity.name
     nodes = [question.node.name, trace.node_of(trace.entity(message.sender)).name]
-    for one in question.job("delay", "outages") or ():
-        is_here = one["node"] is None or any(fnmatchcase(name, one["node"]) for name in nodes)
-        is_here &= one["topic"] is None or fnmatchcase(topic, one["topic"])
-        times = (trace.start_ns + one["from_ns"], trace.start_ns + one["to_ns"])
+    for one in question.rules("delay", "outages"):
+        is_here = not one.get("node") or any(fnmatchcase(name, one["node"]) for name in nodes)
+        is_here &= not one.get("topic") or fnmatchcase(topic, one["topic"])
+        times = [trace.start_ns + one.get(key, 0) for key in ("from_ns", "to_ns")]
         if is_here and times[0] <= message.left_ns < times[1]:
             return int(times[1])
     return 0

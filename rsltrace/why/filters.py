@@ -16,7 +16,7 @@ from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, printable, shortened
 from rsltrace.trace.words.logs import log_record
 from rsltrace.trace.words.phrases import seconds_text
-from rsltrace.why.question import Question
+from rsltrace.why.question import Question, filter_of
 from rsltrace.why.reason import Reason
 
 _SHOWN = 3
@@ -53,20 +53,20 @@ class UnmatchedStamps(Reason):
     @classmethod
     def find(cls, question: Question) -> Reason | None:
         entity, entities = question.entity, question.history.trace.entities.values()
-        of = entity.detail.get("filter")
-        if not isinstance(of, dict):
+        of = filter_of(entity)
+        if of is None:
             return None
-        inputs = [e for e in entities if e.node == entity.node and e.detail.get("filter") == of]
+        inputs = [one for one in entities if one.node == entity.node and filter_of(one) == of]
         stamps = {printable(one.name): sorted(_stamps(question, one)) for one in inputs}
         first, *others = stamps.values()
         nearest_ns = None
         if all(stamps.values()):
             nearest_ns = min(max((_distance(s, o) for o in others), default=0) for s in first)
-            if nearest_ns <= of["slop_ns"]:
+            if nearest_ns <= of[2]:
                 return None
         waited = tuple((name, tuple(found[-_SHOWN:])) for name, found in stamps.items())
-        what = (str(of["callback"]), int(of["slop_ns"]), nearest_ns, waited)
-        return cls(*what, question=question, place=str(of["source"]))
+        what = (of[0], of[2], nearest_ns, waited)
+        return cls(*what, question=question, place=of[1])
 
     def words(self) -> str:
         text = f"the message filter of {self.callback} never called it"
@@ -93,7 +93,7 @@ def _stamps(question: Question, one: Entity) -> Iterator[int]:
     for message in asked.messages:
         if message.taken is not None and message.sent_ns <= question.until_ns:
             decoded = _decoded(asked, one, message.event, message.output)
-            if decoded is not None:
+            if hasattr(decoded, "header"):
                 yield _stamp_ns(decoded.header)
 
 

@@ -177,7 +177,8 @@ class CreatedLate(Reason):
         volatile = [
             name
             for name, one in ends.items()
-            if isinstance(qos := one.detail.get("qos"), dict) and qos["durability"] == "volatile"
+            if isinstance(qos := one.detail.get("qos"), dict)
+            and qos.get("durability") == "volatile"
         ]
         times = (message.sent_ns, history.stamp(made), " and the ".join(volatile))
         return cls(question.sender, *times, question=question, place=question.place, event=made)

@@ -127,18 +127,18 @@ class Question:
 
     def _shares_executor(self, other: Entity) -> bool:
         names = [self.node.name, self.history.trace.node_of(other).name]
-        rules: list[list[str]] = [one["nodes"] for one in self.job("executors") or ()]
+        rules: list[list[str]] = [one.get("nodes") or [] for one in self.rules("executors")]
         return any(all(any(fnmatchcase(n, g) for g in rule) for n in names) for rule in rules)
 
-    def job(self, *keys: str) -> Any:
-        """Return a value of the resolved job, None if there is none."""
+    def rules(self, *keys: str) -> list[dict[str, Any]]:
+        """Return a list of rules of the resolved job, empty if it has none."""
         try:
             value = json.loads(self.history.trace.job.get("resolved") or "{}")
             for key in keys:
                 value = value.get(key)
         except (ValueError, AttributeError, RecursionError):
-            return None
-        return value
+            return []
+        return [one for one in value if isinstance(one, dict)] if isinstance(value, list) else []
 
     def raised(self, event: int) -> tuple[str, str] | None:
         """Return the last line of the exception that an event raised, and its place in user code;
@@ -156,3 +156,12 @@ class Question:
             if f"/{path}".endswith(f"/{file}")
         ]
         return printable(text.rpartition("\n")[2]), places[-1] if places else ""
+
+
+def filter_of(entity: Entity) -> tuple[str, str, int] | None:
+    """Return the callback of the message filter behind a subscription, its line, and how far apart
+    stamps may be (ns); None if there is none."""
+    of = entity.detail.get("filter")
+    if not isinstance(of, dict) or not isinstance(of.get("slop_ns"), int):
+        return None
+    return str(of.get("callback")), str(of.get("source")), of["slop_ns"]

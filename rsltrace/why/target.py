@@ -14,7 +14,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.events import EventWords
 from rsltrace.why.graph import NotConstructed, NotReceived
 from rsltrace.why.history import RunHistory
-from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question
+from rsltrace.why.question import SENDERS, WITH_CALLBACK, Question, filter_of
 from rsltrace.why.reason import Reason
 
 _NAMED = (EntityKind.PUBLISHER, *SENDERS)
@@ -35,7 +35,7 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     ids = {one.id for one in own}
     there = [e for e in trace.entities.values() if e.node in ids and e.kind in WITH_CALLBACK]
     found = [one for one in there if _is_meant(one, asked)]
-    if len({str(one.detail.get("filter") or (one.kind, one.name)) for one in found}) > 1:
+    if len({(filter_of(one) or (one.kind, one.name)) for one in found}) > 1:
         listed = ", ".join(f"{one.id} ({one.kind.label} {printable(one.name)})" for one in found)
         text = f"{called[0]} has several {asked}; give a number: {listed}"
         raise TraceError(printable(text))
@@ -62,9 +62,9 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
 
 
 def _is_meant(entity: Entity, asked: str) -> bool:
-    of = entity.detail.get("filter")
+    of = filter_of(entity)
     callbacks = [str(entity.detail.get("callback") or entity.name)]
-    callbacks += [str(of["callback"])] if isinstance(of, dict) else []
+    callbacks += [of[0]] if of else []
     names = {entity.name, str(entity.id), *callbacks, *(c.rpartition(".")[2] for c in callbacks)}
     return asked in names or f"/{asked}" == entity.name
 
@@ -74,7 +74,7 @@ def _not_begun(history: RunHistory, node: str) -> Reason | None:
     trace, question = history.trace, Question(history, history.trace.entity(0))
     kinds = history.events["kind"][: history.ended].tolist()
     constructs = [event for event, kind in enumerate(kinds) if kind == EventKind.CONSTRUCT]
-    if len(question.job("nodes") or ()) <= len(constructs):
+    if len(question.rules("nodes")) <= len(constructs):
         return None
     for event in constructs:
         if (raised := question.raised(event)) is not None:

@@ -60,9 +60,9 @@ class ClockStands(Reason):
         if question.entity.kind is not EntityKind.TIMER:
             return None
         name, trace = question.node.name, question.history.trace
-        rules = question.job("clocks") or ()
-        rule = next((one for one in rules if fnmatchcase(name, one["node"] or "*")), None)
-        if rule is None or rule["source"] != "topic":
+        rules = question.rules("clocks")
+        rule = next((one for one in rules if fnmatchcase(name, one.get("node") or "*")), None)
+        if rule is None or rule.get("source") != "topic":
             return None
         if any(channel.topic == "/clock" for channel in trace.channels.values()):
             return None
