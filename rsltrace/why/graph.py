@@ -69,6 +69,8 @@ class NodeEnded(Reason):
     @classmethod
     def of_node(cls, question: Question, node: Entity) -> NodeEnded | None:
         history, name = question.history, printable(node.name)
+        if not node.id:
+            return None  # the run itself: a bag, or code outside
         for _, event, number in history.outputs_of([node.id], OutputKind.DRAW):
             if decision_kind(number) in _CRASHES:
                 what = (name, history.stamp(event), "a fault of the job:", decision_text(number))

@@ -6,7 +6,7 @@ import json
 import shutil
 import subprocess
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,12 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.simulation.middleware.qos.policies import (
+    DEFAULT_QOS,
+    Liveliness,
+    Qos,
+    Reliability,
+)
 from rsltrace.trace.reader import Trace
 from rsltrace.why.answer import why
 
@@ -237,6 +243,18 @@ def test_reason_entity_and_line(
     text = command("why", *words)
     assert text.stdout.splitlines() == [sentence, *(f"  {one}" for one in found["evidence"])]
     assert text.stderr.startswith("next: ") == (found["event"] is not None)
+
+
+@pytest.mark.parametrize(
+    "qos",
+    [
+        DEFAULT_QOS,
+        replace(DEFAULT_QOS, reliability=Reliability.BEST_EFFORT, deadline_ns=5, lease_ns=7),
+        replace(DEFAULT_QOS, liveliness=Liveliness.MANUAL_BY_TOPIC, lifespan_ns=9),
+    ],
+)
+def test_the_qos_of_an_entity_is_what_the_trace_shows(qos: Qos) -> None:
+    assert Qos.from_summary(qos.summary()) == qos
 
 
 @pytest.mark.parametrize(
