@@ -103,7 +103,7 @@ else:
     _TimeParam = click.ParamType  # not generic before click 8.2
 
 
-class _RunTimeParam(_TimeParam):
+class RunTimeParam(_TimeParam):
     """A time of the run, or a simulated time after ``@``."""
 
     name = "time"
@@ -157,11 +157,11 @@ class _RunTimeParam(_TimeParam):
 @click.option(
     "--from",
     "first",
-    type=_RunTimeParam(),
+    type=RunTimeParam(),
     metavar="T",
     help="Start at time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
 )
-@click.option("--to", "last", type=_RunTimeParam(), metavar="T", help="End at time T, inclusive.")
+@click.option("--to", "last", type=RunTimeParam(), metavar="T", help="End at time T, inclusive.")
 @click.option(
     "--where",
     metavar="CONDITION",

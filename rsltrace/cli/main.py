@@ -32,6 +32,7 @@ _COMMANDS = {
     "completion": "Print the completion script for bash, zsh or fish.",
     "info": "Summarize a trace: digest, counts, nodes, rates.",
     "cat": "Print the events of a trace, one per line.",
+    "why": "Say why a callback did not come, or came late.",
     "latency": "Measure end-to-end latencies through chains of nodes.",
     "fit": "Fit a job's delays and execution times to a real-time run.",
     "analyze": "Compute worst-case response times of callback chains.",

@@ -109,6 +109,10 @@ _TRACES = ("a.mcap", "a2.mcap", f"x{ESCAPES}.mcap")
         ("info", "a.mcap", "--check"),
         *(("latency", "a.mcap", *more) for more in ((), ("--format", "csv"), ("b.mcap",))),
         ("latency", "a.mcap", "--from", f"/scan{ESCAPES}"),
+        *(("why", trace, f"/driver{ESCAPES}", f"/push{ESCAPES}") for trace in _TRACES),
+        ("why", "a.mcap", ESCAPES, "push"),
+        ("why", "a.mcap", f"/driver{ESCAPES}", ESCAPES),
+        ("why", "a.mcap", f"/driver{ESCAPES}", f"/scan{ESCAPES}"),
         ("export", "a2.mcap", "-o", f"out{ESCAPES}"),
         ("export", "a2.mcap", "--layout", f"layout{ESCAPES}"),
         *(

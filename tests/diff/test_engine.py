@@ -25,6 +25,7 @@ from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.words.phrases import seconds_text
 from rsltrace.trace.writer import TraceWriter
 
 # /source ticks every 10 ms; /left and /right hear it, /sum hears both, /odd has nothing to do with
@@ -414,6 +415,10 @@ def test_a_dropped_message_names_where_it_came_from(tmp_path: Path) -> None:
     diff = compare(tmp_path, Fault("drop", step(20, 3)))
     (first,) = diff.divergences
     assert (diff.verdict, first.b) == (Verdict.MISSING, None)
+    assert first.a is not None
+    entity, at = first.a.entity, seconds_text(first.a.stamp_ns)
+    asked = f"rsltrace why {tmp_path / 'b.mcap'} {entity.node} {entity.name} --at {at}"
+    assert first.next_step == asked
     assert f"event {step(20, 1)}, subscription /a of /left" in first.root_sentence
     (message, output) = first.messages
     assert (message.position, message.presence) == (-1, "only a")

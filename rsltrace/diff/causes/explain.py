@@ -51,6 +51,7 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.facts.remarks import Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Divergence
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import seconds_text
@@ -346,6 +347,11 @@ class Explainer:
                 again = f"{record.command} --until {until} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
         in_a = judgement.a is not None
+        lacking = self.run_b if in_a else self.run_a
+        if self._is_missing_callback(judgement, view):
+            name, since = shlex.quote(view.entity.name), _time_in_run(view.stamp_ns, lacking.trace)
+            of = f"{_word(lacking.trace.name)} {shlex.quote(view.entity.node)} {name}"
+            return f"rsltrace why {of} --at {since}"
         path = path_a if in_a else path_b
         time = _time_in_run(view.stamp_ns, (self.run_a if in_a else self.run_b).trace)
         node = view.entity.node
@@ -355,6 +361,13 @@ class Explainer:
         if view.kind is EventKind.CONSTRUCT:
             choice = " --kind construct"
         return f"rsltrace cat {path}{choice} --from {time} --to {time} --json --payloads"
+
+    def _is_missing_callback(self, judgement: Judgement, view: EventSummary) -> bool:
+        """Whether one run lacks a callback of an entity that both have: `rsltrace why` says why."""
+        matching = self.run_a.matching
+        alone = matching.by_key[view.entity] in {*matching.only_a, *matching.only_b}
+        in_one = judgement.a is None or judgement.b is None
+        return in_one and not alone and not view.entity.ordinal and view.entity.kind in _EXPLAINED
 
 
 def _time_in_run(stamp_ns: int, trace: Trace) -> str:
@@ -388,6 +401,12 @@ _SHARED = {
     BUSY: CauseLinkKind.KEEPS_WAITING,
     STUCK: CauseLinkKind.ENDED_BEFORE,
 }
+
+_EXPLAINED = frozenset(
+    kind.label
+    for kind in (EntityKind.SUBSCRIPTION, EntityKind.TIMER, EntityKind.SERVICE, EntityKind.CLIENT)
+)
+"""Kinds of entities whose callbacks `rsltrace why` is asked about."""
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
 """Roots of which recording the job again helps: it shows which run is the usual one."""

@@ -34,6 +34,7 @@ class Timer(DomainEntity):
     ) -> None:
         super().__init__(dispatcher, node)
         self.callback = callback
+        self._autostart = not canceled
         now_ns = dispatcher.loop.now_ns
         self.state = TimerState(
             period_ns, now_ns, order=self.entity_id, owner=self, canceled=canceled
@@ -91,7 +92,8 @@ class Timer(DomainEntity):
         return callback_name(self.user_callback())
 
     def trace_detail(self) -> dict[str, object]:
-        return {"period_ns": self.state.period_ns}
+        began = {} if self._autostart else {"autostart": False}
+        return {"period_ns": self.state.period_ns, **began}
 
     def _destroy(self) -> None:
         super()._destroy()

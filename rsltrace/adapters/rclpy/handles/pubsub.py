@@ -9,6 +9,7 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
 from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
+from rsltrace.adapters.rclpy.handles.filters import filter_detail
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.messages.codec import codec_for
@@ -204,6 +205,9 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         return len(self.publishers)
 
     trace_name = Subscription.trace_name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**Subscription.trace_detail(self), **filter_detail(self.user_callback())}
 
 
 def _message_info(delivery: Delivery) -> dict[str, int | None]:

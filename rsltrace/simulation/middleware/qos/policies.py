@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import Any
 
 
 class Reliability(IntEnum):
@@ -148,6 +149,26 @@ class Qos:
         if self.liveliness is Liveliness.MANUAL_BY_TOPIC:
             shown["liveliness"] = "manual_by_topic"
         return shown
+
+    @staticmethod
+    def from_summary(shown: Any) -> Qos:
+        """Return the profile that ``summary`` shows.
+
+        :raises KeyError, TypeError: it is none.
+        """
+        values: dict[str, Any] = {**_NO_LIMITS, **shown}
+        for name, kind in _ENUMS.items():
+            values[name] = kind[str(values[name]).upper()]
+        return Qos(**values)
+
+
+_ENUMS: dict[str, type[IntEnum]] = {
+    "history": History,
+    "reliability": Reliability,
+    "durability": Durability,
+    "liveliness": Liveliness,
+}
+_NO_LIMITS = {"deadline_ns": 0, "lifespan_ns": 0, "lease_ns": 0, "liveliness": "automatic"}
 
 
 def incompatible_policies(offered: Qos, requested: Qos) -> list[PolicyKind]:

@@ -1,0 +1,53 @@
+"""``rsltrace why``: why a callback did not come, or came late."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from pathlib import Path
+
+import click
+
+from rsltrace.cli.cat import RunTimeParam
+from rsltrace.job.values.times import TimeInRun
+from rsltrace.terminal import say, tell
+from rsltrace.trace.reader import Trace
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.argument("node")
+@click.argument("what", metavar="TOPIC|CALLBACK")
+@click.option(
+    "--at",
+    type=RunTimeParam(),
+    metavar="T",
+    help="Ask about time T of the run: seconds, or with a unit (90s, 5ms). @T is a simulated time.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) -> int:
+    """Say why a callback of NODE did not come, or came late.
+
+    TOPIC is that of a subscription, or the name of a service or client; CALLBACK is the function
+    of one of these or of a timer (Planner.on_scan, or on_scan), or the number of an entity.
+
+    Without --at, the whole run is looked at: the first message that the callback did not get, else
+    the one it got latest. The line of code is that of what is to blame.
+
+    Exit status: 0 if the callback ran as expected, 1 if there is a reason why it did not, 2 if
+    there is no such node, topic or callback.
+    """
+    from rsltrace.why.answer import AsExpected, evidence, sentence
+    from rsltrace.why.answer import as_json as reason_json
+    from rsltrace.why.answer import why as find_reason
+
+    with Trace.open(trace) as opened:
+        at_ns = None if at is None else at.stamp_ns(opened.start_ns)
+        reason = find_reason(opened, node, what, at_ns)
+        if as_json:
+            say(json.dumps(reason_json(reason), indent=2))
+        else:
+            say("\n  ".join((sentence(reason), *evidence(reason))))
+    if reason.event is not None and not as_json:
+        tell(f"next: rsltrace view {shlex.quote(str(trace))} --at {reason.event}")
+    return int(not isinstance(reason, AsExpected))

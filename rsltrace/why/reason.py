@@ -1,0 +1,46 @@
+"""What all reasons have."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rsltrace.why.question import Question
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reason:
+    """Why a callback did not run. Times are simulated nanoseconds; entities are named as in
+    sentences.
+
+    ``place`` is the line of code (``module.py:24``) of what is to blame, ``event`` the one to look
+    at; "" and None if unknown.
+    """
+
+    is_reason: ClassVar[bool] = True
+    """Whether something kept the callback from running; else another reason is looked for."""
+    question: Question
+    place: str = ""
+    event: int | None = None
+
+    @classmethod
+    def find(cls, question: Question) -> Reason | None:
+        """Return the reason, None if it does not hold."""
+        raise NotImplementedError
+
+    def words(self) -> str:
+        """Return a sentence without its full stop."""
+        raise NotImplementedError
+
+    def clause(self) -> str:
+        """Return the reason as what follows "because" in the sentence of another one."""
+        return self.words()
+
+    def because(self) -> Reason | None:
+        """Return the reason behind this one, if there is one."""
+        return None
+
+    def evidence(self) -> Iterator[str]:
+        """Yield lines that show what the trace says, beside the counts and the event."""
+        yield from ()
