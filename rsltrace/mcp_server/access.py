@@ -44,6 +44,8 @@ class Access:
         found = self.path(name)
         if not found.exists():
             raise RefusedError(f"there is no {name!r} in {self.folders[0]}")
+        for inside in found.iterdir() if found.is_dir() else ():  # of a bag
+            self.path(str(inside))
         return found
 
     def new_trace(self, name: str) -> Path:

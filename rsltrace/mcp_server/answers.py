@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from rsltrace.trace.model.texts import printable, shortened
 
 ANSWER_BYTES_MAX = 8000
+_PREFIX_BYTES = 100
+"""Room for what the package mcp puts before errors."""
 _LINES_BYTES_MAX = 6400
 _LINE_MAX = 400
 _TITLE_MAX = 600
@@ -95,10 +97,12 @@ def answer(title: str, page: Page, then: Sequence[str], *, is_end: bool = False)
 
 def bounded(text: str) -> str:
     """Return a text, cut off at the bound of an answer."""
-    if len(text.encode()) <= ANSWER_BYTES_MAX:
-        return text
+    data, most = text.encode("utf-8", "backslashreplace"), ANSWER_BYTES_MAX - _PREFIX_BYTES
     note = "\n(cut off here)"
-    return text.encode()[: ANSWER_BYTES_MAX - len(note)].decode("utf-8", "ignore") + note
+    if len(data) > most:
+        data = data[: most - len(note)]
+        return data.decode("utf-8", "ignore") + note
+    return data.decode()
 
 
 def _size(line: str) -> int:

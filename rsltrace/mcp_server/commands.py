@@ -44,14 +44,13 @@ async def run_command(
     limit_s: float,
     *,
     module: str = "rsltrace",
-    skip: int = 0,
-    end: bool = False,
+    keeper: PageKeeper | None = None,
 ) -> CommandResult:
-    """Run a command of rsltrace and keep a page of what it prints (see ``PageKeeper``).
+    """Run a command of rsltrace; ``keeper`` keeps a page of what it prints, or its beginning.
 
     If the call is cancelled or takes too long, the command and all it has started end.
     """
-    keeper = PageKeeper(skip=skip, end=end)
+    keeper = keeper or PageKeeper()
     process = await anyio.open_process(
         rsltrace_command(words, module),
         stdin=subprocess.DEVNULL,

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from rsltrace.debug.prompt.show import position_line, stopped_lines
 from rsltrace.mcp_server.access import Access, RefusedError
-from rsltrace.mcp_server.answers import Page, answer, page_of
+from rsltrace.mcp_server.answers import Page, PageKeeper, answer, page_of
 from rsltrace.mcp_server.commands import CommandResult, run_command
 from rsltrace.mcp_server.sessions import Sessions
 
@@ -42,6 +42,7 @@ READING = ("overview", "events", "event", "why", "diff", "latency")
 RUNNING = ("check_job", "record", "node_state", "run_until", "what_if", "explore", "verify")
 TOOLS = (*READING, *RUNNING)
 
+_SMALL = re.compile(r"/small/(\d+)/")
 _EVENT = re.compile(r"\bevent (\d{1,18})\b")
 
 
@@ -58,18 +59,16 @@ class Tools:
         """Summarize a run: its checks and whether they hold, digest, how it ended, nodes, topics,
         rates, findings. Start here with a trace."""
         path = str(self._access.existing(trace))
-        checks = await self._run(["check", path], end=True)
-        if checks.status == 1 and not skip:
-            return answer(
-                f"{trace}: checks of its job fail",
-                checks.page,
-                [
-                    *_look_at(trace, checks.page),
-                    f"overview({trace!r}, skip=1) has nodes and topics",
-                ],
-            )
+        checks = await self._run(["check", path])
+        keeper = PageKeeper(skip=skip)
         then = [f"events({trace!r}, where=...) lists callbacks; event, why, node_state look at one"]
-        return await self._read(f"overview of {trace}", ["info", path], then, skip)
+        if not checks.has_failed:  # as it has where there are no checks
+            for line in (*checks.page.lines, ""):
+                keeper.add(line)
+        if checks.status == 1:
+            then = _look_at(trace, checks.page) + then
+        done = await self._run(["info", path], keeper=keeper)
+        return self._told(f"overview of {trace}", done, then)
 
     async def events(
         self,
@@ -99,11 +98,11 @@ class Tools:
         words += _options("--kind", kinds) + _options("--where", [where] if where else None)
         words += _options("--from", [start] if start else None)
         words += _options("--to", [end] if end else None)
-        then = [
-            f"event({trace!r}, N) shows one of them, why({trace!r}, N) what caused it",
-            f"skip={skip + limit} continues, where there are more",
-        ]
-        return await self._read(f"events of {trace}", words, then, skip)
+        done = await self._run(words, skip=skip)
+        then = [f"event({trace!r}, N) shows one of them, why({trace!r}, N) what caused it"]
+        if len(done.page.lines) >= limit and not done.page.after:
+            then.append(f"events(..., skip={skip + limit}) continues")
+        return self._told(f"events of {trace}", done, then)
 
     async def event(
         self,
@@ -262,7 +261,7 @@ class Tools:
         def go(session: DebugSession) -> tuple[list[str], RunPosition]:
             point = session.break_at(condition)
             try:
-                place = start if start is not None else (session.events or 0) if backwards else 0
+                place = start if start is not None else _end(session) if backwards else 0
                 session.go_to(place)
                 stopped = session.reverse_go_on() if backwards else session.go_on()
                 source = session.inspect("source") if stopped.position.event else None
@@ -274,7 +273,9 @@ class Tools:
         at = position.index - (not position.is_next)
         on = position.index + (position.is_next and not backwards)
         again = f"run_until({trace!r}, {condition!r}, start={on}, backwards={backwards})"
-        then = [f"{again} goes on", f"why({trace!r}, {max(at, 0)}); node_state({trace!r}, node, N)"]
+        then = [f"{again} goes on"]
+        if at >= 0:
+            then.append(f"why({trace!r}, {at}); node_state({trace!r}, node, {at})")
         return answer(f"{trace}: {condition}", page_of(lines), then)
 
     async def what_if(
@@ -323,8 +324,12 @@ class Tools:
         done = await self._run(words, end=True, seconds=seconds)
         then = [f"a larger budget, or another strategy; verify({job!r})"]
         if done.status == 1:
-            small = f"{output}/small/NUMBER"
-            then = [f"diff('{small}/passing.mcap', '{small}/failing.mcap') shows what fails it"]
+            named = _SMALL.search("\n".join(done.page.lines))
+            small = f"{output}/small/{named[1] if named else 'NUMBER'}"
+            then = [
+                f"diff('{small}/passing.mcap', '{small}/failing.mcap') shows what fails it",
+                f"overview('{small}/failing.mcap'), if the job fails in its default order",
+            ]
         return self._told(f"search of {job}", done, then)
 
     async def verify(
@@ -348,7 +353,7 @@ class Tools:
 
     async def _last_change(self, trace: str, node: str, attribute: str, event: int | None) -> int:
         def find(session: DebugSession) -> int:
-            session.go_to((session.events or 0) if event is None else event + 1)
+            session.go_to(_end(session) if event is None else event + 1)
             return session.last_changed(node, attribute).index - 1
 
         return await self._sessions.use(self._access.existing(trace), find)
@@ -378,10 +383,12 @@ class Tools:
         module: str = "rsltrace",
         skip: int = 0,
         end: bool = False,
+        keeper: PageKeeper | None = None,
         seconds: float | None = None,
     ) -> CommandResult:
         limit_s = min(self._access.limit_s, seconds or self._access.limit_s)
-        return await run_command(words, limit_s, module=module, skip=skip, end=end)
+        keeper = keeper or PageKeeper(skip=skip, end=end)
+        return await run_command(words, limit_s, module=module, keeper=keeper)
 
     def _told(self, title: str, done: CommandResult, then: Sequence[str]) -> str:
         """Return the answer of a command.
@@ -395,6 +402,14 @@ class Tools:
         if done.status is None:
             how = "ask for less (until, budget), or have the server started with a greater --limit"
         raise RefusedError(answer(f"{title}: it {done.ended}", done.page, [how]))
+
+
+def _end(session: DebugSession) -> int:
+    """Return the place before the nodes are destroyed, which changes every value."""
+    index = session.events or 0
+    while index and session.event(index - 1)["kind"] == "shutdown":
+        index -= 1
+    return index
 
 
 def _options(name: str, values: Iterable[str] | None) -> list[str]:
