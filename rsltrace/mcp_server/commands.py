@@ -14,7 +14,7 @@ from anyio.abc import Process
 from rsltrace.child_processes import how_ended, kill_group, rsltrace_command
 from rsltrace.mcp_server.answers import Page, PageKeeper
 
-_GRACE_S = 1.5
+GRACE_S = 1.2
 """From SIGTERM, at which a command closes its trace and ends its processes, to SIGKILL. Clients
 wait two seconds for a server that shall end."""
 _LAST_OUTPUT_S = 1.0
@@ -91,7 +91,7 @@ async def _end(process: Process) -> None:
     if process.returncode is None:
         with suppress(ProcessLookupError):
             process.send_signal(signal.SIGTERM)
-        with anyio.move_on_after(_GRACE_S):
+        with anyio.move_on_after(GRACE_S):
             await process.wait()
     kill_group(process.pid)
     await process.aclose()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import os
 import signal
+import threading
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 
@@ -26,6 +27,8 @@ from rsltrace.mcp_server.answers import bounded, page_of
 from rsltrace.mcp_server.sessions import Sessions
 from rsltrace.mcp_server.tools import READING, TOOLS, Tools
 
+_END_S = 1.7
+"""From SIGTERM to the end: commands end in ``commands.GRACE_S``, and clients wait two seconds."""
 _INSTRUCTIONS = """rsltrace runs ROS 2 nodes deterministically, records every callback as an event,
 compares runs, and steps through them forwards and backwards. Begin with record (of a job) or
 overview (of a trace); each answer ends with what is useful next. Lines that begin with "| " are
@@ -47,7 +50,11 @@ async def _serve(server: MCPServer) -> None:
 
         async def end_by_signal() -> None:
             with anyio.open_signal_receiver(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as caught:
-                async for _ in caught:
+                async for number in caught:
+                    # The thread that reads stdin cannot be woken: it must not keep the process.
+                    end = threading.Timer(_END_S, os._exit, (128 + number,))
+                    end.daemon = True
+                    end.start()
                     group.cancel_scope.cancel()
 
         group.start_soon(end_by_signal)

@@ -17,6 +17,7 @@ import pytest
 
 from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
+from rsltrace.child_processes import rsltrace_command
 from rsltrace.mcp_server import guides
 from rsltrace.mcp_server.access import Access, RefusedError
 from rsltrace.mcp_server.answers import ANSWER_BYTES_MAX, PageKeeper, answer, bounded, page_of
@@ -154,6 +155,13 @@ def test_trust_and_folders_come_from_the_command_line_alone(tmp_path: Path) -> N
     assert {path.name for path in tmp_path.iterdir()} == {"bag", "job.yaml", "link.mcap"}
 
 
+def test_a_command_loads_no_module_of_the_working_directory(tmp_path: Path) -> None:
+    for module in ("ctypes", "runpy", "os"):
+        (tmp_path / f"{module}.py").write_text("raise SystemExit(3)\n")
+    done = subprocess.run(rsltrace_command(["--version"]), cwd=tmp_path, timeout=300, check=False)
+    assert done.returncode == 0
+
+
 def test_a_trace_cannot_name_files_to_be_shown(tmp_path: Path) -> None:
     from rsltrace_viewer.model.run import Run
 
@@ -209,7 +217,8 @@ from rclpy.node import Node
 class Endless(Node):
     def __init__(self):
         super().__init__("endless")
-        with open("pids", "a") as file:
+        folder = os.path.dirname(os.path.realpath(__file__))
+        with open(os.path.join(folder, "pids"), "a") as file:
             file.write(f"{os.getpid()}\\n")
         self.create_timer(0.001, lambda: None)
 """
