@@ -8,10 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import pytest
-
-anyio = pytest.importorskip("anyio")
-pytest.importorskip("mcp.server.mcpserver")
+import anyio
 
 Call = tuple[str, dict[str, Any]]
 

@@ -28,6 +28,8 @@ from rsltrace.trace.model.texts import printable_lines
 
 from .conftest import Call, converse
 
+pytest.importorskip("mcp.server.mcpserver")
+
 _SYNTHETIC = Path(__file__).parents[2] / "benchmarks" / "synthetic.py"
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from .conftest import converse
 
+pytest.importorskip("mcp.server.mcpserver")
+
 WALL = Path(__file__).parents[2] / "examples" / "wall"
 CHECK = """
 checks:
