@@ -31,7 +31,7 @@ class Box(NamedTuple):
 RUNNING, READING, SHARED, ROOM = "#fdf1e7", "#e8effb", "#eef0f2", "#ffffff"
 
 BOXES = (
-    Box(180, 44, 223, 54, "testing", "a pytest plugin", SHARED),
+    Box(180, 44, 223, 54, "testing · mcp_server", "a pytest plugin; tools of agents", SHARED),
     Box(413, 44, 223, 54, "viewer", "terminal screens, Rerun", SHARED),
     Box(646, 44, 444, 54, "cli", "the commands", SHARED),
     Box(180, 108, 145, 54, "search", "many runs", RUNNING),

@@ -14,10 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# The kernel ends the process with the one that started it (PR_SET_PDEATHSIG). No module is loaded
-# from the working directory.
-_PROGRAM = """
-import ctypes, os, sys
+END_WITH_PARENT = """
+import ctypes, os
 parent = sys.argv.pop(1)
 if parent:
     prctl = getattr(ctypes.CDLL(None), 'prctl', None)
@@ -25,7 +23,15 @@ if parent:
         prctl(1, 9)
     if os.getppid() != int(parent):
         sys.exit(137)
+"""
+"""Program text: the kernel ends the process with its parent (PR_SET_PDEATHSIG), whose number is the
+first word; "": it does not. ``sys`` is loaded, and the working directory no longer on its path."""
+
+# No module is loaded from the working directory: not even ctypes.
+_PROGRAM = f"""
+import sys
 sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
+{END_WITH_PARENT}
 import runpy
 module = sys.argv.pop(1)
 sys.argv[0] = 'rsltrace'
@@ -44,7 +50,7 @@ def rsltrace_command(
     something to clear away.
     """
     parent = str(os.getpid()) if killed_with_parent else ""
-    return [sys.executable, "-c", _PROGRAM, parent, str(OWN_FOLDER), module, *words]
+    return [sys.executable, "-c", _PROGRAM, str(OWN_FOLDER), parent, module, *words]
 
 
 def start_connected(

@@ -40,6 +40,7 @@ _COMMANDS = {
     "rerun": "Show a trace, or two side by side, in Rerun.",
     "export": "Export a trace to a rosbag2 bag, Perfetto or a Foxglove layout.",
     "diff": "Show where two traces or recordings first diverge, and why.",
+    "mcp": "Serve AI agents over the Model Context Protocol.",
 }
 """Each is the function of its name in the module of its name, beside this one."""
 
