@@ -1,7 +1,6 @@
 """The tools. Docstrings and arguments are what an agent reads of them.
 
-To add one: a method here, and its name in ``TOOLS``. `rsltrace why RUN NODE TOPIC` (why a value is
-as it is) belongs into ``why``, as a command that ``_read`` runs.
+To add one: a method here, and its name in ``TOOLS``.
 """
 
 from __future__ import annotations
@@ -128,18 +127,31 @@ class Tools:
         event: Annotated[
             int | None, Field(description="The event to explain; of an attribute: up to it", ge=0)
         ] = None,
-        node: Annotated[str | None, Field(description="With attribute: its node")] = None,
+        node: Annotated[
+            str | None, Field(description="Of the attribute or callback: its node")
+        ] = None,
         attribute: Annotated[
             str | None, Field(description="Explain this value of a node: stop_at, P[0][0]")
         ] = None,
+        callback: Annotated[
+            str | None,
+            Field(description="Of node, did not come or came late: a topic, a service, on_scan"),
+        ] = None,
+        at: Annotated[str | None, Field(description="With callback: time of the run: 2.5s")] = None,
         skip: Skip = 0,
     ) -> str:
         """Explain an event, or the last change of a node's attribute: the chain of events that
-        caused it, back to a timer or an input, each with its line of code."""
+        caused it, back to a timer or an input, each with its line of code. Or explain why a
+        callback did not come, or came late: give node and callback."""
+        if callback and node:
+            words = ["why", *_options("--at", [at] if at else None)]
+            words += ["--", str(self._access.existing(trace)), node, callback]
+            then = [f"events({trace!r}, nodes=[...]) lists what the node to blame did"]
+            return await self._read(f"why {callback} of {node} did not come", words, then, skip)
         if attribute and node:
             event = await self._last_change(trace, node, attribute, event)
         elif event is None:
-            raise RefusedError("give an event, or node and attribute")
+            raise RefusedError("give an event, or node and attribute, or node and callback")
         then = [f"event({trace!r}, {event}) shows what it received and sent"]
         if event:
             then.append(f"node_state({trace!r}, node, {event - 1}) has the state before it")

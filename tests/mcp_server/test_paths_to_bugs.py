@@ -100,3 +100,15 @@ def test_backwards_and_forwards_and_searches(wall: Path) -> None:
     assert "1 failed of 1 cause" in explore
     assert "overview('found/small/000000/failing.mcap')" in explore
     assert "/range → /speed" in latency
+
+
+def test_why_a_callback_did_not_come(tmp_path: Path) -> None:
+    sample = WALL.parents[1] / "sample_traces" / "missing_event" / "b.mcap"
+    shutil.copy(sample, tmp_path / "run.mcap")
+    reason, unknown = converse(
+        tmp_path,
+        ("why", {"trace": "run.mcap", "node": "/picker", "callback": "/close"}),
+        ("why", {"trace": "run.mcap", "node": "--json", "callback": "/close"}),
+    )
+    assert "had not ended at 10.0 s (picker.py:39)" in reason
+    assert "has no node that is called '--json'" in unknown
