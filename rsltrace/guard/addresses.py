@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from numbers import Number
 from types import (
     BuiltinMethodType,
     FrameType,
@@ -89,8 +90,10 @@ _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
 def has_address_hash(obj: object) -> bool:
     """Return whether an object's hash differs from process to process."""
     kind = type(obj)
-    if kind in (int, float, bool, complex):
+    if kind in (int, bool):
         return False
+    if isinstance(obj, Number):
+        return bool(obj != obj)  # of no number: all would be in one place of a set
     if kind in (str, bytes):
         return _SEEDED
     if obj is None:

@@ -297,7 +297,7 @@ _SQL_RANDOM = replace(
 )
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"
-    r"|\brandom(?:blob)?\(",
+    r"|\bstrftime\([^(),]*\)|\brandom(?:blob)?\(",
     re.IGNORECASE,
 )
 
@@ -394,6 +394,7 @@ RULES: dict[str, Rule] = {
     **_calls(_SLEEP, "time", "sleep"),
     **_calls(_RANDOM, "random", _DRAWS),
     **_classes(_UNSEEDED, "random", "Random", when=is_unseeded),
+    **_classes(_UNSEEDED, "_random", "Random", when=is_unseeded),
     **_classes(_ENTROPY, "random", "SystemRandom"),
     **_calls(_RANDOM, "random", "seed", when=is_unseeded),
     **_calls(_NUMPY, "numpy.random", _NUMPY_DRAWS),
@@ -464,15 +465,16 @@ RULES: dict[str, Rule] = {
     **_calls(_LISTING, "os", "listdir scandir walk fwalk"),
     **_calls(_LISTING, "glob", "glob iglob"),
     **_calls(ENVIRONMENT, "os", "getenv getenvb"),
-    **_calls(_MACHINE, "os", "getppid getcwd getlogin getloadavg"),
+    **_calls(_MACHINE, "os", "getppid getcwd getcwdb getlogin getloadavg getpgrp nice getpriority"),
     **_calls(_MACHINE, "os", "uname", restore=os.uname_result),
-    **_calls(_MACHINE, "os", "getpgid getsid", restore=None),
+    **_calls(_MACHINE, "os", "getpgid getsid umask", restore=None),
+    **_calls(_MACHINE, "resource", "getrlimit prlimit", restore=tuple),
     **_calls(_MACHINE, "os", "sysconf", when=_of_machine),
     **_calls(_MACHINE, "_thread", "get_native_id"),
     **_calls(ENVIRONMENT, "threading", "get_native_id"),
-    **_calls(_INTERPRETER, "gc", "get_stats get_objects"),
+    **_calls(_INTERPRETER, "gc", "get_stats get_objects get_referrers"),
     **_calls(_INTERPRETER, "gc", "get_count", restore=lambda answer: answer),
-    **_calls(_INTERPRETER, "sys", "getallocatedblocks"),
+    **_calls(_INTERPRETER, "sys", "getallocatedblocks getrefcount"),
     **_calls(_PROCESSORS, "os", "process_cpu_count sched_getaffinity"),
     **_calls(
         _PROCESSORS,
@@ -496,6 +498,7 @@ RULES: dict[str, Rule] = {
     ),
     **_calls(_FILE_TIME, "os.path", "getmtime getatime getctime"),
     **_calls(_DISK, "os", "statvfs fstatvfs"),
+    **_calls(_DISK, "os", "readlink", restore=lambda answer: answer),
     **_calls(
         LOCALE,
         "locale",
@@ -517,6 +520,21 @@ SHARED_GENERATORS = {"random.": "random.seed", "numpy.random.": "numpy.random.se
 METHODS = {"iterdir": _LISTING, "rglob": _LISTING}
 """Rules for methods by their names alone, whatever object they are called on."""
 
+REPORTED_MEMBERS: dict[str, NondeterminismSource] = {
+    "array.array.buffer_info": NondeterminismSource.ADDRESS,
+    "ctypes.c_void_p.value": NondeterminismSource.ADDRESS,
+    "ctypes.c_void_p.__repr__": NondeterminismSource.ADDRESS,
+    "numpy.ndarray.__array_interface__": NondeterminismSource.ADDRESS,
+    "numpy.generic.__array_interface__": NondeterminismSource.ADDRESS,
+    "numpy._core._internal._ctypes.data": NondeterminismSource.ADDRESS,
+    "numpy.core._internal._ctypes.data": NondeterminismSource.ADDRESS,
+    "_lsprof.Profiler.getstats": NondeterminismSource.CLOCK,
+    "os.DirEntry.stat": NondeterminismSource.FILE,
+    "os.DirEntry.inode": NondeterminismSource.FILE,
+}
+"""Methods and properties that the guard reports: addresses in user code itself, others where user
+code leads to them."""
+
 AUDIT_EVENTS: dict[str, NondeterminismSource] = {
     **dict.fromkeys(
         (
@@ -537,18 +555,31 @@ AUDIT_EVENTS: dict[str, NondeterminismSource] = {
 """Audit events of Python that the guard reports, named as Python names them."""
 
 C_FUNCTIONS: dict[str, NondeterminismSource] = {
-    **dict.fromkeys(
-        ("time", "clock", "clock_gettime", "gettimeofday", "times", "getrusage"),
-        NondeterminismSource.CLOCK,
-    ),
-    **dict.fromkeys(
-        ("rand", "random", "getrandom", "getentropy", "arc4random", "drand48", "lrand48"),
-        NondeterminismSource.RANDOM,
-    ),
-    "getpid": NondeterminismSource.PID,
-    **dict.fromkeys(
-        ("getppid", "gettid", "getenv", "gethostname", "sched_getcpu"),
-        NondeterminismSource.ENVIRONMENT,
-    ),
+    name: source
+    for source, names in {
+        NondeterminismSource.CLOCK: (
+            "time clock clock_gettime gettimeofday timespec_get ftime times getrusage getitimer"
+        ),
+        NondeterminismSource.RANDOM: (
+            "rand random drand48 lrand48 mrand48 getrandom getentropy arc4random arc4random_buf "
+            "arc4random_uniform"
+        ),
+        NondeterminismSource.PID: "getpid",
+        NondeterminismSource.ENVIRONMENT: (
+            "getppid getpgrp gettid getenv secure_getenv environ getcwd getwd get_current_dir_name "
+            "gethostname gethostid uname sysinfo sysconf getauxval getloadavg getlogin getrlimit "
+            "sched_getcpu getcpu get_nprocs syscall"
+        ),
+        NondeterminismSource.FILE: "open open64 openat fopen fopen64 stat fstat readlink opendir",
+        NondeterminismSource.SOCKET: "socket connect recv recvfrom accept getaddrinfo",
+        NondeterminismSource.PROCESS: "system popen fork vfork posix_spawn execv execve execvp",
+        NondeterminismSource.THREAD: "pthread_create pthread_self alarm setitimer timer_create",
+        NondeterminismSource.ADDRESS: (
+            "malloc calloc realloc aligned_alloc posix_memalign mmap sbrk PyObject_Hash "
+            "_Py_HashPointer PyLong_FromVoidPtr PyCapsule_GetPointer"
+        ),
+    }.items()
+    for name in names.split()
 }
-"""Functions of the C library that the guard reports when nodes load them by ctypes or cffi."""
+"""Functions and variables of the C library and of Python that the guard reports when nodes load
+them by ctypes or cffi."""

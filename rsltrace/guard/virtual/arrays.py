@@ -1,0 +1,78 @@
+"""Memory that numpy leaves as it was: in user code it shows zeros.
+
+``np.empty`` is redirected. Other functions and types have no such object, so user modules call
+``filled`` in place of them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.frames import caller
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.redirect import redirect
+from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
+
+NEW_ARRAYS = frozenset(("empty", "empty_like", "ndarray", "recarray", "chararray"))
+"""Names of numpy's functions and types that make arrays of memory as it is."""
+_BUFFER = 3
+"""From this number of arguments on, a type of arrays is given its memory."""
+
+
+def _fills(guard: Guard, frame: FrameType) -> bool:
+    return guard.is_user(frame) and (
+        guard.mode(NondeterminismSource.RANDOM, frame) is not GuardMode.ALLOW
+    )
+
+
+def _zeroing(real: Callable[..., Any]) -> Any:
+    def empty(*arguments: Any, **options: Any) -> Any:
+        made = real(*arguments, **options)
+        guard = engaged()
+        if guard is not None and not made.dtype.hasobject and _fills(guard, caller()):
+            made.fill(0)
+        return made
+
+    return empty
+
+
+def filled(function: Any, *arguments: Any, **options: Any) -> Any:
+    """Call a function; fill with zeros what numpy has left as it was in the arrays it returns."""
+    made = function(*arguments, **options)
+    guard, np = engaged(), sys.modules.get("numpy")
+    if guard is None or np is None or not _fills(guard, caller()):
+        return made
+    if isinstance(function, np.ufunc):
+        for one in made if isinstance(made, tuple) else (made,):
+            if isinstance(one, np.ndarray):
+                np.copyto(one, 0, casting="unsafe", where=np.logical_not(options["where"]))
+        return made
+    owner = str(getattr(function, "__module__", "")).partition(".")[0]
+    name = getattr(function, "__name__", "")
+    given = isinstance(function, type) and (
+        len(arguments) >= _BUFFER or not {"buffer", "buf"}.isdisjoint(options)
+    )
+    if (
+        owner == "numpy"
+        and name in NEW_ARRAYS
+        and not given
+        and isinstance(made, np.ndarray)
+        and not made.dtype.hasobject
+    ):
+        made.fill(0)
+    return made
+
+
+@contextmanager
+def zeroed_arrays() -> Iterator[None]:
+    """Redirect ``np.empty``."""
+    with ExitStack() as stack:
+        if "numpy" in sys.modules:
+            import numpy as np
+
+            redirect(stack, np.empty, _zeroing)
+        yield
