@@ -391,6 +391,8 @@ RULES: dict[str, Rule] = {
     **_classes(_CLOCK, "numpy", "datetime64", when=_now_text),
     **_calls(_CPU_TIME, "os", "times", restore=os.times_result),
     **_calls(_CPU_TIME, "resource", "getrusage", restore=resource.struct_rusage),
+    **_calls(_CPU_TIME, "cProfile", "run runctx", reports=None),
+    **_classes(_CPU_TIME, "cProfile", "Profile", reports=None),
     **_calls(_SLEEP, "time", "sleep"),
     **_calls(_RANDOM, "random", _DRAWS),
     **_classes(_UNSEEDED, "random", "Random", when=is_unseeded),
@@ -517,8 +519,17 @@ RULES: dict[str, Rule] = {
 SHARED_GENERATORS = {"random.": "random.seed", "numpy.random.": "numpy.random.seed"}
 """A module that calls the second with a seed may call the functions that begin with the first."""
 
-METHODS = {"iterdir": _LISTING, "rglob": _LISTING}
+METHODS = {"iterdir": _LISTING, "rglob": _LISTING, "inode": _FILE_TIME, "buffer_info": ADDRESS}
 """Rules for methods by their names alone, whatever object they are called on."""
+
+ATTRIBUTES = {
+    **dict.fromkeys(("__array_interface__", "__array_struct__", "ctypes.data"), ADDRESS),
+    **{
+        f"st_{name}": _FILE_TIME
+        for name in "ino mtime mtime_ns atime atime_ns ctime ctime_ns".split()
+    },
+}
+"""Rules for attributes by their last names."""
 
 REPORTED_MEMBERS: dict[str, NondeterminismSource] = {
     "array.array.buffer_info": NondeterminismSource.ADDRESS,
@@ -583,3 +594,12 @@ C_FUNCTIONS: dict[str, NondeterminismSource] = {
 }
 """Functions and variables of the C library and of Python that the guard reports when nodes load
 them by ctypes or cffi."""
+
+
+def c_function_rule(name: str) -> Rule | None:
+    """Return the rule for such a function, if it has one."""
+    source = C_FUNCTIONS.get(name)
+    if source is None:
+        return None
+    instead = "the function of Python's own modules, or a parameter of the node"
+    return Rule(source.value, _D, "reported as a finding", instead, source)
