@@ -8,19 +8,21 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from campaigns.one_liners.campaign import all_lines, run
+from campaigns.one_liners.campaign import LIMITS, all_lines, run
 
 
 def main() -> int:
-    """Run the lines and print a table; return 1 if any is silent."""
+    """Run the lines and print a table; return 1 if one is silent that is not known to be."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=6, help="environments to record each line in")
     parser.add_argument("--only", default="", help="lines that contain this text")
+    parser.add_argument("--no-pin", action="store_true", help="record as pytest does")
     parser.add_argument("--verbose", action="store_true", help="show every line")
     options = parser.parse_args()
     lines = [line for line in all_lines() if options.only in line.text]
     with tempfile.TemporaryDirectory() as folder:
-        judged = run(lines, options.runs, Path(folder))
+        more = ["--no-pin"] if options.no_pin else []
+        judged = run(lines, options.runs, Path(folder), options=more)
     for topic in dict.fromkeys(line.topic for line in lines):
         counts = Counter(one.verdict for one in judged if one.line.topic == topic)
         print(f"{topic:20}", *(f"{counts[verdict]:4} {verdict}" for verdict in VERDICTS))
@@ -31,7 +33,7 @@ def main() -> int:
                 print(f"    {text[:200]}")
     counts = Counter(one.verdict for one in judged)
     print(f"{len(lines)} lines:", *(f"{counts[verdict]} {verdict}" for verdict in VERDICTS))
-    return 1 if counts["silent"] else 0
+    return int(any(one.verdict == "silent" and one.line.topic != LIMITS for one in judged))
 
 
 VERDICTS = ("held", "reported", "silent")

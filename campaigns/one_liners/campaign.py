@@ -1,7 +1,8 @@
 """Record every one-liner in perturbed environments and judge what it gave.
 
 Each line of ``lines.txt`` is a callback of its own in one node. What a line gives must be the same
-in all runs (*held*), or its finding must be in the traces (*reported*). All else is *silent*.
+in all runs (*held*), or its finding must be in the traces (*reported*). All else is *silent*, as
+the lines below ``# limits`` are known to be.
 """
 
 from __future__ import annotations
@@ -17,10 +18,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rsltrace.search.perturb import KERNEL, Perturbation, perturbation, record_perturbed
+from rsltrace.search.perturb import (
+    HASH_SEED,
+    KERNEL,
+    LOCALE,
+    TIME_ZONE,
+    Perturbation,
+    perturbation,
+    record_perturbed,
+)
 from rsltrace.trace.reader import Trace
 
 HERE = Path(__file__).parent
+LIMITS = "limits"
 _MODULE = "one_liners"
 _IN_LINE = re.compile(r" in line_(\d+)\b")
 _CASE = """
@@ -65,9 +75,19 @@ def all_lines() -> list[Line]:
     return lines
 
 
-def run(lines: Sequence[Line], runs: int, folder: Path) -> list[Judged]:
-    """Record the lines ``runs`` times and judge each."""
-    recorded = [_recorded(lines, number, folder) for number in range(runs)]
+def write_job(lines: Sequence[Line], place: Path) -> Path:
+    """Write the node of some lines, and a job that runs each of them once; return the job."""
+    cases = (_CASE.format(number=n, line=line.text) for n, line in enumerate(lines))
+    (place / f"{_MODULE}.py").write_text((HERE / "node.py").read_text() + "".join(cases))
+    nodes, stop = [{"node": f"{_MODULE}:Lines"}], {"duration": f"{len(lines) + 10}s"}
+    path = place / "job.json"
+    path.write_text(json.dumps({"nodes": nodes, "stop": stop}))
+    return path
+
+
+def judge(lines: Sequence[Line], traces: Sequence[Path]) -> list[Judged]:
+    """Judge the lines by the traces of some runs."""
+    recorded = [_given(path) for path in traces]
     return [
         Judged(
             line,
@@ -78,34 +98,11 @@ def run(lines: Sequence[Line], runs: int, folder: Path) -> list[Judged]:
     ]
 
 
-def _recorded(
-    lines: Sequence[Line], number: int, folder: Path
-) -> tuple[dict[int, str], dict[int, set[str]]]:
+def _given(path: Path) -> tuple[dict[int, str], dict[int, set[str]]]:
     """Return what each line gave in one run, and the sources of its findings."""
-    place = folder / "job"
-    shutil.rmtree(place, ignore_errors=True)  # so that times and inodes of files differ
-    place.mkdir()
-    cases = (_CASE.format(number=n, line=line.text) for n, line in enumerate(lines))
-    (place / f"{_MODULE}.py").write_text((HERE / "node.py").read_text() + "".join(cases))
-    (place / "job.json").write_text(
-        json.dumps(
-            {
-                "nodes": [{"node": f"{_MODULE}:Lines"}],
-                "stop": {"duration": f"{len(lines) + 10}s"},
-            }
-        )
-    )
-    around = perturbation(number)
-    values = {kind: value for kind, value in around.values.items() if kind != KERNEL}
-    with _limits(number):
-        done = record_perturbed(
-            Perturbation(number, values), [str(place / "job.json")], folder, timeout_s=600
-        )
-    if not done.digest:
-        raise RuntimeError(f"run {number}: {done.failure}\n{done.errors}")
     given: dict[int, str] = {}
     found: dict[int, set[str]] = {}
-    with Trace.open(done.path) as trace:
+    with Trace.open(path) as trace:
         for *_, data in trace.messages("/given"):
             message: Any = trace.decode("/given", data)
             line, text = json.loads(message.data)
@@ -115,6 +112,30 @@ def _recorded(
                 if match := _IN_LINE.search(one.stack):
                     found.setdefault(int(match[1]), set()).add(one.source.value)
     return given, found
+
+
+def run(
+    lines: Sequence[Line], runs: int, folder: Path, *, options: Sequence[str] = ()
+) -> list[Judged]:
+    """Record the lines ``runs`` times, with more options of ``record``, and judge each."""
+    return judge(lines, [_recorded(lines, number, folder, options) for number in range(runs)])
+
+
+def _recorded(lines: Sequence[Line], number: int, folder: Path, options: Sequence[str]) -> Path:
+    place = folder / "job"
+    shutil.rmtree(place, ignore_errors=True)  # so that times and inodes of files differ
+    place.mkdir()
+    job = write_job(lines, place)
+    values = dict(perturbation(number).values)
+    values.pop(KERNEL, None)
+    if "--no-pin" in options:  # what pytest pins itself is the same; the hash seed is not
+        values = {**values, LOCALE: "C.UTF-8", TIME_ZONE: "UTC", HASH_SEED: "random"}
+    around = Perturbation(number, values)
+    with _limits(number):
+        done = record_perturbed(around, [str(job), *options], folder, timeout_s=600)
+    if not done.digest:
+        raise RuntimeError(f"run {number}: {done.failure}\n{done.errors}")
+    return done.path
 
 
 @contextmanager

@@ -33,12 +33,14 @@ import gc
 import getpass
 import gettext
 import glob
+import grp
 import gzip
 import hashlib
 import heapq
 import hmac
 import http.cookiejar
 import http.server
+import importlib.metadata
 import importlib.util
 import inspect
 import io
@@ -51,6 +53,7 @@ import marshal
 import mimetypes
 import mmap
 import multiprocessing
+import multiprocessing.shared_memory
 import operator
 import os
 import pathlib
@@ -87,6 +90,7 @@ import tracemalloc
 import types
 import unittest.mock
 import uuid
+import warnings
 import weakref
 import xml.etree.ElementTree
 import xmlrpc.client
@@ -160,6 +164,11 @@ async def gathered():
     return await asyncio.gather(*map(later, range(5)))
 
 
+async def all_tasks():
+    kept = [asyncio.create_task(later(n)) for n in range(5)]
+    return [task.get_coro().__name__ for task in asyncio.all_tasks()], len(kept)
+
+
 async def raced():
     return [await one for one in asyncio.as_completed([later(n) for n in range(5)])]
 
@@ -214,6 +223,13 @@ def tracemalloc_peak():
     found = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     return found
+
+
+def warned():
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        warnings.warn(f"{Slim()}")
+    return str(caught[0].message)
 
 
 def pickled(obj):

@@ -36,6 +36,7 @@ from rsltrace.guard.call_reports import reported_calls
 from rsltrace.guard.callers import is_never_user_code, module_of
 from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.process_ids import real_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
@@ -312,8 +313,8 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     def __repr__(self: Any, /) -> str:  # noqa: N807
         text = real(self)
         guard = engaged()
-        if guard is None or " at 0x" not in text:
-            return text
+        if guard is None or " at 0x" not in text or present_import() is not None:
+            return text  # an import takes no numbers of a node: the next run may need none
         frame = caller()
         if guard.mode(NondeterminismSource.ADDRESS, frame) is GuardMode.ALLOW:
             return text
@@ -324,6 +325,7 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
                     text = text.replace(address, _address_text(guard, obj) or address)
             left = next((n[0] for n in _SHOWN_ADDRESS.finditer(text) if n[0][:4] != "0x52"), None)
         if left is not None:
+            guard.shown.reported = left
             guard.report_user_call(
                 NondeterminismSource.ADDRESS, f"text of {type(self).__qualname__}", left, frame
             )

@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from rsltrace.trace.model.finding import MODES, GuardMode, GuardPolicy, NondeterminismSource
 
 PROCESSORS = 4
@@ -136,6 +138,9 @@ _UNSEEDED = Rule(
     "is seeded from the node's stream",
     "give it a seed, from a parameter",
     NondeterminismSource.RANDOM,
+)
+_LEFT = replace(
+    _UNSEEDED, does="shows zeros where numpy computes nothing", instead="give it out=np.zeros(…)"
 )
 _TORCH = replace(
     _UNSEEDED,
@@ -332,6 +337,11 @@ def _fewer_than(count: int) -> ArgumentTest:
     return test
 
 
+def _leaves_some(call: ast.Call) -> bool:
+    words = [word.arg for word in call.keywords]
+    return "where" in words and "out" not in words
+
+
 def _with_callback(call: ast.Call) -> bool:
     return len(call.args) > 1
 
@@ -375,6 +385,7 @@ _NUMPY_DRAWS = (
     "rayleigh standard_cauchy standard_exponential standard_gamma standard_t triangular vonmises "
     "wald weibull zipf"
 )
+_UFUNCS = " ".join(name for name, one in vars(np).items() if isinstance(one, np.ufunc))
 _SPAWNS = "spawnl spawnle spawnlp spawnlpe spawnv spawnve spawnvp spawnvpe"
 _EXECS = "execl execle execlp execlpe execv execve execvp execvpe"
 _REQUESTS = "get post put patch delete head options request Session"
@@ -399,6 +410,7 @@ RULES: dict[str, Rule] = {
     **_classes(_UNSEEDED, "_random", "Random", when=is_unseeded),
     **_classes(_ENTROPY, "random", "SystemRandom"),
     **_calls(_RANDOM, "random", "seed", when=is_unseeded),
+    **_calls(_LEFT, "numpy", _UFUNCS, when=_leaves_some),
     **_calls(_NUMPY, "numpy.random", _NUMPY_DRAWS),
     **_calls(_NUMPY, "numpy.random", "seed", when=is_unseeded),
     **_calls(_UNSEEDED, "numpy.random", "default_rng", when=is_unseeded),
@@ -468,6 +480,10 @@ RULES: dict[str, Rule] = {
     **_calls(_LISTING, "glob", "glob iglob"),
     **_calls(ENVIRONMENT, "os", "getenv getenvb"),
     **_calls(_MACHINE, "os", "getppid getcwd getcwdb getlogin getloadavg getpgrp nice getpriority"),
+    **_calls(_MACHINE, "os", "getuid geteuid getgid getegid getgroups isatty ttyname"),
+    **_calls(_MACHINE, "pwd", "getpwuid getpwnam getpwall", restore=None),
+    **_calls(_MACHINE, "grp", "getgrgid getgrnam getgrall", restore=None),
+    **_calls(_MACHINE, "socket", "if_nameindex"),
     **_calls(_MACHINE, "os", "uname", restore=os.uname_result),
     **_calls(_MACHINE, "os", "getpgid getsid umask", restore=None),
     **_calls(_MACHINE, "resource", "getrlimit prlimit", restore=tuple),
@@ -476,6 +492,7 @@ RULES: dict[str, Rule] = {
     **_calls(ENVIRONMENT, "threading", "get_native_id"),
     **_calls(_INTERPRETER, "gc", "get_stats get_objects get_referrers"),
     **_calls(_INTERPRETER, "gc", "get_count", restore=lambda answer: answer),
+    **_calls(_INTERPRETER, "tracemalloc", "get_traced_memory take_snapshot"),
     **_calls(_INTERPRETER, "sys", "getallocatedblocks getrefcount"),
     **_calls(_PROCESSORS, "os", "process_cpu_count sched_getaffinity"),
     **_calls(
@@ -498,6 +515,8 @@ RULES: dict[str, Rule] = {
         "cpu_percent cpu_times cpu_freq virtual_memory swap_memory disk_usage net_io_counters "
         "sensors_temperatures boot_time pids process_iter Process",
     ),
+    **_calls(ADDRESS, "numpy", "byte_bounds", reports=NondeterminismSource.ADDRESS),
+    **_calls(ADDRESS, "numpy.lib.array_utils", "byte_bounds", reports=NondeterminismSource.ADDRESS),
     **_calls(_FILE_TIME, "os.path", "getmtime getatime getctime"),
     **_calls(_DISK, "os", "statvfs fstatvfs"),
     **_calls(_DISK, "os", "readlink", restore=lambda answer: answer),
@@ -540,6 +559,7 @@ REPORTED_MEMBERS: dict[str, NondeterminismSource] = {
     "numpy._core._internal._ctypes.data": NondeterminismSource.ADDRESS,
     "numpy.core._internal._ctypes.data": NondeterminismSource.ADDRESS,
     "_lsprof.Profiler.getstats": NondeterminismSource.CLOCK,
+    "io.TextIOWrapper.isatty": NondeterminismSource.ENVIRONMENT,
     "os.DirEntry.stat": NondeterminismSource.FILE,
     "os.DirEntry.inode": NondeterminismSource.FILE,
 }

@@ -42,15 +42,17 @@ def _zeroing(real: Callable[..., Any]) -> Any:
 
 def filled(function: Any, *arguments: Any, **options: Any) -> Any:
     """Call a function; fill with zeros what numpy has left as it was in the arrays it returns."""
-    made = function(*arguments, **options)
     guard, np = engaged(), sys.modules.get("numpy")
     if guard is None or np is None or not _fills(guard, caller()):
-        return made
-    if isinstance(function, np.ufunc):
+        return function(*arguments, **options)
+    if isinstance(function, np.ufunc) and options.get("out") is None and "where" in options:
+        options["out"] = None  # else: a warning about memory that is not initialised
+        made = function(*arguments, **options)
         for one in made if isinstance(made, tuple) else (made,):
             if isinstance(one, np.ndarray):
                 np.copyto(one, 0, casting="unsafe", where=np.logical_not(options["where"]))
         return made
+    made = function(*arguments, **options)
     owner = str(getattr(function, "__module__", "")).partition(".")[0]
     name = getattr(function, "__name__", "")
     given = isinstance(function, type) and (

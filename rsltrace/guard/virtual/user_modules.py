@@ -102,8 +102,7 @@ def _says_now(node: ast.expr) -> bool:
 
 def _leaves_some(call: ast.Call) -> bool:
     """Return whether a function of numpy may leave elements as they were."""
-    words = [word.arg for word in call.keywords]
-    return "where" in words and "out" not in words
+    return any(word.arg == "where" for word in call.keywords)
 
 
 def rewrite(tree: ast.Module) -> None:
