@@ -72,6 +72,7 @@ import select
 import selectors
 import shutil
 import signal
+import site
 import socket
 import sqlite3
 import ssl

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
 from datetime import timedelta
 from functools import partial
 from numbers import Number
@@ -84,7 +85,9 @@ _OF_PARTS = (tuple.__hash__, frozenset.__hash__)
 """Hash methods that combine the hashes of the elements; subclasses inherit them."""
 _OF_NUMBERS = (range, timedelta)
 """Types that hash numbers, in C."""
-_POINTING = frozenset((BuiltinMethodType, GenericAlias, MethodType, MethodWrapperType, UnionType))
+_POINTING = frozenset(
+    (BuiltinMethodType, ContextVar, GenericAlias, MethodType, MethodWrapperType, UnionType)
+)
 """Types whose own hash methods use addresses."""
 _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
 """Names in the code of a method that makes a hash of an address."""

@@ -484,6 +484,7 @@ RULES: dict[str, Rule] = {
     **_calls(_MACHINE, "pwd", "getpwuid getpwnam getpwall", restore=None),
     **_calls(_MACHINE, "grp", "getgrgid getgrnam getgrall", restore=None),
     **_calls(_MACHINE, "socket", "if_nameindex"),
+    **_calls(_MACHINE, "site", "getuserbase getusersitepackages"),
     **_calls(_MACHINE, "os", "uname", restore=os.uname_result),
     **_calls(_MACHINE, "os", "getpgid getsid umask", restore=None),
     **_calls(_MACHINE, "resource", "getrlimit prlimit", restore=tuple),
@@ -560,6 +561,7 @@ REPORTED_MEMBERS: dict[str, NondeterminismSource] = {
     "numpy.core._internal._ctypes.data": NondeterminismSource.ADDRESS,
     "_lsprof.Profiler.getstats": NondeterminismSource.CLOCK,
     "io.TextIOWrapper.isatty": NondeterminismSource.ENVIRONMENT,
+    "threading.Thread.native_id": NondeterminismSource.ENVIRONMENT,
     "os.DirEntry.stat": NondeterminismSource.FILE,
     "os.DirEntry.inode": NondeterminismSource.FILE,
 }

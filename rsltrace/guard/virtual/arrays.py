@@ -1,7 +1,7 @@
 """Memory that numpy leaves as it was: in user code it shows zeros.
 
-``np.empty`` is redirected. Other functions and types have no such object, so user modules call
-``filled`` in place of them.
+``np.empty`` and ``np.empty_like`` are redirected. Types, functions of masked arrays and ``where=``
+offer no such hook, so user modules call ``filled`` in place of them.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import FrameType
+from types import BuiltinFunctionType, FrameType
 from typing import Any
 
 from rsltrace.guard.frames import caller
@@ -17,7 +17,9 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
-NEW_ARRAYS = frozenset(("empty", "empty_like", "ndarray", "recarray", "chararray"))
+NEW_ARRAYS = frozenset(
+    ("ndarray", "recarray", "chararray", "empty", "masked_all", "masked_all_like")
+)
 """Names of numpy's functions and types that make arrays of memory as it is."""
 _BUFFER = 3
 """From this number of arguments on, a type of arrays is given its memory."""
@@ -47,11 +49,10 @@ def filled(function: Any, *arguments: Any, **options: Any) -> Any:
         return function(*arguments, **options)
     if isinstance(function, np.ufunc) and options.get("out") is None and "where" in options:
         options["out"] = None  # else: a warning about memory that is not initialised
-        made = function(*arguments, **options)
-        for one in made if isinstance(made, tuple) else (made,):
-            if isinstance(one, np.ndarray):
-                np.copyto(one, 0, casting="unsafe", where=np.logical_not(options["where"]))
-        return made
+        made, left = function(*arguments, **options), np.logical_not(options["where"])
+        if isinstance(made, tuple):
+            return tuple(_without(np, one, left) for one in made)
+        return _without(np, made, left)
     made = function(*arguments, **options)
     owner = str(getattr(function, "__module__", "")).partition(".")[0]
     name = getattr(function, "__name__", "")
@@ -69,12 +70,23 @@ def filled(function: Any, *arguments: Any, **options: Any) -> Any:
     return made
 
 
+def _without(np: Any, made: Any, left: Any) -> Any:
+    """Return what a function of numpy has made, with zeros where it has ``left`` memory alone."""
+    if isinstance(made, np.ndarray):
+        np.copyto(made, 0, casting="unsafe", where=left)
+        return made
+    return type(made)(0) if left else made
+
+
 @contextmanager
 def zeroed_arrays() -> Iterator[None]:
-    """Redirect ``np.empty``."""
+    """Redirect numpy's functions."""
     with ExitStack() as stack:
         if "numpy" in sys.modules:
             import numpy as np
 
             redirect(stack, np.empty, _zeroing)
+            like = getattr(np.empty_like, "_implementation", None)
+            if isinstance(like, BuiltinFunctionType):
+                redirect(stack, like, _zeroing)
         yield

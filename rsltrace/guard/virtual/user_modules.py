@@ -30,7 +30,7 @@ _ORDERED = "__rsltrace_ordered__"
 _HASH = "__rsltrace_hash__"
 _NOW = "__rsltrace_now__"
 _FILLED = "__rsltrace_filled__"
-_WORDS = (b"datetime64", b"__hash__", b"empty", b"ndarray", b"recarray", b"chararray", b"where")
+_WORDS = (b"datetime64", b"__hash__", b"where", *map(str.encode, NEW_ARRAYS))
 """A module without these words stays unchanged (before Python 3.13)."""
 _NEVER_SETS = (
     *(ast.Constant, ast.JoinedStr, ast.Compare, ast.Lambda),
