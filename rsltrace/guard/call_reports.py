@@ -226,20 +226,20 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         return str(super().__repr__())
 
     def _report_all(self, frame: FrameType) -> None:
-        guard = _guard_of(self)
+        guard = _guard_of(self, depth=3)
         if guard is not None:
             call, count = "os.environ" + _reader(frame), f"{len(self._data)} variables"
             guard.report_user_call(NondeterminismSource.ENVIRONMENT, call, count, frame)
 
 
-def _guard_of(environment: object, name: Any = "") -> Guard | None:
-    """Return the engaged guard if the caller's read is to be reported."""
+def _guard_of(environment: object, name: Any = "", depth: int = 2) -> Guard | None:
+    """Return the engaged guard if a read, ``depth`` frames up, is to be reported."""
     guard = engaged()
     if guard is None or not (environment is os.environ or environment is os.environb):
         return None
     if isinstance(name, (str, bytes)) and os.fsdecode(name).startswith(_NOT_READ):
         return None
-    return None if _is_formatting_help(sys._getframe(2)) else guard
+    return None if _is_formatting_help(sys._getframe(depth)) else guard
 
 
 @contextmanager

@@ -97,7 +97,11 @@ def _hash_method(owner: Any) -> Any:
     return owner.__hash__
 
 
-def _call(function: Any, *arguments: Any, **options: Any) -> Any:
+def _call(function: Any, text: str, *more: Any) -> Any:
+    return function(text, *more)
+
+
+def _call_with(function: Any, *arguments: Any, **options: Any) -> Any:
     return function(*arguments, **options)
 
 
@@ -105,7 +109,7 @@ _PLAIN_FUNCTIONS = {
     in_set_order: _as_it_is,
     hash_method: _hash_method,
     numpy_now: _call,
-    filled: _call,
+    filled: _call_with,
 }
 _known: list[object] = []
 
