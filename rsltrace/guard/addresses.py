@@ -7,7 +7,10 @@ import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from contextvars import ContextVar
+from datetime import timedelta
 from functools import partial
+from numbers import Number
 from types import (
     BuiltinMethodType,
     FrameType,
@@ -80,7 +83,11 @@ _ALIKE = object.__hash__
 _SEEDED = os.environ.get("PYTHONHASHSEED", "random") == "random"
 _OF_PARTS = (tuple.__hash__, frozenset.__hash__)
 """Hash methods that combine the hashes of the elements; subclasses inherit them."""
-_POINTING = frozenset((BuiltinMethodType, GenericAlias, MethodType, MethodWrapperType, UnionType))
+_OF_NUMBERS = (range, timedelta)
+"""Types that hash numbers, in C."""
+_POINTING = frozenset(
+    (BuiltinMethodType, ContextVar, GenericAlias, MethodType, MethodWrapperType, UnionType)
+)
 """Types whose own hash methods use addresses."""
 _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
 """Names in the code of a method that makes a hash of an address."""
@@ -89,8 +96,10 @@ _TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
 def has_address_hash(obj: object) -> bool:
     """Return whether an object's hash differs from process to process."""
     kind = type(obj)
-    if kind in (int, float, bool, complex):
+    if kind in (int, bool):
         return False
+    if isinstance(obj, Number):
+        return bool(obj != obj)  # of no number: all would be in one place of a set
     if kind in (str, bytes):
         return _SEEDED
     if obj is None:
@@ -102,7 +111,10 @@ def has_address_hash(obj: object) -> bool:
         return has_address_hash(obj())
     if method is _ALIKE or kind in _POINTING or kind in _by_address:
         return True
-    return not _TAKING.isdisjoint(getattr(getattr(method, "__code__", None), "co_names", ()))
+    code = getattr(method, "__code__", None)
+    if code is None:  # in C: dates, patterns and others have the hash of their bytes or texts
+        return _SEEDED and kind not in _OF_NUMBERS
+    return not _TAKING.isdisjoint(code.co_names)
 
 
 def note_address_hash(frame: FrameType) -> None:
@@ -121,7 +133,7 @@ def report_address_in_text(text: str) -> None:
     guard = engaged()
     if guard is not None:
         match = _ADDRESS.search(text)
-        if match is not None:
+        if match is not None and not match[0].endswith(guard.shown.reported or " "):
             report_from_middleware(
                 guard, NondeterminismSource.ADDRESS, "an address in a log record", match.group()
             )

@@ -23,13 +23,22 @@ from rsltrace.guard.file_report_filter import (
     SOURCE_READERS,
     UNREPORTED_MODULES,
     calling_module,
+    is_following_links,
     is_installed_path,
 )
-from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.frames import caller, code_of, replace_member
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.redirect import redirect, redirect_function
-from rsltrace.guard.rules import AUDIT_EVENTS, C_FUNCTIONS, RULES, Rule, answers, sql_call
+from rsltrace.guard.rules import (
+    AUDIT_EVENTS,
+    C_FUNCTIONS,
+    REPORTED_MEMBERS,
+    RULES,
+    Rule,
+    answers,
+    sql_call,
+)
 from rsltrace.trace.model.finding import READ_BY, GuardMode, NondeterminismSource
 
 # -- functions that are replaced ------------------------------------------------------------------
@@ -70,7 +79,8 @@ def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
             return real(*arguments, **options)
         shown = ""
         if is_file:
-            if is_installed_path(arguments[0] if arguments else options.get("path")):
+            path = arguments[0] if arguments else options.get("path")
+            if is_installed_path(path) or is_following_links(frame):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
         text = f"{name}({shown})"
@@ -81,6 +91,43 @@ def _reporting(name: str, rule: Rule, real: Callable[..., Any]) -> Any:
         return value
 
     return call
+
+
+def _report_member(stack: ExitStack, name: str, source: NondeterminismSource) -> None:
+    """Replace a method or property of a type of a loaded module until ``stack`` ends."""
+    module, owner, member = name.rsplit(".", 2)
+    kind = getattr(sys.modules.get(module), owner, None)
+    if kind is None:
+        return
+    make = partial(_reporting_member, f"{owner}.{member}", source)
+    if member in kind.__dict__:
+        replace_member(stack, kind, member, make)
+    else:  # inherited from a type that is left alone
+        setattr(kind, member, make(getattr(kind, member)))
+        stack.callback(delattr, kind, member)
+
+
+def _reporting_member(name: str, source: NondeterminismSource, real: Any) -> Any:
+    def report(value: Any) -> Any:
+        guard = engaged()
+        if guard is not None:
+            frame: Any = sys._getframe(2)
+            of_code = source is not NondeterminismSource.ADDRESS  # which libraries use, too
+            if guard.is_user(frame) or (of_code and guard.is_user_call(frame)):
+                guard.report_user_call(source, name, value, frame, _value_text)
+        return value
+
+    if callable(real):
+
+        def call(self: Any, *arguments: Any, **options: Any) -> Any:
+            return report(real(self, *arguments, **options))
+
+        return call
+
+    def get(self: Any) -> Any:
+        return report(real.__get__(self))
+
+    return property(get, getattr(real, "__set__", None))
 
 
 def _value_text(value: Any) -> str:
@@ -130,12 +177,12 @@ _Environ: Any = type(os.environ)
 
 
 class _ReportedEnvironment(_Environ):  # type: ignore[misc]
-    """``os.environ`` during a run."""
+    """``os.environ`` and ``os.environb`` during a run."""
 
-    def __getitem__(self, name: str) -> str:
+    def __getitem__(self, name: Any) -> Any:
         guard = _guard_of(self, name)
         if guard is None:
-            return str(super().__getitem__(name))
+            return super().__getitem__(name)
         frame = caller()
         call = f"os.environ[{name!r}]"
         if guard.mode(
@@ -149,9 +196,9 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
             )
             if kept is None:
                 raise KeyError(name)
-            return str(self.decodevalue(kept))
+            return self.decodevalue(kept)
         try:
-            value = str(super().__getitem__(name))
+            value = super().__getitem__(name)
         except KeyError:
             guard.report_user_call(
                 NondeterminismSource.ENVIRONMENT, call + _reader(frame), "not set", frame
@@ -166,35 +213,46 @@ class _ReportedEnvironment(_Environ):  # type: ignore[misc]
         return value
 
     def __iter__(self) -> Iterator[str]:
-        guard = _guard_of(self)
-        if guard is not None:
-            frame = caller()
-            call = "os.environ" + _reader(frame)
-            guard.report_user_call(
-                NondeterminismSource.ENVIRONMENT, call, f"{len(self)} variables", frame
-            )
+        self._report_all(caller())
         names: Iterator[str] = super().__iter__()
         return names
 
+    def __len__(self) -> int:
+        self._report_all(caller())
+        return len(self._data)
 
-def _guard_of(environment: object, name: str = "") -> Guard | None:
-    """Return the engaged guard if the caller's read is to be reported."""
+    def __repr__(self) -> str:
+        self._report_all(caller())
+        return str(super().__repr__())
+
+    def _report_all(self, frame: FrameType) -> None:
+        guard = _guard_of(self, depth=3)
+        if guard is not None:
+            call, count = "os.environ" + _reader(frame), f"{len(self._data)} variables"
+            guard.report_user_call(NondeterminismSource.ENVIRONMENT, call, count, frame)
+
+
+def _guard_of(environment: object, name: Any = "", depth: int = 2) -> Guard | None:
+    """Return the engaged guard if a read, ``depth`` frames up, is to be reported."""
     guard = engaged()
-    if guard is None or environment is not os.environ or str(name).startswith(_NOT_READ):
+    if guard is None or not (environment is os.environ or environment is os.environb):
         return None
-    return None if _is_formatting_help(sys._getframe(2)) else guard
+    if isinstance(name, (str, bytes)) and os.fsdecode(name).startswith(_NOT_READ):
+        return None
+    return None if _is_formatting_help(sys._getframe(depth)) else guard
 
 
 @contextmanager
 def environment_watched() -> Iterator[None]:
     """Report reads of ``os.environ``."""
-    environment: Any = os.environ
-    kind = type(environment)
-    environment.__class__ = _ReportedEnvironment
+    environments: tuple[Any, ...] = (os.environ, os.environb)
+    for environment in environments:
+        environment.__class__ = _ReportedEnvironment
     try:
         yield
     finally:
-        environment.__class__ = kind
+        for environment in environments:
+            environment.__class__ = _Environ
 
 
 def _is_formatting_help(frame: FrameType | None) -> bool:
@@ -215,9 +273,9 @@ def _reader(frame: FrameType | None) -> str:
     return f"{READ_BY}{module_of(frame).partition('.')[0]}"
 
 
-def _variable_text(name: str, value: str) -> str:
+def _variable_text(name: str | bytes, value: str | bytes) -> str:
     """Return a variable's value as evidence; only a hash if it may be a secret."""
-    if _SECRET.search(name) or len(value) > 200:
+    if _SECRET.search(os.fsdecode(name)) or len(value) > 200:
         return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
     return repr(value)
 
@@ -229,6 +287,8 @@ def _variable_text(name: str, value: str) -> str:
 _HASHED_BYTES_MAX = 64 << 20
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _ADDRESSES = ("ctypes.addressof", "builtins.id")
+_SHOWING = ("__repr__", "__lt__")
+"""Methods that let addresses be seen, in texts and in the order of what is sorted (``pprint``)."""
 _is_hooked = False
 
 
@@ -240,7 +300,7 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         return
     frame: Any = caller()
     if event in _ADDRESSES:
-        if not guard.is_user(frame):
+        if not guard.is_user(frame) and code_of(frame).co_name not in _SHOWING:
             return  # libraries use id() for bookkeeping
     elif user_frame(frame, guard.packages) is None:
         return
@@ -331,11 +391,14 @@ def reported_calls() -> Iterator[None]:
     """Report calls until the block ends."""
     report_audit_events()
     with ExitStack() as stack:
-        for module in sorted(REPORTED_MODULES & sys.stdlib_module_names):
+        owners = {name.rsplit(".", 2)[0] for name in REPORTED_MEMBERS}
+        for module in sorted((REPORTED_MODULES | owners) & sys.stdlib_module_names):
             with suppress(ImportError):  # not on every system
                 importlib.import_module(module)
         for module in sorted(REPORTED_MODULES & sys.modules.keys()):
             report_functions(stack, module)
+        for name, source in REPORTED_MEMBERS.items():
+            _report_member(stack, name, source)
         redirect(stack, sqlite3.connect, _connecting)
         stack.enter_context(environment_watched())
         yield

@@ -3,24 +3,40 @@
 from __future__ import annotations
 
 import ctypes
+import datetime
 import hashlib
 import os
 import platform
+import re
 import resource
 import sys
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from contextvars import ContextVar, Token
 from functools import partial
-from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
+from types import (
+    AsyncGeneratorType,
+    BuiltinMethodType,
+    CellType,
+    CodeType,
+    CoroutineType,
+    FrameType,
+    FunctionType,
+    GeneratorType,
+    MethodWrapperType,
+)
 from typing import Any
+from weakref import CallableProxyType, ProxyType, ReferenceType
+from xml.etree.ElementTree import Element
 
 from rsltrace.guard.addresses import reported_hashes
 from rsltrace.guard.call_reports import reported_calls
 from rsltrace.guard.callers import is_never_user_code, module_of
 from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.libraries import present_import
 from rsltrace.guard.process_ids import real_id, real_path, virtual_id
 from rsltrace.guard.recorded.descriptors import recorded_descriptors
 from rsltrace.guard.recorded.files import recorded_files
@@ -28,6 +44,7 @@ from rsltrace.guard.recorded.polls import recorded_polls
 from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.redirect import redirect, replace_attribute
+from rsltrace.guard.virtual.arrays import zeroed_arrays
 from rsltrace.guard.virtual.clocks import virtual_clocks
 from rsltrace.guard.virtual.processors import virtual_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
@@ -276,29 +293,64 @@ def own_process_ids() -> Iterator[None]:
 
 
 # ``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. For the time of a run
-# ``__repr__`` of objects, functions, generators and coroutines shows a number instead of the
-# address; every type that inherits one of these looks it up by name.
+# ``__repr__`` of objects, functions, generators and others shows a number instead of the address;
+# every type that inherits one of these looks it up by name.
 
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
 )
-_SHOWN_ALIKE = (FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType)
+_SHOWING_ADDRESSES = (
+    *(object, FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType),
+    *(BuiltinMethodType, MethodWrapperType, CodeType, CellType, FrameType),
+    *(ReferenceType, ProxyType, CallableProxyType, memoryview),
+    *(ContextVar, Token, type(datetime.datetime_CAPI), Element),
+    ctypes._CFuncPtr,  # type: ignore[attr-defined]
+)
+_SHOWN_ADDRESS = re.compile(r"(?<=\bat )0x[0-9a-f]{6,}")
 
 
 def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     def __repr__(self: Any, /) -> str:  # noqa: N807
         text = real(self)
         guard = engaged()
-        if guard is None or guard.mode(NondeterminismSource.ADDRESS, caller()) is GuardMode.ALLOW:
+        if guard is None or " at 0x" not in text or present_import() is not None:
+            return text  # an import takes no numbers of a node: the next run may need none
+        frame = caller()
+        if guard.mode(NondeterminismSource.ADDRESS, frame) is GuardMode.ALLOW:
             return text
         with engage(None):
-            address = f"0x{id(self):x}"
-            return text.replace(address, _address_text(guard, self) or address)
+            for obj in _shown_by(self):
+                address = f"0x{id(obj):x}"
+                if f"at {address}" in text:
+                    text = text.replace(address, _address_text(guard, obj) or address)
+            left = next((n[0] for n in _SHOWN_ADDRESS.finditer(text) if n[0][:4] != "0x52"), None)
+        if left is not None:
+            guard.shown.reported = left
+            guard.report_user_call(
+                NondeterminismSource.ADDRESS, f"text of {type(self).__qualname__}", left, frame
+            )
+        return text
 
     # numba's jitclass rejects a class that adds a function to ``object``.
     vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
     method: Callable[[Any], str] = _as_method(__repr__)
     return method
+
+
+def _shown_by(obj: Any) -> Iterator[Any]:
+    """Yield an object and another one whose address its text has, if it has one."""
+    kind = type(obj)
+    if kind in (BuiltinMethodType, MethodWrapperType):
+        yield obj.__self__
+    elif kind is CellType:
+        yield obj
+        with suppress(ValueError):  # it is empty
+            yield obj.cell_contents
+    elif kind is ReferenceType:
+        yield obj
+        yield obj()
+    else:
+        yield obj
 
 
 def _address_text(guard: Guard, obj: Any) -> str | None:
@@ -317,8 +369,17 @@ def _address_text(guard: Guard, obj: Any) -> str | None:
 def numbered_texts() -> Iterator[None]:
     """Replace the methods that make texts with addresses."""
     with ExitStack() as stack:
-        for kind in (object, *_SHOWN_ALIKE):
+        for kind in _SHOWING_ADDRESSES:
             replace_special_method(stack, kind, "__repr__", _numbered)
+        yield
+
+
+@contextmanager
+def own_arguments() -> Iterator[None]:
+    """Hide the words of the command from nodes; programs of the job get their own."""
+    with ExitStack() as stack:
+        for name in ("argv", "orig_argv"):
+            replace_attribute(stack, sys, name, ["rsltrace"])
         yield
 
 
@@ -326,11 +387,13 @@ _REPLACEMENTS = (
     fresh_module_caches,
     virtual_clocks,
     virtual_randomness,
+    zeroed_arrays,
     sorted_listings,
     numbered_texts,
     reported_hashes,
     ordered_sets,
     own_process_ids,
+    own_arguments,
     reported_calls,
     virtual_processors,
     recorded_files,

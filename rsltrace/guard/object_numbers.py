@@ -165,6 +165,8 @@ class TextNumbers:
     def __init__(self) -> None:
         self._kept: dict[int, tuple[Callable[[], Any], int]] = {}
         self._last: Counter[str] = Counter()
+        self.reported = ""
+        """The last address that stayed in a text, which is a finding already."""
 
     def number(self, node: str, obj: Any) -> int | None:
         """Return an object's number, the node's next one if it is new.

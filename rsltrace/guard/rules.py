@@ -14,6 +14,8 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
+import numpy as np
+
 from rsltrace.trace.model.finding import MODES, GuardMode, GuardPolicy, NondeterminismSource
 
 PROCESSORS = 4
@@ -136,6 +138,9 @@ _UNSEEDED = Rule(
     "is seeded from the node's stream",
     "give it a seed, from a parameter",
     NondeterminismSource.RANDOM,
+)
+_LEFT = replace(
+    _UNSEEDED, does="shows zeros where numpy computes nothing", instead="give it out=np.zeros(…)"
 )
 _TORCH = replace(
     _UNSEEDED,
@@ -297,7 +302,7 @@ _SQL_RANDOM = replace(
 )
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"
-    r"|\brandom(?:blob)?\(",
+    r"|\bstrftime\([^(),]*\)|\brandom(?:blob)?\(",
     re.IGNORECASE,
 )
 
@@ -330,6 +335,11 @@ def _fewer_than(count: int) -> ArgumentTest:
         return not starred and len(given) + len(call.keywords) < count
 
     return test
+
+
+def _leaves_some(call: ast.Call) -> bool:
+    words = [word.arg for word in call.keywords]
+    return "where" in words and "out" not in words
 
 
 def _with_callback(call: ast.Call) -> bool:
@@ -375,6 +385,7 @@ _NUMPY_DRAWS = (
     "rayleigh standard_cauchy standard_exponential standard_gamma standard_t triangular vonmises "
     "wald weibull zipf"
 )
+_UFUNCS = " ".join(name for name, one in vars(np).items() if isinstance(one, np.ufunc))
 _SPAWNS = "spawnl spawnle spawnlp spawnlpe spawnv spawnve spawnvp spawnvpe"
 _EXECS = "execl execle execlp execlpe execv execve execvp execvpe"
 _REQUESTS = "get post put patch delete head options request Session"
@@ -391,11 +402,15 @@ RULES: dict[str, Rule] = {
     **_classes(_CLOCK, "numpy", "datetime64", when=_now_text),
     **_calls(_CPU_TIME, "os", "times", restore=os.times_result),
     **_calls(_CPU_TIME, "resource", "getrusage", restore=resource.struct_rusage),
+    **_calls(_CPU_TIME, "cProfile", "run runctx", reports=None),
+    **_classes(_CPU_TIME, "cProfile", "Profile", reports=None),
     **_calls(_SLEEP, "time", "sleep"),
     **_calls(_RANDOM, "random", _DRAWS),
     **_classes(_UNSEEDED, "random", "Random", when=is_unseeded),
+    **_classes(_UNSEEDED, "_random", "Random", when=is_unseeded),
     **_classes(_ENTROPY, "random", "SystemRandom"),
     **_calls(_RANDOM, "random", "seed", when=is_unseeded),
+    **_calls(_LEFT, "numpy", _UFUNCS, when=_leaves_some),
     **_calls(_NUMPY, "numpy.random", _NUMPY_DRAWS),
     **_calls(_NUMPY, "numpy.random", "seed", when=is_unseeded),
     **_calls(_UNSEEDED, "numpy.random", "default_rng", when=is_unseeded),
@@ -464,15 +479,22 @@ RULES: dict[str, Rule] = {
     **_calls(_LISTING, "os", "listdir scandir walk fwalk"),
     **_calls(_LISTING, "glob", "glob iglob"),
     **_calls(ENVIRONMENT, "os", "getenv getenvb"),
-    **_calls(_MACHINE, "os", "getppid getcwd getlogin getloadavg"),
+    **_calls(_MACHINE, "os", "getppid getcwd getcwdb getlogin getloadavg getpgrp nice getpriority"),
+    **_calls(_MACHINE, "os", "getuid geteuid getgid getegid getgroups isatty ttyname"),
+    **_calls(_MACHINE, "pwd", "getpwuid getpwnam getpwall", restore=None),
+    **_calls(_MACHINE, "grp", "getgrgid getgrnam getgrall", restore=None),
+    **_calls(_MACHINE, "socket", "if_nameindex"),
+    **_calls(_MACHINE, "site", "getuserbase getusersitepackages"),
     **_calls(_MACHINE, "os", "uname", restore=os.uname_result),
-    **_calls(_MACHINE, "os", "getpgid getsid", restore=None),
+    **_calls(_MACHINE, "os", "getpgid getsid umask", restore=None),
+    **_calls(_MACHINE, "resource", "getrlimit prlimit", restore=tuple),
     **_calls(_MACHINE, "os", "sysconf", when=_of_machine),
     **_calls(_MACHINE, "_thread", "get_native_id"),
     **_calls(ENVIRONMENT, "threading", "get_native_id"),
-    **_calls(_INTERPRETER, "gc", "get_stats get_objects"),
+    **_calls(_INTERPRETER, "gc", "get_stats get_objects get_referrers"),
     **_calls(_INTERPRETER, "gc", "get_count", restore=lambda answer: answer),
-    **_calls(_INTERPRETER, "sys", "getallocatedblocks"),
+    **_calls(_INTERPRETER, "tracemalloc", "get_traced_memory take_snapshot"),
+    **_calls(_INTERPRETER, "sys", "getallocatedblocks getrefcount"),
     **_calls(_PROCESSORS, "os", "process_cpu_count sched_getaffinity"),
     **_calls(
         _PROCESSORS,
@@ -494,8 +516,11 @@ RULES: dict[str, Rule] = {
         "cpu_percent cpu_times cpu_freq virtual_memory swap_memory disk_usage net_io_counters "
         "sensors_temperatures boot_time pids process_iter Process",
     ),
+    **_calls(ADDRESS, "numpy", "byte_bounds", reports=NondeterminismSource.ADDRESS),
+    **_calls(ADDRESS, "numpy.lib.array_utils", "byte_bounds", reports=NondeterminismSource.ADDRESS),
     **_calls(_FILE_TIME, "os.path", "getmtime getatime getctime"),
     **_calls(_DISK, "os", "statvfs fstatvfs"),
+    **_calls(_DISK, "os", "readlink", restore=lambda answer: answer),
     **_calls(
         LOCALE,
         "locale",
@@ -514,8 +539,34 @@ RULES: dict[str, Rule] = {
 SHARED_GENERATORS = {"random.": "random.seed", "numpy.random.": "numpy.random.seed"}
 """A module that calls the second with a seed may call the functions that begin with the first."""
 
-METHODS = {"iterdir": _LISTING, "rglob": _LISTING}
+METHODS = {"iterdir": _LISTING, "rglob": _LISTING, "inode": _FILE_TIME, "buffer_info": ADDRESS}
 """Rules for methods by their names alone, whatever object they are called on."""
+
+ATTRIBUTES = {
+    **dict.fromkeys(("__array_interface__", "__array_struct__", "ctypes.data"), ADDRESS),
+    **{
+        f"st_{name}": _FILE_TIME
+        for name in "ino mtime mtime_ns atime atime_ns ctime ctime_ns".split()
+    },
+}
+"""Rules for attributes by their last names."""
+
+REPORTED_MEMBERS: dict[str, NondeterminismSource] = {
+    "array.array.buffer_info": NondeterminismSource.ADDRESS,
+    "ctypes.c_void_p.value": NondeterminismSource.ADDRESS,
+    "ctypes.c_void_p.__repr__": NondeterminismSource.ADDRESS,
+    "numpy.ndarray.__array_interface__": NondeterminismSource.ADDRESS,
+    "numpy.generic.__array_interface__": NondeterminismSource.ADDRESS,
+    "numpy._core._internal._ctypes.data": NondeterminismSource.ADDRESS,
+    "numpy.core._internal._ctypes.data": NondeterminismSource.ADDRESS,
+    "_lsprof.Profiler.getstats": NondeterminismSource.CLOCK,
+    "io.TextIOWrapper.isatty": NondeterminismSource.ENVIRONMENT,
+    "threading.Thread.native_id": NondeterminismSource.ENVIRONMENT,
+    "os.DirEntry.stat": NondeterminismSource.FILE,
+    "os.DirEntry.inode": NondeterminismSource.FILE,
+}
+"""Methods and properties that the guard reports: addresses in user code itself, others where user
+code leads to them."""
 
 AUDIT_EVENTS: dict[str, NondeterminismSource] = {
     **dict.fromkeys(
@@ -537,18 +588,40 @@ AUDIT_EVENTS: dict[str, NondeterminismSource] = {
 """Audit events of Python that the guard reports, named as Python names them."""
 
 C_FUNCTIONS: dict[str, NondeterminismSource] = {
-    **dict.fromkeys(
-        ("time", "clock", "clock_gettime", "gettimeofday", "times", "getrusage"),
-        NondeterminismSource.CLOCK,
-    ),
-    **dict.fromkeys(
-        ("rand", "random", "getrandom", "getentropy", "arc4random", "drand48", "lrand48"),
-        NondeterminismSource.RANDOM,
-    ),
-    "getpid": NondeterminismSource.PID,
-    **dict.fromkeys(
-        ("getppid", "gettid", "getenv", "gethostname", "sched_getcpu"),
-        NondeterminismSource.ENVIRONMENT,
-    ),
+    name: source
+    for source, names in {
+        NondeterminismSource.CLOCK: (
+            "time clock clock_gettime gettimeofday timespec_get ftime times getrusage getitimer"
+        ),
+        NondeterminismSource.RANDOM: (
+            "rand random drand48 lrand48 mrand48 getrandom getentropy arc4random arc4random_buf "
+            "arc4random_uniform"
+        ),
+        NondeterminismSource.PID: "getpid",
+        NondeterminismSource.ENVIRONMENT: (
+            "getppid getpgrp gettid getenv secure_getenv environ getcwd getwd get_current_dir_name "
+            "gethostname gethostid uname sysinfo sysconf getauxval getloadavg getlogin getrlimit "
+            "sched_getcpu getcpu get_nprocs syscall"
+        ),
+        NondeterminismSource.FILE: "open open64 openat fopen fopen64 stat fstat readlink opendir",
+        NondeterminismSource.SOCKET: "socket connect recv recvfrom accept getaddrinfo",
+        NondeterminismSource.PROCESS: "system popen fork vfork posix_spawn execv execve execvp",
+        NondeterminismSource.THREAD: "pthread_create pthread_self alarm setitimer timer_create",
+        NondeterminismSource.ADDRESS: (
+            "malloc calloc realloc aligned_alloc posix_memalign mmap sbrk PyObject_Hash "
+            "_Py_HashPointer PyLong_FromVoidPtr PyCapsule_GetPointer"
+        ),
+    }.items()
+    for name in names.split()
 }
-"""Functions of the C library that the guard reports when nodes load them by ctypes or cffi."""
+"""Functions and variables of the C library and of Python that the guard reports when nodes load
+them by ctypes or cffi."""
+
+
+def c_function_rule(name: str) -> Rule | None:
+    """Return the rule for such a function, if it has one."""
+    source = C_FUNCTIONS.get(name)
+    if source is None:
+        return None
+    instead = "the function of Python's own modules, or a parameter of the node"
+    return Rule(source.value, _D, "reported as a finding", instead, source)

@@ -30,6 +30,7 @@ CALLS = [
     "os.times()",
     "random.random()",
     "random.Random()",
+    "_random.Random()",
     "random.SystemRandom().random()",
     "numpy.random.rand()",
     "numpy.random.default_rng()",
@@ -45,6 +46,8 @@ CALLS = [
     "os.environ['PATH']",
     "os.environ.get('NOTHING')",
     "os.getenv('NOTHING')",
+    "len(os.environ)",
+    "os.getcwdb()",
     "os.getpid()",
     "os.getloadavg()",
     "gc.get_objects()",
@@ -56,11 +59,18 @@ CALLS = [
     "os.system('true')",
     "socket.getaddrinfo('127.0.0.1', 80)",
     "hash(object())",
+    "sys.getrefcount(None)",
+    "numpy.zeros(3).ctypes.data",
+    "numpy.zeros(3).__array_interface__",
+    "array.array('i').buffer_info()",
+    "ctypes.CDLL(None).syscall(39)",
+    "[one.inode() for one in sorted(os.scandir('/'), key=str)]",
+    "os.lstat('/tmp').st_mtime",
     "f'{id(N)}'",
 ]
 IMPORTS = (
-    "import datetime, email.utils, gc, glob, numpy, os, pathlib, random, secrets, socket, "
-    "subprocess, threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
+    "import _random, array, ctypes, datetime, email.utils, gc, glob, numpy, os, pathlib, random, "
+    "secrets, socket, subprocess, sys, threading, time, timeit, uuid\nfrom rclpy.node import Node\n"
 )
 
 

@@ -10,7 +10,15 @@ from rsltrace.guard import rules
 from rsltrace.guard.audit.names import NameResolver
 from rsltrace.guard.audit.scopes import ModuleSource, NameScope
 from rsltrace.guard.audit.sets import is_set, order_matters
-from rsltrace.guard.rules import METHODS, RULES, SHARED_GENERATORS, Rule, sql_call
+from rsltrace.guard.rules import (
+    ATTRIBUTES,
+    METHODS,
+    RULES,
+    SHARED_GENERATORS,
+    Rule,
+    c_function_rule,
+    sql_call,
+)
 from rsltrace.trace.model.finding import EXECUTOR, NEVER_CALLED
 
 # Differences of two reads of a ROS clock in one function: 0 in a simulation.
@@ -105,6 +113,9 @@ def _called_with(module: ModuleSource, node: ast.Call, names: NameResolver) -> s
     return names.of(ast.Attribute(node.args[0], texts[1], ast.Load()), scope)
 
 
+_C_LIBRARIES = frozenset(
+    ("ctypes.CDLL", "ctypes.PyDLL", "ctypes.cdll.LoadLibrary", "ctypes.pythonapi")
+)
 _SORTERS = ("builtins.sorted", "builtins.min", "builtins.max")
 _DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 _ORDERINGS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
@@ -187,6 +198,9 @@ def _call(module: ModuleSource, node: ast.Call, names: NameResolver) -> Iterator
     if name is None:
         if isinstance(node.func, ast.Attribute):
             rule = METHODS.get(node.func.attr)
+            in_c = c_function_rule(node.func.attr)
+            if in_c is not None and names.is_made_by(node.func.value, scope, _C_LIBRARIES):
+                yield CallSite(node, f"C library: {node.func.attr}()", in_c)
             if rule is not None and not _is_order_ignored(module, node, scope, names):
                 yield CallSite(node, f"{node.func.attr}()", rule)
             if node.func.attr in ("execute", "executemany", "executescript") and node.args:
@@ -226,6 +240,8 @@ def _reference(
         return
     name = names.of(node, scope)
     if name is None:
+        if isinstance(node, ast.Attribute):
+            yield from _attribute(node)
         return
     if name == "os.environ":
         if isinstance(parent, ast.Subscript) and not isinstance(parent.ctx, ast.Load):
@@ -250,6 +266,15 @@ def _reference(
     else:
         bound = isinstance(parent, (ast.Assign, ast.AnnAssign, ast.arguments))
         yield CallSite(node, shown, rule, alias=node if bound else None)
+
+
+def _attribute(node: ast.Attribute) -> Iterator[CallSite]:
+    names = [node.attr]
+    if isinstance(node.value, ast.Attribute):
+        names.append(f"{node.value.attr}.{node.attr}")
+    for name in names:
+        if name in ATTRIBUTES:
+            yield CallSite(node, f".{name}", ATTRIBUTES[name])
 
 
 def _environ(module: ModuleSource, attribute: ast.Attribute) -> Iterator[CallSite]:

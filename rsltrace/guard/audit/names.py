@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import builtins
 from collections.abc import Iterator, Mapping
+from collections.abc import Set as AbstractSet
 
 from rsltrace.guard.audit.scopes import (
     AnnotatedName,
@@ -60,6 +61,25 @@ class NameResolver:
                 if found_name is not None:
                     return found_name
         return None
+
+    def is_made_by(
+        self, node: ast.expr, scope: NameScope, makers: AbstractSet[str], depth: int = 0
+    ) -> bool:
+        """Return whether an expression is what one of ``makers`` returns, or one of them."""
+        if isinstance(node, ast.Call):
+            return self.of(node.func, scope) in makers
+        if self.of(node, scope) in makers:
+            return True
+        bound: list[tuple[Binding, NameScope]] = []
+        if isinstance(node, ast.Name):
+            bound = list(self.bindings(node, scope))
+        elif isinstance(node, ast.Attribute) and scope.own_class and _is_self(node.value):
+            bound = [(one, scope) for one in scope.own_class.attributes.get(node.attr, [])]
+        return depth < _DEPTH_MAX and any(
+            self.is_made_by(one, scope.module.scope_of(one), makers, depth + 1)
+            for one, scope in bound
+            if isinstance(one, ast.expr)
+        )
 
     def bindings(self, node: ast.Name, scope: NameScope) -> Iterator[tuple[Binding, NameScope]]:
         """Yield what a name is bound to in the innermost scope that knows it."""

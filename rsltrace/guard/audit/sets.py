@@ -38,7 +38,7 @@ _ORDERED = {
 }
 _ORDERED_IN = ("collections.", "heapq.", "itertools.", "numpy.", "random.", "statistics.")
 """Modules whose functions iterate over their arguments."""
-_KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
+_KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist", "dump"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
 

@@ -8,6 +8,7 @@ from the node's stream, too.
 
 from __future__ import annotations
 
+import _random
 import os
 import random
 import sys
@@ -132,7 +133,6 @@ def virtual_randomness() -> Iterator[None]:
 
             _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
             _shared_numpy(stack, np.random)
-            redirect(stack, np.empty, _zeroing)
         yield
 
 
@@ -212,6 +212,19 @@ def _unseeded(stack: ExitStack) -> None:
         real(self, a, version)
 
     replace_attribute(stack, random.Random, "seed", seed)
+    replace_attribute(stack, _random, "Random", _Generator)
+
+
+class _Generator(_random.Random):
+    """The generator in C, which takes entropy in C, too, if it gets no seed."""
+
+    def __init__(self, *seed: Any) -> None:
+        """Seed, as the type does when it makes a generator or, from Python 3.11 on, here."""
+        self.seed(*seed)
+
+    def seed(self, a: Any = None, /) -> None:
+        """Seed as ``random.Random`` does without a seed."""
+        super().seed(int.from_bytes(os.urandom(32), "big") if a is None else a)
 
 
 def _uuids(stack: ExitStack) -> None:
@@ -263,24 +276,6 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
     draw = _drawing("numpy.random.seed()", real, seeding)
     for place in (module, module.mtrand):
         replace_attribute(stack, place, "seed", draw)
-
-
-def _zeroing(real: Callable[..., Any]) -> Any:
-    """``np.empty`` shows old memory; in user code it shows zeros."""
-
-    def empty(*arguments: Any, **options: Any) -> Any:
-        made = real(*arguments, **options)
-        guard = engaged()
-        if guard is not None and not made.dtype.hasobject:
-            frame = caller()
-            if (
-                guard.is_user(frame)
-                and guard.mode(NondeterminismSource.RANDOM, frame) is not GuardMode.ALLOW
-            ):
-                made.fill(0)
-        return made
-
-    return empty
 
 
 def seed_shared_generator(seed: int) -> None:

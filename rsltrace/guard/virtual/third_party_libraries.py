@@ -23,6 +23,7 @@ from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.frames import caller, replace_member
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
+from rsltrace.guard.virtual.arrays import filled
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
 from rsltrace.guard.virtual.set_order import in_set_order
 from rsltrace.guard.virtual.user_modules import rewrite
@@ -100,10 +101,15 @@ def _call(function: Any, text: str, *more: Any) -> Any:
     return function(text, *more)
 
 
+def _call_with(function: Any, *arguments: Any, **options: Any) -> Any:
+    return function(*arguments, **options)
+
+
 _PLAIN_FUNCTIONS = {
     in_set_order: _as_it_is,
     hash_method: _hash_method,
     numpy_now: _call,
+    filled: _call_with,
 }
 _known: list[object] = []
 

@@ -1,7 +1,8 @@
 """User modules, compiled with calls of the guard where Python offers no other hook.
 
-These are ``np.datetime64("now")``, the method ``__hash__`` and, from Python 3.13 on, ``[*s]`` and
-``r += s`` (``set_order`` handles all other iterations over sets). Line numbers stay.
+These are ``np.datetime64("now")``, arrays of uninitialised memory, the method ``__hash__`` and,
+from Python 3.13 on, ``[*s]`` and ``r += s`` (``set_order`` handles all other iterations over sets).
+Line numbers stay.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_rsltrace_module, is_user_file
 from rsltrace.guard.libraries import importing, is_library
+from rsltrace.guard.virtual.arrays import NEW_ARRAYS, filled
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.original_code import keep_source
 from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
@@ -27,7 +29,8 @@ from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
 _ORDERED = "__rsltrace_ordered__"
 _HASH = "__rsltrace_hash__"
 _NOW = "__rsltrace_now__"
-_WORDS = (b"datetime64", b"__hash__")
+_FILLED = "__rsltrace_filled__"
+_WORDS = (b"datetime64", b"__hash__", b"where", *map(str.encode, NEW_ARRAYS))
 """A module without these words stays unchanged (before Python 3.13)."""
 _NEVER_SETS = (
     *(ast.Constant, ast.JoinedStr, ast.Compare, ast.Lambda),
@@ -41,9 +44,14 @@ class _Rewriter(ast.NodeTransformer):
         self.generic_visit(node)
         function = node.func
         name = getattr(function, "id", None) or getattr(function, "attr", None)
+        instead = ""
         if name == "datetime64" and node.args and _says_now(node.args[0]):
+            instead = _NOW
+        elif (name in NEW_ARRAYS and node.args) or _leaves_some(node):
+            instead = _FILLED
+        if instead:
             node.args.insert(0, function)
-            node.func = ast.copy_location(ast.Name(_NOW, ast.Load()), function)
+            node.func = ast.copy_location(ast.Name(instead, ast.Load()), function)
             return ast.fix_missing_locations(node)
         return node
 
@@ -90,6 +98,11 @@ def _in_order(node: ast.expr) -> ast.expr:
 
 def _says_now(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and node.value in ("now", "today")
+
+
+def _leaves_some(call: ast.Call) -> bool:
+    """Return whether a function of numpy may leave elements as they were."""
+    return any(word.arg == "where" for word in call.keywords)
 
 
 def rewrite(tree: ast.Module) -> None:
@@ -215,6 +228,7 @@ def user_modules(
         _ORDERED: in_set_order,
         _HASH: hash_method,
         _NOW: numpy_now,
+        _FILLED: filled,
     }
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run

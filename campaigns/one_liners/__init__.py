@@ -1,0 +1,1 @@
+"""Nondeterministic one-liners, as users write them: held by the guard, or reported."""
