@@ -236,8 +236,7 @@ def _(what: DivergenceKind, of: Judgement) -> str:
 
 @says(DivergenceKind.ONLY_ZERO_DELAYS)
 def _(what: DivergenceKind, of: Judgement) -> str:
-    how = "did the same in both runs; one run adds delays of 0 ns, which have no effect"
-    return f"{_at(_one(of))} {how}"
+    return f"one run only adds delays of 0 ns, first in {_at(_one(of))}"
 
 
 @says(DivergenceKind.OTHER_SENDER)
@@ -626,10 +625,12 @@ def headline(first: Judgement, effect: Judgement | None, searched_to: int | None
     if not lead:
         return sentence_of(first)
     one = first.one
+    up_to = "" if searched_to is None or searched_to < 0 else f" up to event {searched_to}"
+    if first.what is DivergenceKind.ONLY_ZERO_DELAYS:
+        return f"{lead}; no effect{up_to}: {sentence_of(first)}"
     if searched_to is not None and one is not None:
         topics = listed([message.topic for message in first.messages if not message.is_input])
         where = f"on {topics}" if topics else f"on the state of {one.node}"
-        up_to = "" if searched_to < 0 else f" up to event {searched_to}"
         return f"{lead}; no effect{up_to} except {where}, by {phrase(one)}"
     return f"{lead}; first effect: {effect_text(first)}"
 

@@ -1,0 +1,95 @@
+"""Headlines for changes a robot engineer makes: they name the node, what changed and both values."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+import rsltrace
+from rsltrace.diff.result import Diff
+
+pytestmark = pytest.mark.ros
+
+SOURCE = """
+import time
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+class Source(Node):
+    def __init__(self):
+        super().__init__("source")
+        self.declare_parameter("gain", 1)
+        self.count = 0
+        self.out = self.create_publisher(UInt64, "/signal", 5)
+        self.timer = self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.count += self.get_parameter("gain").value
+        self.out.publish(UInt64(data=self.count))
+"""
+SINK = """
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import UInt64
+
+class Sink(Node):
+    def __init__(self):
+        super().__init__("sink")
+        self.out = self.create_publisher(UInt64, "/heard", 5)
+        best_effort = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
+        self.create_subscription(UInt64, "/signal", self.heard, best_effort)
+
+    def heard(self, message):
+        self.out.publish(message)
+"""
+JOB = """
+nodes:
+  - node: headline_source:Source
+  - node: headline_sink:Sink
+stop: {duration: 2s}
+"""
+FILES = {"headline_source.py": SOURCE, "headline_sink.py": SINK, "job.yaml": JOB}
+
+
+def recorded(folder: Path, name: str, *changes: tuple[str, str]) -> Path:
+    """Record the job with texts of its files replaced."""
+    from rsltrace.run import run
+
+    files = "\0".join(FILES.values())
+    for old, new in changes:
+        assert old in files
+        files = files.replace(old, new)
+    for file, text in zip(FILES, files.split("\0"), strict=True):
+        (folder / file).write_text(text)
+    importlib.invalidate_caches()
+    run(rsltrace.load_job(folder / "job.yaml"), folder / name, force=True)
+    return folder / name
+
+
+def both_ways(a: Path, b: Path) -> tuple[Diff, Diff]:
+    return rsltrace.diff(a, b, window=10), rsltrace.diff(b, a, window=10)
+
+
+STOP = "stop: {duration: 2s}"
+OUTAGE = "delay: {{outages: [{{topic: /signal, from: {}s, to: {}s}}]}}\n"
+
+
+def test_outage_after_many_delays_of_zero(tmp_path: Path) -> None:
+    """The draws of 0 ns before the outage are no effect, however many they are."""
+    a = recorded(tmp_path, "a.mcap")
+    b = recorded(tmp_path, "b.mcap", (STOP, OUTAGE.format(1.65, 1.85) + STOP))
+    for found in both_ways(a, b):
+        assert "first effect: timer Source.tick of /source at 1.7 s" in found.sentence
+        assert "lost in an outage" in found.sentence
+        assert any("from event 2 on, one run adds delays of 0 ns" in note for note in found.notes)
+
+
+def test_outage_after_the_end(tmp_path: Path) -> None:
+    a = recorded(tmp_path, "a.mcap")
+    b = recorded(tmp_path, "b.mcap", (STOP, OUTAGE.format(5, 6) + STOP))
+    for found in both_ways(a, b):
+        assert "; no effect: one run only adds delays of 0 ns, first in timer" in found.sentence
