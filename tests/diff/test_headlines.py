@@ -1,4 +1,4 @@
-"""Headlines for changes a robot engineer makes: they name the node, what changed and both values."""
+"""Headlines for changes a robot engineer makes: the node, what changed, both values."""
 
 from __future__ import annotations
 

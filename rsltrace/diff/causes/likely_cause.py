@@ -19,6 +19,7 @@ from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
+    DivergenceKind,
     ExternalAnswers,
     Judgement,
     LikelyCause,
@@ -72,7 +73,9 @@ def likely_cause(
         return found
     if judgement.verdict in _OF_ORDER and judgement.changed is None:
         nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
-        changed = entity_changes(run_a, run_b, topics_of(view, judgement.messages), nodes - {""})
+        topics = topics_of(view, judgement.messages)
+        with_depth = judgement.what is DivergenceKind.OTHER_SENDER
+        changed = entity_changes(run_a, run_b, topics, nodes - {""}, with_depth=with_depth)
         if changed is not None:
             return changed
     return unrecorded_answer(run, view) if judgement.is_unexplained else None

@@ -89,10 +89,12 @@ class UnfinishedCall(Fact):
 
 @dataclass(frozen=True, slots=True)
 class QueueOverflow(Fact):
-    """The queue of a subscription was full in ``run``."""
+    """The queue of a subscription was full in ``run``, where it has a ``depth`` that the other
+    run may not have."""
 
     depth: int
     run: str
+    depths: tuple[int | None, int | None] = (None, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -178,8 +178,8 @@ class DifferentJobs(Fact):
 @dataclass(frozen=True, slots=True)
 class RunsDiverge(Fact):
     """See the divergences. ``searched_to`` is the event up to which no effect of another set-up, or
-    of delays of 0 ns, was found (-1: to the end), None if none was looked for, or one was found. ``foreign`` are the names
-    of the jobs where the runs have no node in common."""
+    of delays of 0 ns, was found (-1: to the end), None if none was looked for, or one was found.
+    ``foreign`` are the names of the jobs where the runs have no node in common."""
 
     searched_to: int | None = None
     foreign: tuple[str, ...] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
@@ -39,6 +40,7 @@ from rsltrace.diff.facts.evidence import (
     CallDifference,
     EntityChange,
     EntityChanges,
+    EntityProperty,
     EventSummary,
     MessageDifference,
     Presence,
@@ -368,11 +370,27 @@ def _(what: EarlierEnd, of: Judgement) -> str:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-def _change_text(change: EntityChange) -> str:
-    entity = change.entity
+@says(EntityChanges)
+def _(fact: EntityChanges, of: object) -> str:
+    alike: dict[EntityChange, list[str]] = {}
+    for change in fact.changes:
+        node = replace(change.entity, kind="", name="", type="", ordinal=0)
+        named = f"{change.entity.kind} {printable(change.entity.name)}"
+        alike.setdefault(replace(change, entity=node), []).append(named)
+    return joined([_change_text(change, joined(names)) for change, names in alike.items()])
+
+
+def _change_text(change: EntityChange, names: str) -> str:
     values = ", ".join(_property_text(*value) for value in change.values)
-    made = f"{entity.node} created {entity.kind} {printable(entity.name)}"
-    return f"{made} with a different {change.property.value}: {values}"
+    made = f"{change.entity.node} created {names}"
+    text = f"{made} with a different {change.property.value}: {values}"
+    if not change.peers:
+        return text
+    if change.property is EntityProperty.QOS:
+        peers = joined([f"the {peer.kind} of {peer.node}" for peer in change.peers])
+        return f"{text}, which in {change.run} does not match {peers}"
+    peers = joined([f"{peer.kind} {printable(peer.name)}" for peer in change.peers])
+    return f"{text}, in {change.run} that of {peers}"
 
 
 def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
@@ -386,10 +404,17 @@ def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
 def _policy(name: str, value: str | int | None) -> str:
     if value is None:  # a trace has only what is no default
         return "automatic" if name == "liveliness" else "none"
-    return format_duration(value) if isinstance(value, int) else value
+    return format_duration(value) if isinstance(value, int) and name.endswith("_ns") else f"{value}"
 
 
 # -- what became of a message ----------------------------------------------------------------------
+
+
+@says(QueueOverflow)
+def _(loss: QueueOverflow, of: object) -> str:
+    a, b = loss.depths
+    depth = f"{loss.depth}" if a is None or b is None or a == b else f"{a} → {b}"
+    return f"its queue (depth {depth}) overflowed in {loss.run}"
 
 
 @says(UnfinishedCall)
@@ -705,8 +730,6 @@ SENTENCES.update(
         DifferentInput: lambda fact, of: (
             f"{_at(_one(of))} received a different {fact.topic or 'input'}"
         ),
-        EntityChanges: lambda fact, of: joined([_change_text(change) for change in fact.changes]),
-        QueueOverflow: lambda fact, of: f"its queue (depth {fact.depth}) overflowed in {fact.run}",
         NoMoreMessages: lambda fact, of: f"it receives nothing more in {fact.run}",
         CauseKind.ONLY_IN_ONE_BAG: lambda fact, of: (
             because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
