@@ -93,3 +93,48 @@ def test_outage_after_the_end(tmp_path: Path) -> None:
     b = recorded(tmp_path, "b.mcap", (STOP, OUTAGE.format(5, 6) + STOP))
     for found in both_ways(a, b):
         assert "; no effect: one run only adds delays of 0 ns, first in timer" in found.sentence
+
+
+CAMERA = """
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.lifecycle import LifecycleNode
+from rclpy.node import Node
+
+class Camera(LifecycleNode):
+    def __init__(self):
+        super().__init__("camera")
+
+    def on_configure(self, state):
+        self.calibrate()
+        return super().on_configure(state)
+
+    def calibrate(self):
+        pass
+
+class Manager(Node):
+    def __init__(self):
+        super().__init__("manager")
+        self.client = self.create_client(ChangeState, "/camera/change_state")
+        self.timer = self.create_timer(0.5, self.tick)
+
+    def tick(self):
+        self.timer.cancel()
+        configure = Transition(id=Transition.TRANSITION_CONFIGURE)
+        self.client.call_async(ChangeState.Request(transition=configure))
+"""
+MANAGED = "  - node: headline_camera:Camera\n  - node: headline_camera:Manager\n"
+
+
+def test_exception_that_rclpy_suppresses(tmp_path: Path) -> None:
+    (tmp_path / "headline_camera.py").write_text(CAMERA)
+    a = recorded(tmp_path, "a.mcap", (STOP, MANAGED + STOP))
+    (tmp_path / "headline_camera.py").write_text(CAMERA.replace("pass", 'raise KeyError("lens")'))
+    b = recorded(tmp_path, "b.mcap", (STOP, MANAGED + STOP))
+    line = CAMERA.splitlines().index("        pass") + 1
+    for found, run in zip(both_ways(a, b), "ba", strict=True):
+        raised = f"raised KeyError: 'lens' at headline_camera.py:{line} only in {run}"
+        told = f"Camera.on_configure of /camera {raised}; rclpy suppressed it"
+        assert f"likely cause: {told}" in found.sentence
+        cause = found.divergences[0].root_sentence
+        assert cause.startswith(f"{told}; no earlier event differs, but the runs had different")

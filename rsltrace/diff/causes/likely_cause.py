@@ -6,6 +6,7 @@ import ast
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 
 from rsltrace.diff.alignment.rows import ComparedTrace
@@ -20,6 +21,7 @@ from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
     DivergenceKind,
+    ErrorInTransition,
     ExternalAnswers,
     Judgement,
     LikelyCause,
@@ -35,7 +37,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.errors import JobError
 from rsltrace.trace.format import METADATA_SOURCES
-from rsltrace.trace.model.finding import NondeterminismSource
+from rsltrace.trace.model.finding import NondeterminismSource, decode_suppressed
 from rsltrace.trace.words.code import code_file, code_place
 
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
@@ -57,14 +59,17 @@ def likely_cause(
     calls: Sequence[CallDifference],
     relevance: Relevance,
 ) -> LikelyCause | None:
-    """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
-    shows, entities with other properties. Else an unrecorded answer.
+    """Return what explains a root: an exception that rclpy suppressed, the first of ``calls`` if
+    its answers differ, a set whose order shows, entities with other properties. Else an unrecorded
+    answer.
     """
     run_a, run_b = runs
     run = run_b if judgement.a is None else run_a
     view = judgement.one
     if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
         return None
+    if (suppressed := _suppressed_exception(judgement, runs)) is not None:
+        return suppressed
     if calls and calls[0].differs:
         changed = judgement.changed
         subject = subject_of(view) if changed is None else changed.node
@@ -79,6 +84,24 @@ def likely_cause(
         if changed is not None:
             return changed
     return unrecorded_answer(run, view) if judgement.is_unexplained else None
+
+
+def _suppressed_exception(
+    judgement: Judgement, runs: tuple[ComparedTrace, ComparedTrace]
+) -> ErrorInTransition | None:
+    """Return the first exception of a lifecycle callback that only one of two events has."""
+    in_a, in_b = (
+        [one for one in decode_suppressed(run.trace.result) if one.event == event.index]
+        if event is not None and run.trace.complete
+        else []
+        for run, event in zip(runs, (judgement.a, judgement.b), strict=True)
+    )
+    for a, b in zip_longest(in_a, in_b):
+        one = a or b
+        error_a, error_b = (None if each is None else each.error for each in (a, b))
+        if one is not None and error_a != error_b:
+            return ErrorInTransition(one.node, one.callback, one.place, error_a, error_b)
+    return None
 
 
 def telling_calls(

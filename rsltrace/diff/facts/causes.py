@@ -354,6 +354,18 @@ class SetOrder(Fact):
 
 
 @dataclass(frozen=True, slots=True)
+class ErrorInTransition(Fact):
+    """A lifecycle callback raised what rclpy suppressed: ``a`` and ``b`` are the exceptions, None
+    where a run has none."""
+
+    node: str
+    callback: str
+    place: str
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
     """An unrecorded external answer: a possible cause. ``source`` is the key of
     ``guard:`` that keeps it."""
@@ -363,7 +375,7 @@ class UnrecordedAnswer(Fact):
     source: str
 
 
-LikelyCause = ExternalAnswers | SetOrder | UnrecordedAnswer | EntityChanges
+LikelyCause = ExternalAnswers | SetOrder | ErrorInTransition | UnrecordedAnswer | EntityChanges
 
 
 @dataclass(frozen=True, slots=True)

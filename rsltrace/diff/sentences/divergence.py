@@ -17,6 +17,7 @@ from rsltrace.diff.facts.causes import (
     DifferentTime,
     DivergenceKind,
     EarlierEnd,
+    ErrorInTransition,
     EventInOneRun,
     ExceptionInOneRun,
     ExternalAnswers,
@@ -434,6 +435,8 @@ def cause_of(of: Judgement) -> str:
     if isinstance(of.likely, UnrecordedAnswer):
         how = f"set guard: {{{of.likely.source}: record}} in the job"
         text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
+    elif isinstance(of.likely, ErrorInTransition):
+        text = f"{sentence(of.likely)}; {text}"
     elif of.likely is not None:
         because = because_of(of.settings)
         text = f"{sentence(of.likely)}; and {because}" if because else sentence(of.likely)
@@ -615,6 +618,15 @@ def call_text(call: CallDifference) -> str:
     if call.a is None or call.b is None:
         return f"{done} only in {'b' if call.a is None else 'a'} at {place}"
     return f"{done} ({call.short[0]} in a, {call.short[1]} in b) at {place}"
+
+
+@says(ErrorInTransition)
+def _(cause: ErrorInTransition, of: object) -> str:
+    raised = f"{cause.callback} of {cause.node} raised"
+    if cause.a is not None and cause.b is not None:
+        return f"{raised} {cause.a} in a, {cause.b} in b, at {cause.place}, which rclpy suppressed"
+    where = "a" if cause.b is None else "b"
+    return f"{raised} {cause.a or cause.b} at {cause.place} only in {where}; rclpy suppressed it"
 
 
 @says(SetOrder)
