@@ -138,3 +138,47 @@ def test_exception_that_rclpy_suppresses(tmp_path: Path) -> None:
         assert f"likely cause: {told}" in found.sentence
         cause = found.divergences[0].root_sentence
         assert cause.startswith(f"{told}; no earlier event differs, but the runs had different")
+
+
+def test_call_that_no_guard_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With guard: false, the call in the callback is named, and the command that lists all."""
+    monkeypatch.chdir(tmp_path)
+    timed = ("data=self.count", "data=time.time_ns()")
+    off = (STOP, "guard: false\n" + STOP)
+    a, b = (recorded(tmp_path, f"{name}.mcap", timed, off) for name in "ab")
+    line = SOURCE.splitlines().index("        self.out.publish(UInt64(data=self.count))") + 1
+    call = f"time.time_ns() at headline_source.py:{line}"
+    for found in both_ways(a, b):
+        assert f"; possible cause: {call}, which guard: false lets differ" in found.sentence
+        assert f"; a possible cause is {call}" in found.divergences[0].root_sentence
+        assert found.divergences[0].next_step == "rsltrace audit headline_source.py"
+
+
+LATCHED = (
+    (
+        "import time\n",
+        "import time\nfrom rclpy.qos import QoSProfile, DurabilityPolicy\n",
+    ),
+    (
+        '        self.out = self.create_publisher(UInt64, "/signal", 5)\n        self.timer',
+        """        latched = QoSProfile(depth=3, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.out = self.create_publisher(UInt64, "/signal", latched)
+        for number in range(3): self.out.publish(UInt64(data=EACH))
+        self.timer""",
+    ),
+    (
+        "reliability=ReliabilityPolicy.BEST_EFFORT)",
+        "durability=DurabilityPolicy.TRANSIENT_LOCAL)",
+    ),
+    ("QoSProfile, ReliabilityPolicy", "QoSProfile, DurabilityPolicy"),
+)
+
+
+@pytest.mark.parametrize("each", ["number", "7"])
+def test_depth_of_a_history(each: str, tmp_path: Path) -> None:
+    latched = (*LATCHED, ("EACH", each))
+    a = recorded(tmp_path, "a.mcap", *latched)
+    b = recorded(tmp_path, "b.mcap", *latched, ("depth=3", "depth=1"))
+    for found, depths in zip(both_ways(a, b), ("3 → 1", "1 → 3"), strict=True):
+        created = "/source created publisher /signal with a different QoS"
+        assert f"likely cause: {created}: depth {depths}" in found.sentence

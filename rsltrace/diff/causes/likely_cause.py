@@ -22,11 +22,13 @@ from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
     DivergenceKind,
     ErrorInTransition,
+    EventInOneRun,
     ExternalAnswers,
     Judgement,
     LikelyCause,
     Root,
     SetOrder,
+    UnguardedCall,
     Verdict,
 )
 from rsltrace.diff.facts.evidence import (
@@ -79,11 +81,17 @@ def likely_cause(
     if judgement.verdict in _OF_ORDER and judgement.changed is None:
         nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
         topics = topics_of(view, judgement.messages)
-        with_depth = judgement.what is DivergenceKind.OTHER_SENDER
+        what = judgement.what  # a history of another depth: other messages are kept for later
+        lost = isinstance(what, EventInOneRun) and what.loss is None
+        with_depth = lost or what is DivergenceKind.OTHER_SENDER
         changed = entity_changes(run_a, run_b, topics, nodes - {""}, with_depth=with_depth)
         if changed is not None:
             return changed
-    return unrecorded_answer(run, view) if judgement.is_unexplained else None
+    if not judgement.is_unexplained:
+        return None
+    if relevance.guard_is_off:
+        return _unguarded_call(run, view)
+    return unrecorded_answer(run, view)
 
 
 def _suppressed_exception(
@@ -149,15 +157,21 @@ def _set_behind(
             return SetOrder(call.call, call.where.partition(" in ")[0])
     if relevance.sets_are_in_order:
         return None
-    place = code_place(run.trace, run.trace.event(view.index))
-    found = code_file(run.trace, place)
-    if found is None or not _is_as_recorded(run, found[0]):
+    calls_there = _audited_calls(run, view, of_sets=True)
+    if calls_there is None:
         return None
-    lines = _lines_with_sets(*found)
-    if not lines:
+    (_, place, what), *more = calls_there
+    return SetOrder(what, place, len(more))
+
+
+def _unguarded_call(run: ComparedTrace, view: EventSummary) -> UnguardedCall | None:
+    """Return the first call in the code of an event whose answer a run without a guard takes from
+    outside; None if there is none, or the code is not here."""
+    found = _audited_calls(run, view, of_sets=False)
+    if found is None:
         return None
-    file = place.rpartition(":")[0]
-    return SetOrder(lines[0][1], f"{file}:{lines[0][0]}", len(lines) - 1)
+    (file, place, call), *more = found
+    return UnguardedCall(call, place, file, len(more))
 
 
 def _is_reordered(message: MessageDifference) -> bool:
@@ -172,15 +186,30 @@ def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
     return present in run.trace.metadata(METADATA_SOURCES).values()
 
 
-def _lines_with_sets(file: Path, line: int) -> list[tuple[int, str]]:
-    """Return where a file goes through sets: in the function at a line, or else anywhere."""
+def _audited_calls(
+    run: ComparedTrace, view: EventSummary, *, of_sets: bool
+) -> list[tuple[str, str, str]] | None:
+    """Return what an audit finds in the code of an event: file, place and call; None for nothing,
+    or if the code is not here as it was recorded."""
+    place = code_place(run.trace, run.trace.event(view.index))
+    found = code_file(run.trace, place)
+    if found is None or not _is_as_recorded(run, found[0]):
+        return None
+    module = place.rpartition(":")[0]
+    lines = _audited_lines(*found, of_sets=of_sets)
+    return [(str(found[0]), f"{module}:{line}", call) for line, call in lines] or None
+
+
+def _audited_lines(file: Path, line: int, *, of_sets: bool) -> list[tuple[int, str]]:
+    """Return where a file goes through sets, or calls something nondeterministic: in the function
+    at a line, or else anywhere."""
     from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
         found = [
             (o.line, o.call)
             for o in audit_path(file).found
-            if o.kind == NondeterminismSource.ORDER.value
+            if (o.kind == NondeterminismSource.ORDER.value) is of_sets
         ]
         tree = ast.parse(file.read_bytes())
     except (JobError, OSError, SyntaxError, ValueError):

@@ -375,7 +375,19 @@ class UnrecordedAnswer(Fact):
     source: str
 
 
-LikelyCause = ExternalAnswers | SetOrder | ErrorInTransition | UnrecordedAnswer | EntityChanges
+@dataclass(frozen=True, slots=True)
+class UnguardedCall(Fact):
+    """A call in the code that ran, which no guard watched: a possible cause. ``file`` has it, and
+    ``more`` such calls."""
+
+    call: str
+    place: str
+    file: str
+    more: int = 0
+
+
+PossibleCause = UnrecordedAnswer | UnguardedCall
+LikelyCause = ExternalAnswers | SetOrder | ErrorInTransition | EntityChanges | PossibleCause
 
 
 @dataclass(frozen=True, slots=True)

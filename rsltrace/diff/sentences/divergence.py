@@ -27,12 +27,14 @@ from rsltrace.diff.facts.causes import (
     NoMoreMessages,
     NotDelivered,
     ParameterFiles,
+    PossibleCause,
     QueueOverflow,
     RunEnd,
     SameCause,
     SetOrder,
     SleepTimes,
     UnfinishedCall,
+    UnguardedCall,
     UnrecordedAnswer,
     Verdict,
     WaitInOneRun,
@@ -120,6 +122,8 @@ def sentence_of(of: Judgement) -> str:
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
+    if isinstance(of.likely, UnguardedCall):
+        return f"{text}; possible cause: {sentence(of.likely)}, which guard: false lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
@@ -435,6 +439,9 @@ def cause_of(of: Judgement) -> str:
     if isinstance(of.likely, UnrecordedAnswer):
         how = f"set guard: {{{of.likely.source}: record}} in the job"
         text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
+    elif isinstance(of.likely, UnguardedCall):
+        more = f" and {of.likely.more} more calls" if of.likely.more else ""
+        text = f"{text}; a possible cause is {sentence(of.likely)}{more}"
     elif isinstance(of.likely, ErrorInTransition):
         text = f"{sentence(of.likely)}; {text}"
     elif of.likely is not None:
@@ -656,7 +663,7 @@ def headline(first: Judgement, effect: Judgement | None, searched_to: int | None
     set_up = effect is not None or searched_to is not None
     lead = _lead(tuple(dict.fromkeys(settings)), set_up=set_up)
     if effect is not None:
-        known = first.likely is not None and not isinstance(first.likely, UnrecordedAnswer)
+        known = first.likely is not None and not isinstance(first.likely, PossibleCause)
         lead = lead or (sentence(first.likely) if known else sentence_of(first))
         return f"{lead}; first effect: {effect_text(effect)}"
     if not lead:
@@ -767,6 +774,7 @@ SENTENCES.update(
             f"it follows from an earlier difference: {sentence(fact.root.what, fact.root)}"
         ),
         SameCause: lambda fact, of: cause_of(fact.first),
+        UnguardedCall: lambda fact, of: f"{fact.call} at {fact.place}",
         UnrecordedAnswer: lambda fact, of: f"the result of {fact.call} at {fact.place}",
     }
 )
