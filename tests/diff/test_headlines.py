@@ -182,3 +182,41 @@ def test_depth_of_a_history(each: str, tmp_path: Path) -> None:
     for found, depths in zip(both_ways(a, b), ("3 → 1", "1 → 3"), strict=True):
         created = "/source created publisher /signal with a different QoS"
         assert f"likely cause: {created}: depth {depths}" in found.sentence
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('"gain", 1)', '"gain", 3)', "parameter gain of /source 1 → 3"),
+        (
+            '"gain", 1)',
+            '"gain", 1)\n        self.declare_parameter("more", 2.5)',
+            "more of /source 2.5",
+        ),
+        (
+            '"gain", 1)',
+            '"gain", 1)\n        self.declare_parameter("more", [2.5, 1.0])',
+            "more of /source [2.5, 1.0]",
+        ),
+    ],
+)
+def test_default_of_a_parameter(old: str, new: str, told: str, tmp_path: Path) -> None:
+    a = recorded(tmp_path, "a.mcap")
+    b = recorded(tmp_path, "b.mcap", (f'"gain", {old}', f'"gain", {new}'))
+    found, _ = both_ways(a, b)
+    assert told in found.sentence
+    assert "(code of module headline_source)" in found.sentence
+
+
+def test_timeout_of_a_call(tmp_path: Path) -> None:
+    """A callback that wakes up at the same time in both runs and sleeps again in one."""
+    waits = "self.client.wait_for_service(timeout_sec=1.0)"
+    client = (
+        ("time\n", "time\nfrom std_srvs.srv import Trigger\n"),
+        ("        self.count = 0", '        self.client = self.create_client(Trigger, "/ask")'),
+        ("        self.count += ", f"        {waits}\n        self.count = "),
+    )
+    a = recorded(tmp_path, "a.mcap", *client)
+    b = recorded(tmp_path, "b.mcap", *client, ("timeout_sec=1.0", "timeout_sec=0.2"))
+    for found, run in zip(both_ways(a, b), "ab", strict=True):
+        assert f" slept 250 ms in {run} but not in " in found.sentence

@@ -234,14 +234,16 @@ def slept(
     as long in both, or if they did not."""
     if a is None or b is None or a.kind is not b.kind:
         return None
-    in_a, in_b = _slept_ns(run_a, a), _slept_ns(run_b, b)
+    woke = a.kind is EventKind.RESUME and a.cause_event == b.cause_event == NO_EVENT
+    back = woke and a.stamp_ns != b.stamp_ns
+    in_a, in_b = _slept_ns(run_a, a, back=back), _slept_ns(run_b, b, back=back)
     return None if in_a == in_b else SleepTimes(in_a, in_b)
 
 
-def _slept_ns(run: ComparedTrace, view: EventSummary) -> int | None:
-    """Return how long a callback slept after an event, or before one that resumed it."""
+def _slept_ns(run: ComparedTrace, view: EventSummary, *, back: bool) -> int | None:
+    """Return how long a callback slept after an event, or before one that resumed it (``back``)."""
     number = run.matching.by_key[view.entity]
-    if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
+    if back:
         rows = load_rows(run, max(view.index - _LOOKED_AT_MAX, 0), view.index)
         for place in reversed(range(len(rows))):
             if rows.number[place] == number:

@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import islice, pairwise
 
+import numpy as np
+
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import (
     TIMER,
@@ -95,6 +97,8 @@ _LOOKED_AT_MAX = 1000
 
 _PARAMETERS_MAX = 3
 _VALUES = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}
+_ARRAYS = {6: "bool_array_value", 7: "integer_array_value", 8: "double_array_value"}
+_ARRAYS |= {5: "byte_array_value", 9: "string_array_value"}
 """The field of a ``ParameterValue`` by its type."""
 
 _SENT = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
@@ -362,10 +366,14 @@ def _parameters(event: object) -> dict[str, str]:
     for name in ("new_parameters", "changed_parameters"):
         for parameter in getattr(event, name, ()):
             value = getattr(parameter, "value", None)
-            field = _VALUES.get(getattr(value, "type", 0))
-            if field is not None:
-                text = printable(str(getattr(value, field, "")))
-                found[printable(str(parameter.name))] = text
+            kind = getattr(value, "type", 0)
+            if kind in _VALUES:
+                text = str(getattr(value, _VALUES[kind], ""))
+            elif kind in _ARRAYS:
+                text = str(np.asarray(getattr(value, _ARRAYS[kind], ())).tolist())
+            else:
+                continue
+            found[printable(str(parameter.name))] = printable(text)
     return found
 
 

@@ -46,6 +46,8 @@ from rsltrace.diff.facts.evidence import (
     EntityProperty,
     EventSummary,
     MessageDifference,
+    ParameterChanges,
+    ParameterValues,
     Presence,
     Setting,
     SettingKind,
@@ -661,7 +663,7 @@ def headline(first: Judgement, effect: Judgement | None, searched_to: int | None
     """
     settings = (*(effect.settings if effect is not None else ()), *first.settings)
     set_up = effect is not None or searched_to is not None
-    lead = _lead(tuple(dict.fromkeys(settings)), set_up=set_up)
+    lead = _lead(tuple(dict.fromkeys(settings)), first if set_up else None)
     if effect is not None:
         known = first.likely is not None and not isinstance(first.likely, PossibleCause)
         lead = lead or (sentence(first.likely) if known else sentence_of(first))
@@ -714,14 +716,34 @@ def _done(message: MessageDifference) -> str:
     return f"{verb} {message.topic} with a different {other}"
 
 
-def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
+def _lead(settings: Sequence[Setting], constructor: Judgement | None) -> str:
     """Return the keys of the job that can be the cause, with their lines; for a constructor,
-    the code, too."""
+    the code, too, with the parameters that differ."""
     of_job = [_setting(setting) for setting in settings if setting.key]
-    if not of_job and set_up:
-        code = (setting for setting in settings if setting.kind is SettingKind.CODE)
-        of_job = [f"the {setting.place} differs" for setting in code]
-    return listed(of_job)
+    if of_job or constructor is None:
+        return listed(of_job)
+    code = [setting.place for setting in settings if setting.kind is SettingKind.CODE]
+    parameters = _parameters(constructor)
+    if code and parameters:
+        return f"{listed(parameters)} ({listed(code)})"
+    return listed([f"the {place} differs" for place in code])
+
+
+def _parameters(constructor: Judgement) -> list[str]:
+    """Return the parameters that a constructor set to another value, with the values."""
+    node = _one(constructor).node
+    found = []
+    for message in constructor.messages:
+        if isinstance(message.fate, ParameterChanges):
+            changed = message.fate.values
+            found += [f"parameter {name} of {node} {pair_text(a, b)}" for name, a, b in changed]
+        elif isinstance(message.fate, ParameterValues) and message.presence in IN_ONE:
+            where = IN_ONE[message.presence]
+            found += [
+                f"parameter {name} of {node} {shortened(value, _VALUE_MAX)} {where}"
+                for name, value in message.fate.values
+            ]
+    return found
 
 
 def _setting(setting: Setting) -> str:
