@@ -187,17 +187,9 @@ def test_depth_of_a_history(each: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [
-        ('"gain", 1)', '"gain", 3)', "parameter gain of /source 1 → 3"),
-        (
-            '"gain", 1)',
-            '"gain", 1)\n        self.declare_parameter("more", 2.5)',
-            "more of /source 2.5",
-        ),
-        (
-            '"gain", 1)',
-            '"gain", 1)\n        self.declare_parameter("more", [2.5, 1.0])',
-            "more of /source [2.5, 1.0]",
-        ),
+        ("1)", "3)", "parameter gain of /source 1 → 3"),
+        ("1)", '1)\n        self.declare_parameter("more", 2.5)', "more of /source 2.5 only"),
+        ("1)", '1)\n        self.declare_parameter("more", [2.5])', "more of /source [2.5] only"),
     ],
 )
 def test_default_of_a_parameter(old: str, new: str, told: str, tmp_path: Path) -> None:
