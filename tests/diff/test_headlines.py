@@ -212,3 +212,15 @@ def test_timeout_of_a_call(tmp_path: Path) -> None:
     b = recorded(tmp_path, "b.mcap", *client, ("timeout_sec=1.0", "timeout_sec=0.2"))
     for found, run in zip(both_ways(a, b), "ab", strict=True):
         assert f" slept 250 ms in {run} but not in " in found.sentence
+
+
+def test_delays_that_differ_in_the_seventh_digit(tmp_path: Path) -> None:
+    """In the setting, in the draw and in the report's table."""
+    delay = "delay: {{topics: {{/signal: {}}}}}\n"
+    a = recorded(tmp_path, "a.mcap", (STOP, delay.format("100ms") + STOP))
+    b = recorded(tmp_path, "b.mcap", (STOP, delay.format("100.0001ms") + STOP))
+    found, _ = both_ways(a, b)
+    assert "100 ms → 100.0001 ms (job.yaml:5)" in found.sentence
+    assert "delay 100 ms in a, delay 100.0001 ms in b" in found.sentence
+    (draw,) = found.divergences[0].messages[0].fields
+    assert (draw.a, draw.b) == ("delay 100 ms", "delay 100.0001 ms")

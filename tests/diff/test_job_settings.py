@@ -95,7 +95,7 @@ def test_what_may_be_one_file_comes_last(tmp_path: Path) -> None:
         ),
         (
             "stop.duration=20.000000001s",
-            {"robot.yaml:10: stop.duration": ("20000000000", "20000000001")},
+            {"robot.yaml:10: stop.duration": ("20 s", "20.000000001 s")},
         ),
         (
             "nodes.ekf.parameters.frame='50.0'",

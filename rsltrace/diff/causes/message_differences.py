@@ -53,7 +53,7 @@ from rsltrace.trace.model.event import (
     decision_text,
 )
 from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import contrasting, printable, shortened
 from rsltrace.trace.words.code import output_places, relative_place
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
@@ -196,7 +196,7 @@ class _MessageComparison:
         if moved or kind == OutputKind.ENTITY:
             return base
         if kind == OutputKind.DRAW:
-            text_a, text_b = (decision_text(output[2]) if output else "none" for output in (a, b))
+            text_a, text_b = contrasting(a and a[2], b and b[2], _decision)
             return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
         values: list[object] = []
         for run, output in ((self._run_a, a), (self._run_b, b)):
@@ -249,6 +249,10 @@ class _MessageComparison:
 
 
 _NOT_RECORDED = (NoFieldsReason.NOT_RECORDED_IN_A, NoFieldsReason.NOT_RECORDED_IN_B)
+
+
+def _decision(number: int | None, digits: int) -> str:
+    return "none" if number is None else decision_text(number, digits)
 
 
 def _last_line(traceback: object) -> str:

@@ -78,7 +78,13 @@ from rsltrace.trace.model.event import (
     is_switch,
 )
 from rsltrace.trace.model.finding import NondeterminismSource
-from rsltrace.trace.model.texts import contrasting_durations, format_duration, printable, shortened
+from rsltrace.trace.model.texts import (
+    contrasting,
+    contrasting_durations,
+    format_duration,
+    printable,
+    shortened,
+)
 from rsltrace.trace.words.phrases import at_time, event_phrase, seconds_text
 
 PARAMETER_EVENTS = "/parameter_events"
@@ -291,10 +297,7 @@ def _drawn(number: int | None, other: int | None) -> str:
     """Return a decision in words, in which it differs from the other."""
     if number is None:
         return f"no {_DRAWS.get(decision_kind(other or 0), 'loss')}"
-    text = decision_text(number)
-    if other is not None and text == decision_text(other):
-        return decision_text(number, 17)
-    return text
+    return contrasting(number, number if other is None else other, decision_text)[0]
 
 
 def _took(number: int | None, other: int | None) -> str:
