@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
-from rsltrace.diff.facts.causes import Judgement, UnrecordedAnswer, Verdict
+from rsltrace.diff.facts.causes import Judgement, PossibleCause, Verdict
 from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CallDifference,
@@ -63,7 +63,7 @@ class Divergence(Judgement):
         """What came from outside and explains it, "" if nothing is known."""
         from rsltrace.diff.sentences import sentence
 
-        if self.likely is None or isinstance(self.likely, UnrecordedAnswer):
+        if self.likely is None or isinstance(self.likely, PossibleCause):
             return ""
         return sentence(self.likely)
 

@@ -82,7 +82,13 @@ from rsltrace.simulation.middleware.events.event import NameRegistry
 from rsltrace.simulation.middleware.interface import AllTopicFaults
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_STATES
 from rsltrace.trace.mcap.sink import unfinished_path
-from rsltrace.trace.model.finding import EndlessWait, GuardCount, encode_drops, encode_waits
+from rsltrace.trace.model.finding import (
+    EndlessWait,
+    GuardCount,
+    encode_drops,
+    encode_suppressed,
+    encode_waits,
+)
 from rsltrace.trace.model.texts import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -539,6 +545,7 @@ class RunSession:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error, outcome.waits),
+                    **encode_suppressed(outcome.suppressed),
                     **encode_drops(queue_drops(outcome.drops)),
                     **self._late_numerics(),
                 },

@@ -53,7 +53,8 @@ class Busy(Node):
     def __init__(self):
         super().__init__("busy")
         self.out = self.create_publisher(UInt64, "/done", 5)
-        self.group = MutuallyExclusiveCallbackGroup()
+        free = os.environ.get("KIND") == "free"
+        self.group = ReentrantCallbackGroup() if free else MutuallyExclusiveCallbackGroup()
         group = {"own": self.group, "free": ReentrantCallbackGroup()}.get(os.environ.get("GROUP"))
         self.create_timer(0.1, self.work, callback_group=self.group)
         self.create_timer(0.1, self.more, callback_group=group)
@@ -130,8 +131,10 @@ def test_qos_that_fits_no_more(
     )
     name, old, _, *new = told.split(" ")
     backwards = f"{name} {' '.join(new)} → {old}"
-    for found, values in ((diff, told), (back, backwards)):
-        assert f"{who} with a different QoS: {values}" in found.sentence
+    peer = "the subscription of /sink" if end == "OFFERED" else "the publisher of /source"
+    for found, values, run in ((diff, told, "b"), (back, backwards, "a")):
+        unmatched = f", which in {run} does not match {peer}"
+        assert f"{who} with a different QoS: {values}{unmatched}" in found.sentence
         assert_blames(found, who.split()[0])
 
 
@@ -207,9 +210,9 @@ def test_periods_that_differ_are_shown_so(tmp_path: Path, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("groups", "told"),
     [
-        (("own", ""), "exclusive 1 → default"),
-        (("", "own"), "default → exclusive 1"),
-        (("own", "free"), "exclusive 1 → reentrant 2"),
+        (("own", ""), "mutually exclusive 1 → default, in a that of timer Busy.work"),
+        (("", "own"), "default → mutually exclusive 1, in b that of timer Busy.work"),
+        (("own", "free"), "mutually exclusive 1 → reentrant 2, in a that of timer Busy.work"),
     ],
 )
 def test_another_callback_group(
@@ -221,3 +224,14 @@ def test_another_callback_group(
     )
     diff = rsltrace.diff(a, b)
     assert f"/busy created timer Busy.more with a different callback group: {told}" in diff.sentence
+
+
+def test_members_of_a_callback_group_of_another_kind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b = (
+        recorded(tmp_path, f"{kind}.mcap", monkeypatch, BUSY, GROUP="own", KIND=kind)
+        for kind in ("exclusive", "free")
+    )
+    both = "timer Busy.work and timer Busy.more with a different callback group: "
+    assert f"/busy created {both}mutually exclusive 1 → reentrant 1" in rsltrace.diff(a, b).sentence

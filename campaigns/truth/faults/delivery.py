@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-import re
+from dataclasses import replace
 
 from campaigns.truth.faults.planting import ALWAYS_FALSE, NOT_DETERMINISTIC, Planted, Truth, fault
 from campaigns.truth.graph import Callback, NodePlan, World, random_world
@@ -71,7 +71,7 @@ def depth(rng: random.Random) -> Planted:
             ("missing",),
             receiver.full_name,
             "/burst",
-            first=(rf"queue \(depth {shallow}\) overflowed",),
+            first=(rf"queue \(depth 10 → {shallow}\) overflowed",),
             says=(rf"code of module {receiver.module}",),
             never=NEVER,
         ),
@@ -104,7 +104,11 @@ def incompatible(rng: random.Random) -> Planted:
         b,
         Truth(
             ("missing", "graph", "same-input-different-output"),
-            says=(r"QoS|reliab", re.escape("/burst"), r"code of module truth_burst"),
+            first=(
+                r"/burst created publisher /burst with a different QoS: reliability reliable → "
+                r"best_effort, which in b does not match the subscription of /drain",
+            ),
+            says=(r"code of module truth_burst",),
             never=NEVER,
             independent=None,
         ),
@@ -135,21 +139,30 @@ _changed_setup(
     "drain",
     SUBSCRIBED,
     '"/burst", self.heard, QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL))',
-    r"QoS|durability",
+    r"/drain created subscription /burst with a different QoS: durability volatile → "
+    r"transient_local, which in b does not match the publisher of /burst",
+)
+_changed_setup(
+    "QoS: liveliness that nobody offers",
+    "drain",
+    SUBSCRIBED,
+    '"/burst", self.heard, '
+    "QoSProfile(depth=10, liveliness=rclpy.qos.LivelinessPolicy.MANUAL_BY_TOPIC))",
+    r"QoS: liveliness automatic → manual_by_topic, which in b does not match the publisher of ",
 )
 _changed_setup(
     "QoS: deadline that is missed",
     "drain",
     SUBSCRIBED,
     '"/burst", self.heard, QoSProfile(depth=10, deadline=Duration(seconds=0.03)))',
-    r"QoS|deadline",
+    r"QoS: deadline none → 30 ms, which in b does not match the publisher of /burst",
 )
 _changed_setup(
     "QoS: history",
     "drain",
     SUBSCRIBED,
     '"/burst", self.heard, QoSProfile(depth=3, history=HistoryPolicy.KEEP_LAST))',
-    r"queue \(depth 3\) overflowed",
+    r"queue \(depth 10 → 3\) overflowed",
 )
 _changed_setup(
     "another type on a topic",
@@ -158,5 +171,39 @@ _changed_setup(
     "Float32, ",
     r"Float64 only in a.*Float32 only in b",
 )
+
+
+def _grouped(name: str, one: str, other: str, *first: str) -> None:
+    """Register a class: of two timers at once, of which one sleeps, the other is of ``one``
+    callback group in a and of ``other`` in b."""
+
+    @fault(name)
+    def planter(rng: random.Random) -> Planted:
+        a = random_world(rng)
+        slow = Callback("slow", "timer", "Grouped.slow", ["time.sleep(0.01)"], "", 50)
+        more = Callback("more", "timer", "Grouped.more", [], "", 50)
+        setup = [
+            "own, free = MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup()",
+            "self.slow_timer = self.create_timer(0.05, self.slow, callback_group=own)",
+            f"self.more_timer = self.create_timer(0.05, self.more, callback_group={one})",
+        ]
+        top = [
+            "from rclpy.callback_groups import MutuallyExclusiveCallbackGroup",
+            "from rclpy.callback_groups import ReentrantCallbackGroup",
+        ]
+        node = NodePlan("grouped", "grouped", setup, [slow, more], top=top)
+        a.add(node)
+        a.job["executors"] = [{"nodes": [node.full_name], "workers": 2}]
+        b = a.copy()
+        b.node("grouped").setup[2] = setup[2].replace(f"={one})", f"={other})")
+        says = (rf"code of module {node.module}",)
+        made = "created timer Grouped.more with a different callback group: (mutually )?"
+        truth = Truth(("timing",), node.full_name, "Grouped.more", says=says, never=NEVER)
+        return Planted(a, b, replace(truth, first=tuple(made + text for text in first)))
+
+
+_OTHER = "that of timer Grouped.slow"
+_grouped("callback group shared", "None", "own", f"default → mutually exclusive 1, in b {_OTHER}")
+_grouped("callback group left", "own", "free", f"exclusive 1 → reentrant 2, in a {_OTHER}")
 _changed_setup("relative name", "burst", '"/burst"', '"~/burst"', "/burst/burst")
 _changed_setup("depth that is never reached", "drain", ", 10)", ", 12)", same=True)

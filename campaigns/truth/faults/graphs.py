@@ -192,7 +192,7 @@ def parameter(rng: random.Random) -> Planted:
     b.node(node.name).setup.append('self.declare_parameter("more", 5)')
     truth = Truth(
         node=node.full_name,
-        first=(r"more|parameter",),
+        first=(rf"parameter more of {node.full_name} 5 only in b",),
         says=(rf"code of module {node.module}",),
         never=NEVER,
         independent=None,
@@ -239,8 +239,8 @@ def _declared(name: str, one: str, other: str, *says: str) -> None:
         return Planted(a, b, truth)
 
 
-_declared("default of a parameter", "1.5", "1.75", "/s")
-_declared("type of a parameter", "2", "2.0")
+_declared("default of a parameter", "1.5", "1.75", "/s", r"gain of /source\d 1\.5 → 1\.75")
+_declared("type of a parameter", "2", "2.0", r"gain of /source\d 2 → 2\.0")
 
 
 @fault("parameter of all nodes")

@@ -98,7 +98,13 @@ _lived("activating refused", "on_activate", FAILURE, CHANGE)
 _lived("deactivating refused", "on_deactivate", FAILURE, CHANGE)
 _lived("cleaning up refused", "on_cleanup", FAILURE, CHANGE)
 _lived("transition with an error", "on_activate", ["return TransitionCallbackReturn.ERROR"], CHANGE)
-_lived("transition that raises", "on_activate", ['raise RuntimeError("planted")'], CHANGE)
+_lived(
+    "transition that raises",
+    "on_activate",
+    ['raise RuntimeError("planted")'],
+    CHANGE,
+    r"on_activate of /camera raised RuntimeError: planted at truth_camera\.py:\d+ only in b",
+)
 _lived("transition that takes time", "on_activate", ["time.sleep(0.004)"], "4 ms")
 _lived(
     "publisher that is not activated", "on_activate", ["return TransitionCallbackReturn.SUCCESS"]

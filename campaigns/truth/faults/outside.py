@@ -76,7 +76,9 @@ def unseeded(rng: random.Random) -> Planted:
 def guard_off(rng: random.Random) -> Planted:
     a, node = _reads(rng, "random.random()", in_constructor=False)
     a.job["guard"] = False
-    return Planted(a, a.copy(), _truth(node, r"guard: false"))
+    call = r"random\.random\(\) at truth_\w+\.py:\d+"
+    truth = _truth(node, rf"possible cause: {call}, which guard: false lets", rf"cause is {call}")
+    return Planted(a, a.copy(), truth)
 
 
 @fault("random drawn once more")

@@ -71,7 +71,7 @@ def no_delay(rng: random.Random) -> Planted:
     a = random_world(rng)
     topic = one_of(rng, a, "relay").hears[0]
     b = changed(a, "delay", {"topics": {topic: "0ms"}})
-    first = (r"delays of 0 ns, which have no effect",)
+    first = (r"no effect: one run only adds delays of 0 ns",)
     return Planted(a, b, Truth(("draw",), first=first, says=(r"delay",), never=DRAWN))
 
 

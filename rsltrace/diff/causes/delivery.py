@@ -23,11 +23,15 @@ from rsltrace.diff.facts.evidence import (
     EventSummary,
     MessageDifference,
 )
+from rsltrace.simulation.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.finding import EndlessWait, decode_waits
+from rsltrace.trace.words.entities import EntityKey
 
 _LOOKED_AT_MAX = 1000
+_PUBLISHER = EntityKind.PUBLISHER.label
+_ENDS = {_PUBLISHER, EntityKind.SUBSCRIPTION.label}
 _QOS_EVENT = EntityKind.QOS_EVENT.label
 _OF_QOS = (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT, EventKind.QOS_EVENT)
 """Events of endpoints."""
@@ -61,7 +65,9 @@ def lost_message(
     depth = _depth(has_not, number)
     sent = _sent_between(has_not, view, later)
     if depth is not None and sent >= depth:
-        return QueueOverflow(depth, name)
+        other = _depth(has, number)
+        in_a, in_b = (depth, other) if name == "a" else (other, depth)
+        return QueueOverflow(depth, name, (in_a, in_b))
     return None
 
 
@@ -96,12 +102,12 @@ def _sent_between(run: ComparedTrace, view: EventSummary, later: tuple[int, int,
 
 
 def _depth(run: ComparedTrace, number: int) -> int | None:
-    depth = _qos(run, number).get("depth")
+    depth = _qos(_detail(run, number)).get("depth")
     return depth if isinstance(depth, int) else None
 
 
-def _qos(run: ComparedTrace, number: int) -> dict[str, object]:
-    qos = _detail(run, number).get("qos")
+def _qos(detail: dict[str, object]) -> dict[str, object]:
+    qos = detail.get("qos")
     return qos if isinstance(qos, dict) else {}
 
 
@@ -130,31 +136,69 @@ def entity_changes(
     run_b: ComparedTrace,
     topics: frozenset[str],
     nodes: frozenset[str] = frozenset(),
+    *,
+    with_depth: bool = False,
 ) -> EntityChanges | None:
     """Return which entities of both runs have another QoS, of some topics and services, or are in
     another callback group, of some nodes; None if there are none.
 
-    Depths are not included: they show as overflows.
+    Depths are only included ``with_depth``: they show as overflows.
     """
     alone = {*run_a.matching.only_a, *run_a.matching.only_b}
+    known = {
+        key: (_detail(run_a, number), _detail(run_b, number))
+        for number, key in enumerate(run_a.matching.keys)
+        if number not in alone and (key.name in topics or key.node in nodes)
+    }
     found = []
-    for number, key in enumerate(run_a.matching.keys):
-        if number in alone or not (key.name in topics or key.node in nodes):
-            continue
-        a, b = _detail(run_a, number), _detail(run_b, number)
-        if key.name in topics and (values := _policies(a.get("qos"), b.get("qos"))):
-            found.append(EntityChange(key, EntityProperty.QOS, values))
-        if key.node in nodes and (groups := (a.get("group"), b.get("group")))[0] != groups[1]:
-            one, other = (str(group or "default") for group in groups)
-            found.append(EntityChange(key, EntityProperty.GROUP, (("", one, other),)))
+    for key, details in known.items():
+        qos_a, qos_b = (detail.get("qos") for detail in details)
+        if key.name in topics and (values := _policies(qos_a, qos_b, with_depth=with_depth)):
+            ends = [o for o in known if o.name == key.name and {o.kind, key.kind} == _ENDS]
+            apart = {end: _unmatched((key, end), (details, known[end])) for end in ends}
+            found.append(EntityChange(key, EntityProperty.QOS, values, *_in_one_run(apart)))
+        group_a, group_b = (detail.get("group") for detail in details)
+        if key.node in nodes and group_a != group_b:
+            value = ("", str(group_a or "default"), str(group_b or "default"))
+            shared = {
+                other: (
+                    group_a is not None and theirs[0].get("group") == group_a,
+                    group_b is not None and theirs[1].get("group") == group_b,
+                )
+                for other, theirs in known.items()
+                if other != key and other.node == key.node
+            }
+            found.append(EntityChange(key, EntityProperty.GROUP, (value,), *_in_one_run(shared)))
     return EntityChanges(tuple(found)) if found else None
 
 
-def _policies(a: object, b: object) -> tuple[tuple[str, str | int | None, str | int | None], ...]:
+def _policies(
+    a: object, b: object, *, with_depth: bool
+) -> tuple[tuple[str, str | int | None, str | int | None], ...]:
     if not isinstance(a, dict) or not isinstance(b, dict):
         return ()
-    names = [name for name in {**a, **b} if name != "depth" and a.get(name) != b.get(name)]
-    return tuple((name, a.get(name), b.get(name)) for name in names)
+    names = [name for name in {**a, **b} if a.get(name) != b.get(name)]
+    return tuple((n, a.get(n), b.get(n)) for n in names if with_depth or n != "depth")
+
+
+def _unmatched(
+    keys: tuple[EntityKey, EntityKey], details: tuple[tuple[dict[str, object], ...], ...]
+) -> tuple[bool, bool]:
+    """Whether the QoS of two endpoints does not match in a, and in b."""
+    offered, requested = details if keys[0].kind == _PUBLISHER else details[::-1]
+    in_a, in_b = (
+        bool(incompatible_policies(*(Qos.of_summary(_qos(detail)) for detail in ends)))
+        for ends in zip(offered, requested, strict=True)
+    )
+    return in_a, in_b
+
+
+def _in_one_run(related: dict[EntityKey, tuple[bool, bool]]) -> tuple[tuple[EntityKey, ...], str]:
+    """Return the entities that are related in one run only, and which run that is."""
+    for run, where in (("a", (True, False)), ("b", (False, True))):
+        if found := tuple(key for key, runs in related.items() if runs == where):
+            return found, run
+    return (), ""
 
 
 # -- calls that waited, callbacks that slept -----------------------------------------------------
@@ -190,14 +234,16 @@ def slept(
     as long in both, or if they did not."""
     if a is None or b is None or a.kind is not b.kind:
         return None
-    in_a, in_b = _slept_ns(run_a, a), _slept_ns(run_b, b)
+    woke = a.kind is EventKind.RESUME and a.cause_event == b.cause_event == NO_EVENT
+    back = woke and a.stamp_ns != b.stamp_ns
+    in_a, in_b = _slept_ns(run_a, a, back=back), _slept_ns(run_b, b, back=back)
     return None if in_a == in_b else SleepTimes(in_a, in_b)
 
 
-def _slept_ns(run: ComparedTrace, view: EventSummary) -> int | None:
-    """Return how long a callback slept after an event, or before one that resumed it."""
+def _slept_ns(run: ComparedTrace, view: EventSummary, *, back: bool) -> int | None:
+    """Return how long a callback slept after an event, or before one that resumed it (``back``)."""
     number = run.matching.by_key[view.entity]
-    if view.kind is EventKind.RESUME and view.cause_event == NO_EVENT:
+    if back:
         rows = load_rows(run, max(view.index - _LOOKED_AT_MAX, 0), view.index)
         for place in reversed(range(len(rows))):
             if rows.number[place] == number:

@@ -36,7 +36,14 @@ from rsltrace.diff.causes.propagation import (
 from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
-from rsltrace.diff.facts.causes import Consequence, Judgement, Root, SameCause, Verdict
+from rsltrace.diff.facts.causes import (
+    Consequence,
+    Judgement,
+    Root,
+    SameCause,
+    UnguardedCall,
+    Verdict,
+)
 from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CauseLink,
@@ -332,6 +339,8 @@ class Explainer:
         assert view is not None
         path_a, path_b = (_word(run.trace.name) for run in (self.run_a, self.run_b))
         verdict = judgement.verdict
+        if isinstance(judgement.likely, UnguardedCall):
+            return f"rsltrace audit {_word(judgement.likely.file)}"
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
         if self._opens_viewer(judgement):

@@ -12,14 +12,14 @@ import difflib
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.trace.model.operation import nested_too_deep
-from rsltrace.trace.model.texts import format_duration
+from rsltrace.trace.model.texts import contrasting, format_duration
 from rsltrace.trace.reader import Trace
 
 _LINES_MAX = 20_000
@@ -92,9 +92,9 @@ class _Change:
         """Return both values on a line each: times with a unit; parts without unset keys."""
         if (self.a and self.a[0]) is None and (self.b and self.b[0]) is None:
             return (None if self.a is None else "null"), (None if self.b is None else "null")
-        key = self.path_a[-1]
-        a, b = (None if leaf is None else _text(leaf[0], key) for leaf in (self.a, self.b))
-        if a == b and a is not None:  # rounded for people
+        text = partial(_text, key=self.path_a[-1])
+        a, b = contrasting(self.a and self.a[0], self.b and self.b[0], text)
+        if a == b and a is not None:
             a, b = (json.dumps(leaf[0]) for leaf in (self.a, self.b) if leaf is not None)
         return a, b
 
@@ -256,10 +256,10 @@ def _changed_entries(path_a: Path, path_b: Path, a: list[Any], b: list[Any]) -> 
             yield _Change((*path_a, at_b), (*path_b, at_b), None, (b[at_b],))
 
 
-def _text(value: Any, key: str | int) -> str | None:
+def _text(value: Any, digits: int, key: str | int) -> str | None:
     if value is None:
         return None
-    plain = _plain(value, key)
+    plain = _plain(value, key, digits)
     text = json.dumps(plain, ensure_ascii=False)
     return plain if isinstance(plain, str) and not _has_two_meanings(plain) else text
 
@@ -273,13 +273,13 @@ def _has_two_meanings(text: str) -> bool:
     return True
 
 
-def _plain(value: Any, key: str | int) -> Any:
+def _plain(value: Any, key: str | int, digits: int) -> Any:
     if isinstance(value, dict):
         kept = {name: item for name, item in value.items() if item not in _NOTHING}
-        return {_written(name): _plain(item, name) for name, item in kept.items()}
+        return {_written(name): _plain(item, name, digits) for name, item in kept.items()}
     if isinstance(value, list):
-        return [_plain(item, key) for item in value]
-    return format_duration(value) if _is_time(value, key) else value
+        return [_plain(item, key, digits) for item in value]
+    return format_duration(value, digits) if _is_time(value, key) else value
 
 
 def _is_time(value: Any, key: str | int) -> bool:

@@ -6,6 +6,7 @@ import ast
 import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 
 from rsltrace.diff.alignment.rows import ComparedTrace
@@ -19,11 +20,15 @@ from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
+    DivergenceKind,
+    ErrorInTransition,
+    EventInOneRun,
     ExternalAnswers,
     Judgement,
     LikelyCause,
     Root,
     SetOrder,
+    UnguardedCall,
     Verdict,
 )
 from rsltrace.diff.facts.evidence import (
@@ -34,7 +39,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.errors import JobError
 from rsltrace.trace.format import METADATA_SOURCES
-from rsltrace.trace.model.finding import NondeterminismSource
+from rsltrace.trace.model.finding import NondeterminismSource, decode_suppressed
 from rsltrace.trace.words.code import code_file, code_place
 
 _OF_PROGRAMS = ("os.read()", "os.waitpid()")
@@ -56,14 +61,17 @@ def likely_cause(
     calls: Sequence[CallDifference],
     relevance: Relevance,
 ) -> LikelyCause | None:
-    """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
-    shows, entities with other properties. Else an unrecorded answer.
+    """Return what explains a root: an exception that rclpy suppressed, the first of ``calls`` if
+    its answers differ, a set whose order shows, entities with other properties. Else an unrecorded
+    answer.
     """
     run_a, run_b = runs
     run = run_b if judgement.a is None else run_a
     view = judgement.one
     if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
         return None
+    if (suppressed := _suppressed_exception(judgement, runs)) is not None:
+        return suppressed
     if calls and calls[0].differs:
         changed = judgement.changed
         subject = subject_of(view) if changed is None else changed.node
@@ -72,10 +80,36 @@ def likely_cause(
         return found
     if judgement.verdict in _OF_ORDER and judgement.changed is None:
         nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
-        changed = entity_changes(run_a, run_b, topics_of(view, judgement.messages), nodes - {""})
+        topics = topics_of(view, judgement.messages)
+        what = judgement.what  # a history of another depth: other messages are kept for later
+        lost = isinstance(what, EventInOneRun) and what.loss is None
+        with_depth = lost or what is DivergenceKind.OTHER_SENDER
+        changed = entity_changes(run_a, run_b, topics, nodes - {""}, with_depth=with_depth)
         if changed is not None:
             return changed
-    return unrecorded_answer(run, view) if judgement.is_unexplained else None
+    if not judgement.is_unexplained:
+        return None
+    if relevance.guard_is_off:
+        return _unguarded_call(run, view)
+    return unrecorded_answer(run, view)
+
+
+def _suppressed_exception(
+    judgement: Judgement, runs: tuple[ComparedTrace, ComparedTrace]
+) -> ErrorInTransition | None:
+    """Return the first exception of a lifecycle callback that only one of two events has."""
+    in_a, in_b = (
+        [one for one in decode_suppressed(run.trace.result) if one.event == event.index]
+        if event is not None and run.trace.complete
+        else []
+        for run, event in zip(runs, (judgement.a, judgement.b), strict=True)
+    )
+    for a, b in zip_longest(in_a, in_b):
+        one = a or b
+        error_a, error_b = (None if each is None else each.error for each in (a, b))
+        if one is not None and error_a != error_b:
+            return ErrorInTransition(one.node, one.callback, one.place, error_a, error_b)
+    return None
 
 
 def telling_calls(
@@ -123,15 +157,21 @@ def _set_behind(
             return SetOrder(call.call, call.where.partition(" in ")[0])
     if relevance.sets_are_in_order:
         return None
-    place = code_place(run.trace, run.trace.event(view.index))
-    found = code_file(run.trace, place)
-    if found is None or not _is_as_recorded(run, found[0]):
+    calls_there = _audited_calls(run, view, of_sets=True)
+    if calls_there is None:
         return None
-    lines = _lines_with_sets(*found)
-    if not lines:
+    (_, place, what), *more = calls_there
+    return SetOrder(what, place, len(more))
+
+
+def _unguarded_call(run: ComparedTrace, view: EventSummary) -> UnguardedCall | None:
+    """Return the first call in the code of an event whose answer a run without a guard takes from
+    outside; None if there is none, or the code is not here."""
+    found = _audited_calls(run, view, of_sets=False)
+    if found is None:
         return None
-    file = place.rpartition(":")[0]
-    return SetOrder(lines[0][1], f"{file}:{lines[0][0]}", len(lines) - 1)
+    (file, place, call), *more = found
+    return UnguardedCall(call, place, file, len(more))
 
 
 def _is_reordered(message: MessageDifference) -> bool:
@@ -146,15 +186,30 @@ def _is_as_recorded(run: ComparedTrace, file: Path) -> bool:
     return present in run.trace.metadata(METADATA_SOURCES).values()
 
 
-def _lines_with_sets(file: Path, line: int) -> list[tuple[int, str]]:
-    """Return where a file goes through sets: in the function at a line, or else anywhere."""
+def _audited_calls(
+    run: ComparedTrace, view: EventSummary, *, of_sets: bool
+) -> list[tuple[str, str, str]] | None:
+    """Return what an audit finds in the code of an event: file, place and call; None for nothing,
+    or if the code is not here as it was recorded."""
+    place = code_place(run.trace, run.trace.event(view.index))
+    found = code_file(run.trace, place)
+    if found is None or not _is_as_recorded(run, found[0]):
+        return None
+    module = place.rpartition(":")[0]
+    lines = _audited_lines(*found, of_sets=of_sets)
+    return [(str(found[0]), f"{module}:{line}", call) for line, call in lines] or None
+
+
+def _audited_lines(file: Path, line: int, *, of_sets: bool) -> list[tuple[int, str]]:
+    """Return where a file goes through sets, or calls something nondeterministic: in the function
+    at a line, or else anywhere."""
     from rsltrace.guard.audit.audit import audit_path  # most diffs do not need it
 
     try:
         found = [
             (o.line, o.call)
             for o in audit_path(file).found
-            if o.kind == NondeterminismSource.ORDER.value
+            if (o.kind == NondeterminismSource.ORDER.value) is of_sets
         ]
         tree = ast.parse(file.read_bytes())
     except (JobError, OSError, SyntaxError, ValueError):

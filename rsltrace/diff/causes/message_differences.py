@@ -9,6 +9,8 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import islice, pairwise
 
+import numpy as np
+
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import (
     TIMER,
@@ -51,7 +53,7 @@ from rsltrace.trace.model.event import (
     decision_text,
 )
 from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
-from rsltrace.trace.model.texts import printable, shortened
+from rsltrace.trace.model.texts import contrasting, printable, shortened
 from rsltrace.trace.words.code import output_places, relative_place
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.events import output_text
@@ -95,6 +97,8 @@ _LOOKED_AT_MAX = 1000
 
 _PARAMETERS_MAX = 3
 _VALUES = {1: "bool_value", 2: "integer_value", 3: "double_value", 4: "string_value"}
+_ARRAYS = {6: "bool_array_value", 7: "integer_array_value", 8: "double_array_value"}
+_ARRAYS |= {5: "byte_array_value", 9: "string_array_value"}
 """The field of a ``ParameterValue`` by its type."""
 
 _SENT = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
@@ -192,7 +196,7 @@ class _MessageComparison:
         if moved or kind == OutputKind.ENTITY:
             return base
         if kind == OutputKind.DRAW:
-            text_a, text_b = (decision_text(output[2]) if output else "none" for output in (a, b))
+            text_a, text_b = contrasting(a and a[2], b and b[2], _decision)
             return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
         values: list[object] = []
         for run, output in ((self._run_a, a), (self._run_b, b)):
@@ -245,6 +249,10 @@ class _MessageComparison:
 
 
 _NOT_RECORDED = (NoFieldsReason.NOT_RECORDED_IN_A, NoFieldsReason.NOT_RECORDED_IN_B)
+
+
+def _decision(number: int | None, digits: int) -> str:
+    return "none" if number is None else decision_text(number, digits)
 
 
 def _last_line(traceback: object) -> str:
@@ -362,10 +370,14 @@ def _parameters(event: object) -> dict[str, str]:
     for name in ("new_parameters", "changed_parameters"):
         for parameter in getattr(event, name, ()):
             value = getattr(parameter, "value", None)
-            field = _VALUES.get(getattr(value, "type", 0))
-            if field is not None:
-                text = printable(str(getattr(value, field, "")))
-                found[printable(str(parameter.name))] = text
+            kind = getattr(value, "type", 0)
+            if kind in _VALUES:
+                text = str(getattr(value, _VALUES[kind], ""))
+            elif kind in _ARRAYS:
+                text = str(np.asarray(getattr(value, _ARRAYS[kind], ())).tolist())
+            else:
+                continue
+            found[printable(str(parameter.name))] = printable(text)
     return found
 
 

@@ -89,10 +89,12 @@ class UnfinishedCall(Fact):
 
 @dataclass(frozen=True, slots=True)
 class QueueOverflow(Fact):
-    """The queue of a subscription was full in ``run``."""
+    """The queue of a subscription was full in ``run``, where it has a ``depth`` that the other
+    run may not have."""
 
     depth: int
     run: str
+    depths: tuple[int | None, int | None] = (None, None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,6 +354,18 @@ class SetOrder(Fact):
 
 
 @dataclass(frozen=True, slots=True)
+class ErrorInTransition(Fact):
+    """A lifecycle callback raised what rclpy suppressed: ``a`` and ``b`` are the exceptions, None
+    where a run has none."""
+
+    node: str
+    callback: str
+    place: str
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class UnrecordedAnswer(Fact):
     """An unrecorded external answer: a possible cause. ``source`` is the key of
     ``guard:`` that keeps it."""
@@ -361,7 +375,19 @@ class UnrecordedAnswer(Fact):
     source: str
 
 
-LikelyCause = ExternalAnswers | SetOrder | UnrecordedAnswer | EntityChanges
+@dataclass(frozen=True, slots=True)
+class UnguardedCall(Fact):
+    """A call in the code that ran, which no guard watched: a possible cause. ``file`` has it, and
+    ``more`` such calls."""
+
+    call: str
+    place: str
+    file: str
+    more: int = 0
+
+
+PossibleCause = UnrecordedAnswer | UnguardedCall
+LikelyCause = ExternalAnswers | SetOrder | ErrorInTransition | EntityChanges | PossibleCause
 
 
 @dataclass(frozen=True, slots=True)

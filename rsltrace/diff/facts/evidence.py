@@ -325,11 +325,17 @@ class EntityProperty(Enum):
 @dataclass(frozen=True, slots=True)
 class EntityChange:
     """An entity that both runs made, with another property: (name, a, b) as texts, or nanoseconds,
-    None where a side has none. The name is that of a policy, or empty."""
+    None where a side has none. The name is that of a policy, or empty.
+
+    ``peers`` are, in ``run`` and not in the other one, the endpoints that a QoS does not match, or
+    the entities of the same callback group.
+    """
 
     entity: EntityKey
     property: EntityProperty
     values: tuple[tuple[str, str | int | None, str | int | None], ...]
+    peers: tuple[EntityKey, ...] = ()
+    run: str = ""
 
 
 @dataclass(frozen=True, slots=True)

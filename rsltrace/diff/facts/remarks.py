@@ -75,6 +75,13 @@ class StartIsTolerated(Fact):
 
 
 @dataclass(frozen=True, slots=True)
+class ZeroDelaysBefore(Fact):
+    """From event ``start`` on one run adds delays of 0 ns; shown is what differs in more."""
+
+    start: int
+
+
+@dataclass(frozen=True, slots=True)
 class MoreDivergences(Fact):
     """Divergences that are not listed."""
 
@@ -130,6 +137,7 @@ Remark = (
     | SelectionIsEqual
     | SelectionDivergesLater
     | StartIsTolerated
+    | ZeroDelaysBefore
     | MoreDivergences
     | NoRecordCommand
     | JobChanged
@@ -169,9 +177,9 @@ class DifferentJobs(Fact):
 
 @dataclass(frozen=True, slots=True)
 class RunsDiverge(Fact):
-    """See the divergences. ``searched_to`` is the event up to which no effect of another set-up was
-    found (-1: to the end), None if none was looked for, or one was found. ``foreign`` are the names
-    of the jobs where the runs have no node in common."""
+    """See the divergences. ``searched_to`` is the event up to which no effect of another set-up, or
+    of delays of 0 ns, was found (-1: to the end), None if none was looked for, or one was found.
+    ``foreign`` are the names of the jobs where the runs have no node in common."""
 
     searched_to: int | None = None
     foreign: tuple[str, ...] | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
@@ -16,6 +17,7 @@ from rsltrace.diff.facts.causes import (
     DifferentTime,
     DivergenceKind,
     EarlierEnd,
+    ErrorInTransition,
     EventInOneRun,
     ExceptionInOneRun,
     ExternalAnswers,
@@ -25,12 +27,14 @@ from rsltrace.diff.facts.causes import (
     NoMoreMessages,
     NotDelivered,
     ParameterFiles,
+    PossibleCause,
     QueueOverflow,
     RunEnd,
     SameCause,
     SetOrder,
     SleepTimes,
     UnfinishedCall,
+    UnguardedCall,
     UnrecordedAnswer,
     Verdict,
     WaitInOneRun,
@@ -39,8 +43,11 @@ from rsltrace.diff.facts.evidence import (
     CallDifference,
     EntityChange,
     EntityChanges,
+    EntityProperty,
     EventSummary,
     MessageDifference,
+    ParameterChanges,
+    ParameterValues,
     Presence,
     Setting,
     SettingKind,
@@ -71,7 +78,13 @@ from rsltrace.trace.model.event import (
     is_switch,
 )
 from rsltrace.trace.model.finding import NondeterminismSource
-from rsltrace.trace.model.texts import contrasting_durations, format_duration, printable, shortened
+from rsltrace.trace.model.texts import (
+    contrasting,
+    contrasting_durations,
+    format_duration,
+    printable,
+    shortened,
+)
 from rsltrace.trace.words.phrases import at_time, event_phrase, seconds_text
 
 PARAMETER_EVENTS = "/parameter_events"
@@ -117,6 +130,8 @@ def sentence_of(of: Judgement) -> str:
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
+    if isinstance(of.likely, UnguardedCall):
+        return f"{text}; possible cause: {sentence(of.likely)}, which guard: false lets differ"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
 
 
@@ -236,8 +251,7 @@ def _(what: DivergenceKind, of: Judgement) -> str:
 
 @says(DivergenceKind.ONLY_ZERO_DELAYS)
 def _(what: DivergenceKind, of: Judgement) -> str:
-    how = "did the same in both runs; one run adds delays of 0 ns, which have no effect"
-    return f"{_at(_one(of))} {how}"
+    return f"one run only adds delays of 0 ns, first in {_at(_one(of))}"
 
 
 @says(DivergenceKind.OTHER_SENDER)
@@ -283,10 +297,7 @@ def _drawn(number: int | None, other: int | None) -> str:
     """Return a decision in words, in which it differs from the other."""
     if number is None:
         return f"no {_DRAWS.get(decision_kind(other or 0), 'loss')}"
-    text = decision_text(number)
-    if other is not None and text == decision_text(other):
-        return decision_text(number, 17)
-    return text
+    return contrasting(number, number if other is None else other, decision_text)[0]
 
 
 def _took(number: int | None, other: int | None) -> str:
@@ -369,11 +380,27 @@ def _(what: EarlierEnd, of: Judgement) -> str:
 # -- entities with other properties ---------------------------------------------------------------
 
 
-def _change_text(change: EntityChange) -> str:
-    entity = change.entity
+@says(EntityChanges)
+def _(fact: EntityChanges, of: object) -> str:
+    alike: dict[EntityChange, list[str]] = {}
+    for change in fact.changes:
+        node = replace(change.entity, kind="", name="", type="", ordinal=0)
+        named = f"{change.entity.kind} {printable(change.entity.name)}"
+        alike.setdefault(replace(change, entity=node), []).append(named)
+    return joined([_change_text(change, joined(names)) for change, names in alike.items()])
+
+
+def _change_text(change: EntityChange, names: str) -> str:
     values = ", ".join(_property_text(*value) for value in change.values)
-    made = f"{entity.node} created {entity.kind} {printable(entity.name)}"
-    return f"{made} with a different {change.property.value}: {values}"
+    made = f"{change.entity.node} created {names}"
+    text = f"{made} with a different {change.property.value}: {values}"
+    if not change.peers:
+        return text
+    if change.property is EntityProperty.QOS:
+        peers = joined([f"the {peer.kind} of {peer.node}" for peer in change.peers])
+        return f"{text}, which in {change.run} does not match {peers}"
+    peers = joined([f"{peer.kind} {printable(peer.name)}" for peer in change.peers])
+    return f"{text}, in {change.run} that of {peers}"
 
 
 def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
@@ -387,10 +414,17 @@ def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
 def _policy(name: str, value: str | int | None) -> str:
     if value is None:  # a trace has only what is no default
         return "automatic" if name == "liveliness" else "none"
-    return format_duration(value) if isinstance(value, int) else value
+    return format_duration(value) if isinstance(value, int) and name.endswith("_ns") else f"{value}"
 
 
 # -- what became of a message ----------------------------------------------------------------------
+
+
+@says(QueueOverflow)
+def _(loss: QueueOverflow, of: object) -> str:
+    a, b = loss.depths
+    depth = f"{loss.depth}" if a is None or b is None or a == b else f"{a} → {b}"
+    return f"its queue (depth {depth}) overflowed in {loss.run}"
 
 
 @says(UnfinishedCall)
@@ -410,6 +444,11 @@ def cause_of(of: Judgement) -> str:
     if isinstance(of.likely, UnrecordedAnswer):
         how = f"set guard: {{{of.likely.source}: record}} in the job"
         text = f"{text}; {sentence(of.likely)} is not recorded (to record it, {how})"
+    elif isinstance(of.likely, UnguardedCall):
+        more = f" and {of.likely.more} more calls" if of.likely.more else ""
+        text = f"{text}; a possible cause is {sentence(of.likely)}{more}"
+    elif isinstance(of.likely, ErrorInTransition):
+        text = f"{sentence(of.likely)}; {text}"
     elif of.likely is not None:
         because = because_of(of.settings)
         text = f"{sentence(of.likely)}; and {because}" if because else sentence(of.likely)
@@ -593,6 +632,15 @@ def call_text(call: CallDifference) -> str:
     return f"{done} ({call.short[0]} in a, {call.short[1]} in b) at {place}"
 
 
+@says(ErrorInTransition)
+def _(cause: ErrorInTransition, of: object) -> str:
+    raised = f"{cause.callback} of {cause.node} raised"
+    if cause.a is not None and cause.b is not None:
+        return f"{raised} {cause.a} in a, {cause.b} in b, at {cause.place}, which rclpy suppressed"
+    where = "a" if cause.b is None else "b"
+    return f"{raised} {cause.a or cause.b} at {cause.place} only in {where}; rclpy suppressed it"
+
+
 @says(SetOrder)
 def _(cause: SetOrder, of: object) -> str:
     more = f" (and {cause.more} more)" if cause.more else ""
@@ -618,18 +666,20 @@ def headline(first: Judgement, effect: Judgement | None, searched_to: int | None
     """
     settings = (*(effect.settings if effect is not None else ()), *first.settings)
     set_up = effect is not None or searched_to is not None
-    lead = _lead(tuple(dict.fromkeys(settings)), set_up=set_up)
+    lead = _lead(tuple(dict.fromkeys(settings)), first if set_up else None)
     if effect is not None:
-        known = first.likely is not None and not isinstance(first.likely, UnrecordedAnswer)
+        known = first.likely is not None and not isinstance(first.likely, PossibleCause)
         lead = lead or (sentence(first.likely) if known else sentence_of(first))
         return f"{lead}; first effect: {effect_text(effect)}"
     if not lead:
         return sentence_of(first)
     one = first.one
+    up_to = "" if searched_to is None or searched_to < 0 else f" up to event {searched_to}"
+    if first.what is DivergenceKind.ONLY_ZERO_DELAYS:
+        return f"{lead}; no effect{up_to}: {sentence_of(first)}"
     if searched_to is not None and one is not None:
         topics = listed([message.topic for message in first.messages if not message.is_input])
         where = f"on {topics}" if topics else f"on the state of {one.node}"
-        up_to = "" if searched_to < 0 else f" up to event {searched_to}"
         return f"{lead}; no effect{up_to} except {where}, by {phrase(one)}"
     return f"{lead}; first effect: {effect_text(first)}"
 
@@ -669,14 +719,34 @@ def _done(message: MessageDifference) -> str:
     return f"{verb} {message.topic} with a different {other}"
 
 
-def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
+def _lead(settings: Sequence[Setting], constructor: Judgement | None) -> str:
     """Return the keys of the job that can be the cause, with their lines; for a constructor,
-    the code, too."""
+    the code, too, with the parameters that differ."""
     of_job = [_setting(setting) for setting in settings if setting.key]
-    if not of_job and set_up:
-        code = (setting for setting in settings if setting.kind is SettingKind.CODE)
-        of_job = [f"the {setting.place} differs" for setting in code]
-    return listed(of_job)
+    if of_job or constructor is None:
+        return listed(of_job)
+    code = [setting.place for setting in settings if setting.kind is SettingKind.CODE]
+    parameters = _parameters(constructor)
+    if code and parameters:
+        return f"{listed(parameters)} ({listed(code)})"
+    return listed([f"the {place} differs" for place in code])
+
+
+def _parameters(constructor: Judgement) -> list[str]:
+    """Return the parameters that a constructor set to another value, with the values."""
+    node = _one(constructor).node
+    found = []
+    for message in constructor.messages:
+        if isinstance(message.fate, ParameterChanges):
+            changed = message.fate.values
+            found += [f"parameter {name} of {node} {pair_text(a, b)}" for name, a, b in changed]
+        elif isinstance(message.fate, ParameterValues) and message.presence in IN_ONE:
+            where = IN_ONE[message.presence]
+            found += [
+                f"parameter {name} of {node} {shortened(value, _VALUE_MAX)} {where}"
+                for name, value in message.fate.values
+            ]
+    return found
 
 
 def _setting(setting: Setting) -> str:
@@ -704,8 +774,6 @@ SENTENCES.update(
         DifferentInput: lambda fact, of: (
             f"{_at(_one(of))} received a different {fact.topic or 'input'}"
         ),
-        EntityChanges: lambda fact, of: joined([_change_text(change) for change in fact.changes]),
-        QueueOverflow: lambda fact, of: f"its queue (depth {fact.depth}) overflowed in {fact.run}",
         NoMoreMessages: lambda fact, of: f"it receives nothing more in {fact.run}",
         CauseKind.ONLY_IN_ONE_BAG: lambda fact, of: (
             because_of(of.settings) or f"only the bag of {_has(of)[0]} has this message"
@@ -731,6 +799,7 @@ SENTENCES.update(
             f"it follows from an earlier difference: {sentence(fact.root.what, fact.root)}"
         ),
         SameCause: lambda fact, of: cause_of(fact.first),
+        UnguardedCall: lambda fact, of: f"{fact.call} at {fact.place}",
         UnrecordedAnswer: lambda fact, of: f"the result of {fact.call} at {fact.place}",
     }
 )

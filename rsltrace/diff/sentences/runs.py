@@ -39,6 +39,7 @@ from rsltrace.diff.facts.remarks import (
     StartIsTolerated,
     TruncatedRecording,
     UndecodedMessages,
+    ZeroDelaysBefore,
 )
 from rsltrace.diff.sentences import SENTENCES, says, sentence
 from rsltrace.diff.sentences.values import IN_ONE
@@ -265,6 +266,12 @@ def _(remark: StartIsTolerated, of: object) -> str:
     covered = "but only in ignored fields or within tolerance"
     shown = "this report shows the first other difference"
     return f"the runs diverge at event {remark.start}, {covered}; {shown}"
+
+
+@says(ZeroDelaysBefore)
+def _(remark: ZeroDelaysBefore, of: object) -> str:
+    since = f"from event {remark.start} on, one run adds delays of 0 ns, which have no effect"
+    return f"{since}; this report shows the first other difference"
 
 
 @says(MoreDivergences)

@@ -35,6 +35,7 @@ from rsltrace.diff.facts.remarks import (
     SelectionDivergesLater,
     SelectionIsEqual,
     StartIsTolerated,
+    ZeroDelaysBefore,
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff, Divergence, EntityCount
@@ -201,20 +202,28 @@ class _TraceComparison:
         )
         wanted: list[FoundDivergence] = []
         search = None if watch is not None else EffectSearch(self._covered)
+        start: AlignedBlock | None = None
         for block in blocks:
             self._aligned_to = (block.end_a, block.end_b)
             if isinstance(block, EqualBlock):
                 self._counts.take_equal(block)
                 continue
+            self._counts.take(block)
+            start = start or block
+            far = block.end_a - self._start >= EFFECT_WITHIN
             known = len(propagation.found)
             first = self._first(block) if not known else None
+            if first is None and not known:  # nothing but delays of 0 ns differs so far
+                blocks.skip_equal = True
+                if not block.at_end and not (far and not options.everything):
+                    continue
+                block, first = start, first_item(start, self._start)
+                self._searched_to = self._to_end
             propagation.take(block, first)
-            self._counts.take(block)
             new = propagation.found[known:]
             wanted += [f for f in new if watch is None or watch(f.origin.item, block)]
             if search is not None:
                 search.take(block, propagation)
-            far = block.end_a - self._start >= EFFECT_WITHIN
             if not options.everything and (search is None or not search.going_on or far):
                 break
             blocks.skip_equal = True
@@ -228,12 +237,17 @@ class _TraceComparison:
         explainer = self._explainer([])
         return explainer.is_covered
 
-    def _first(self, block: AlignedBlock) -> EventPair:
-        """Return the pair at which the runs diverge; a delay of 0 ns alone is no divergence."""
-        first = first_item(block, self._start)
-        if first.plain and self._run_a.without_zero_delays:
-            return next((item for item in block.items if not item.plain), first)
-        return first
+    def _first(self, block: AlignedBlock) -> EventPair | None:
+        """Return the pair at which the runs diverge; None where only delays of 0 ns differ, which
+        is no divergence."""
+        if block.rows_a.first <= self._start:
+            first = first_item(block, self._start)
+            if not first.plain or not self._run_a.without_zero_delays:
+                return first
+        found = next((item for item in block.items if not item.plain), None)
+        if found is not None:
+            self._remarks.append(ZeroDelaysBefore(self._start))
+        return found
 
     def _divergences(
         self,
@@ -261,11 +275,15 @@ class _TraceComparison:
         if search is not None and not search.past_covered and search.found is not None:
             self._effect = explainer.explain_effect(search.found, divergences[0])
         if search is not None and search.in_vain:
-            ends = (self._a.event_count, self._b.event_count)
-            whole = self._aligned_to == ends
-            self._searched_to = -1 if whole else self._aligned_to[0]
+            self._searched_to = self._to_end
         self._remarks += explainer.warnings
         return divergences
+
+    @property
+    def _to_end(self) -> int:
+        """See ``RunsDiverge.searched_to``."""
+        whole = self._aligned_to == (self._a.event_count, self._b.event_count)
+        return -1 if whole else self._aligned_to[0]
 
     def _past_covered(
         self, chosen: list[FoundDivergence], search: EffectSearch

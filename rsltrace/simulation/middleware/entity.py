@@ -115,7 +115,7 @@ class DomainEntity:
         return {}
 
     def trace_group(self) -> str:
-        """Return the callback group: ``exclusive 1``; "" for the default one, or none."""
+        """Return the callback group: ``mutually exclusive 1``; "" for the default one, or none."""
         return ""
 
     def user_callback(self) -> object:

@@ -127,6 +127,39 @@ def decode_waits(result: Mapping[str, str]) -> list[EndlessWait]:
         return []
 
 
+# Exceptions of lifecycle callbacks: rclpy goes to the error state without a word of them.
+
+_EXCEPTIONS_KEPT = 100
+
+
+@dataclass(frozen=True, slots=True)
+class SuppressedException:
+    """An exception of ``callback`` in ``event``, raised at ``place`` (``camera.py:14``)."""
+
+    event: int
+    node: str
+    callback: str
+    error: str
+    place: str
+
+
+def encode_suppressed(exceptions: Iterable[SuppressedException]) -> dict[str, str]:
+    """Return the entry of a run's result for its suppressed exceptions."""
+    kept = [astuple(one) for one in exceptions][:_EXCEPTIONS_KEPT]
+    return {"suppressed": json.dumps(kept)} if kept else {}
+
+
+def decode_suppressed(result: Mapping[str, str]) -> list[SuppressedException]:
+    """Return the suppressed exceptions of a result; none if another program wrote them."""
+    try:
+        return [
+            SuppressedException(int(event), *(printable(str(text)) for text in texts))
+            for event, *texts in json.loads(result.get("suppressed", "[]"))
+        ]
+    except (ValueError, TypeError):
+        return []
+
+
 class NondeterminismSource(str, Enum):
     """Sources of nondeterminism: kinds of calls with answers from outside, or random ones."""
 

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+Text = TypeVar("Text", str, "str | None")
 
 NS_PER_S = 1_000_000_000
 _IN_FULL_NS = 1_000_000 * NS_PER_S
@@ -49,18 +53,19 @@ def format_milliseconds(duration_ns: int | None) -> str:
     return f"{duration_ns / 1e6:.{4 if abs(duration_ns) < 10 * NS_PER_S else 9}g}"
 
 
+def contrasting(a: Any, b: Any, text: Callable[[Any, int], Text]) -> tuple[Text, Text]:
+    """Return two values with as many digits as it takes to see the difference; ``text`` returns a
+    value rounded to some digits."""
+    for digits in range(_DIGITS, _DIGITS_MAX):
+        shown = text(a, digits), text(b, digits)
+        if shown[0] != shown[1] or a == b:
+            break
+    return shown
+
+
 def contrasting_durations(a_ns: int, b_ns: int) -> tuple[str, str]:
     """Return two durations with as many digits as it takes to see the difference."""
-    for digits in range(_DIGITS, _DIGITS_MAX):
-        a, b = format_duration(a_ns, digits), format_duration(b_ns, digits)
-        if _told_ns(a) != _told_ns(b) or a_ns == b_ns:
-            break
-    return a, b
-
-
-def _told_ns(text: str) -> float:
-    number, unit = text.split()
-    return float(number) * {"s": 1e9, "ms": 1e6, "us": 1e3, "ns": 1}[unit]
+    return contrasting(a_ns, b_ns, format_duration)
 
 
 # Fields of message classes that no message definition contains.

@@ -6,12 +6,22 @@ transition event topic are ordinary entities of the node.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from traceback import walk_tb
 from typing import Any
 
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.adapters.rclpy.handles.services import ServiceHandle
+from rsltrace.guard.callers import is_user_file
+from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.events.failure import exception_text
+from rsltrace.simulation.middleware.interface import imported_file
+from rsltrace.trace.model.finding import SuppressedException
+from rsltrace.trace.model.texts import shortened
+
+_ERROR_MAX = 200
 
 _STATES = {
     0: "unknown",
@@ -72,6 +82,38 @@ def _service_property(name: str) -> property:
     return property(lambda self: self._services.get(name))  # None without communication
 
 
+class NotingCallback:
+    """The callback of a transition. Its exceptions are noted: rclpy suppresses them."""
+
+    def __init__(self, node: NodeHandle, callback: Callable[[Any], Any]) -> None:
+        self._node = node
+        self._callback = callback
+
+    def __call__(self, state: Any) -> Any:
+        try:
+            return self._callback(state)
+        except Exception as error:
+            self._note(error)
+            raise
+
+    def _note(self, error: Exception) -> None:
+        runtime, name = self._node.runtime, callback_name(self._callback)
+        text = shortened(f"{type(error).__qualname__}: {exception_text(error)}", _ERROR_MAX)
+        node, place = self._node.fully_qualified_name, _user_line(error)
+        found = SuppressedException(runtime.loop.events, node, name, text, place)
+        outcome = runtime.domain.outcome
+        outcome.suppressed.append(found)
+        outcome.notes.append(f"rclpy suppressed an exception: {name} of {node}: {text} at {place}")
+
+
+def _user_line(error: Exception) -> str:
+    """Return the innermost line of user code that an exception went through."""
+    frames = [(frame, line) for frame, line in walk_tb(error.__traceback__)]
+    of_user = [one for one in frames if is_user_file(one[0].f_code.co_filename)]
+    frame, line = (of_user or frames)[-1]
+    return f"{imported_file(frame.f_code, frame.f_globals)}:{line}"
+
+
 class StateMachineHandle(Handle):
     """Stands in for ``_rclpy.LifecycleStateMachine``."""
 
@@ -80,6 +122,7 @@ class StateMachineHandle(Handle):
             raise TypeError(f"enable_communication_interface must be a bool, not {communicate!r}")
         super().__init__()
         self._real = node.real
+        self._node = node
         self._state = 1
         self._events: PublisherHandle | None = None
         self._services: dict[str, ServiceHandle] = {}
@@ -155,8 +198,16 @@ class StateMachineHandle(Handle):
 
     def _go(self, start: int, goal: int, publish_update: bool) -> None:
         self._state = goal
+        self._note_exceptions()
         if publish_update and self._events is not None:
             self._events.publish(transition_event((start, _STATES[start]), (goal, _STATES[goal])))
+
+    def _note_exceptions(self) -> None:
+        """Let the exceptions of the callback that rclpy calls now be noted."""
+        callbacks = getattr(self._node.made, "_callbacks", {})  # of ``LifecycleNodeMixin``
+        callback = callbacks.get(self._state)
+        if callback is not None and not isinstance(callback, NotingCallback):
+            callbacks[self._state] = NotingCallback(self._node, callback)
 
     # -- services ----------------------------------------------------------------------------------
 

@@ -27,7 +27,7 @@ from rsltrace.simulation.middleware.graph import Graph, action_names_and_types, 
 from rsltrace.simulation.middleware.participant import Participant, full_name
 
 _GROUP_KINDS = {
-    "MutuallyExclusiveCallbackGroup": "exclusive",
+    "MutuallyExclusiveCallbackGroup": "mutually exclusive",
     "ReentrantCallbackGroup": "reentrant",
 }
 _FRAMES_MAX = 10

@@ -12,7 +12,7 @@ from rsltrace.simulation.loop.recorded_order import THE_RUN, entity_text
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT
-from rsltrace.trace.model.finding import EndlessWait
+from rsltrace.trace.model.finding import EndlessWait, SuppressedException
 
 _ACTIONS = (EntityKind.ACTION_CLIENT, EntityKind.ACTION_SERVER)
 _ACTION_TOPICS = ("feedback", "status")
@@ -86,13 +86,15 @@ class NameRegistry(EventObserver):
 @dataclass(slots=True)
 class RunOutcome:
     """How a run has gone. ``ended_after`` is the number of events when it ended; later ones are its
-    shutdown. ``waits`` are the calls that still waited then. ``drops`` counts the drops of full
+    shutdown. ``waits`` are the calls that still waited then, ``suppressed`` the exceptions that
+    rclpy suppressed. ``drops`` counts the drops of full
     queues by receiver, and by queue size of a publisher in an outage (else 0)."""
 
     error: RunError | None = None
     notes: list[str] = field(default_factory=list)
     ended_after: int | None = None
     waits: list[EndlessWait] = field(default_factory=list)
+    suppressed: list[SuppressedException] = field(default_factory=list)
     drops: dict[tuple[Any, int], int] = field(default_factory=dict)
 
     def note_end(self, events: int) -> None:

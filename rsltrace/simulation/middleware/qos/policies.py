@@ -135,6 +135,26 @@ class Qos:
         ]
         return "\n".join(lines)
 
+    @staticmethod
+    def of_summary(shown: dict[str, object]) -> Qos:
+        """Return the policies that decide on a connection, as ``summary`` shows them."""
+
+        def limit(name: str) -> int:
+            value = shown.get(name)
+            return value if isinstance(value, int) else 0
+
+        best_effort = shown.get("reliability") == "best_effort"
+        latched = shown.get("durability") == "transient_local"
+        manual = shown.get("liveliness") == "manual_by_topic"
+        return replace(
+            DEFAULT_QOS,
+            reliability=Reliability.BEST_EFFORT if best_effort else Reliability.RELIABLE,
+            durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
+            liveliness=Liveliness.MANUAL_BY_TOPIC if manual else Liveliness.AUTOMATIC,
+            deadline_ns=limit("deadline_ns"),
+            lease_ns=limit("lease_ns"),
+        )
+
     def summary(self) -> dict[str, object]:
         """Return the policies to show for an entity; durations only if they are limits."""
         shown: dict[str, object] = {
