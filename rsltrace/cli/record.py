@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -404,7 +405,9 @@ def _report(
         )
         return
     kept = result.kept and f" ({result.kept})"
-    tell(f"wrote {result.path}{kept}: {result.stop_reason}")
+    has_next = checked is not None and checked.violated
+    then = "" if has_next else f"; next: rsltrace view {shlex.quote(str(result.path))}"
+    tell(f"wrote {result.path}{kept}: {result.stop_reason}{then}")
     say(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
 
 

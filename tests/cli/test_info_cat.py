@@ -279,9 +279,9 @@ def test_cat_selects_across_segments(tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["--node", "taler"], "has no node taler; did you mean '/talker'?"),
-        (["--node", "/talker", "--node", "x"], "has no node x; there are: /listener, /talker"),
+        (["--node", "/talker", "--node", "x"], "has no node x; there are /listener, /talker"),
         (["--topic", "/x"], "has no topic or service /x; "),
-        (["--entity", "99"], "has no entity 99; there are: "),
+        (["--entity", "99"], "has no entity 99; there are "),
     ],
 )
 def test_a_name_that_matches_nothing_is_an_error(

@@ -46,7 +46,7 @@ from rsltrace.diff.traces.ended_runs import (
     who_ended,
 )
 from rsltrace.diff.traces.tolerance import interruptions, messages_within, side
-from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
@@ -91,7 +91,7 @@ def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
         for glob in globs:
             if not any(fnmatchcase(name, glob) for name in known):
                 raise TraceError(
-                    f"neither run has a {what} {printable(glob)}{did_you_mean(glob, known)}"
+                    f"neither run has a {what} {printable(glob)}{near_or_all(glob, sorted(known))}"
                 )
 
 
