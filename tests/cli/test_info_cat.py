@@ -293,6 +293,21 @@ def test_a_name_that_matches_nothing_is_an_error(
     assert said in result.stderr
 
 
+@pytest.mark.parametrize("name", ["localizer", "/localiser"])
+def test_every_command_says_which_name_was_meant(name: str) -> None:
+    folder = Path(__file__).parents[2] / "sample_traces/delayed_input"
+    a, b = folder / "a.mcap", folder / "b.mcap"
+    for words in (
+        ["cat", a, "--node", name],
+        ["diff", a, b, "--node", name],
+        ["latency", a, "--from", "/odom", "--via", f"/{name}x"],
+        ["cat", a, "--where", f"node /{name}x"],
+    ):
+        result = call(*words)
+        assert result.exit_code == 2
+        assert "; did you mean '/localizer'?" in result.stderr, words
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
