@@ -26,6 +26,8 @@ from rsltrace.diff.row_sign import RowSign
 Ints = npt.NDArray[np.int64]
 _NONE = -1
 _COLUMN_MIN = 1024
+ALIGNED_MAX = 2_000_000
+"""Rows after the first difference; beyond, events are not compared."""
 
 
 _SIGNS = tuple(RowSign)

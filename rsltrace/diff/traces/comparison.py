@@ -7,6 +7,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 
+from rsltrace.diff.alignment.aligned_rows import ALIGNED_MAX, AlignedRows
 from rsltrace.diff.alignment.blocks import (
     AlignedBlock,
     AlignedBlocks,
@@ -117,6 +118,7 @@ class _TraceComparison:
             self._only_names = real is None
             self._start = start if real is None else real
             self._remarks += [RenamedProgram(*names) for names in self._matching.renamed]
+        self._rows = AlignedRows(a.event_count, b.event_count, self._start)
         self._counts = _EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
@@ -179,7 +181,7 @@ class _TraceComparison:
 
     def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
-        return Explainer(self._run_a, self._run_b, self._options, settings, found)
+        return Explainer(self._run_a, self._run_b, self._options, settings, found, self._rows)
 
     def _ended(self, over: Trace) -> Divergence:
         explainer = self._explainer([])
@@ -203,6 +205,8 @@ class _TraceComparison:
         search = None if watch is not None else EffectSearch(self._covered)
         for block in blocks:
             self._aligned_to = (block.end_a, block.end_b)
+            if self._rows.matched < ALIGNED_MAX:
+                self._rows.take(block)
             if isinstance(block, EqualBlock):
                 self._counts.take_equal(block)
                 continue

@@ -270,10 +270,7 @@ def document(diff: Diff) -> str:
 
     The events before a divergence are left out: they are on the timelines.
     """
-    divergences = tuple(
-        replace(each, before_a=(), before_b=(), same_node_a=(), same_node_b=())
-        for each in diff.divergences
-    )
+    divergences = tuple(replace(each, rows=(), node_rows=()) for each in diff.divergences)
     shown = replace(diff, divergences=divergences)
     report = report_lines(shown, DiffOptions(everything=True), width=_WIDTH)
     verdict = "The runs diverge" if diff.diverged else diff.verdict.value
