@@ -167,4 +167,5 @@ def test_view_and_rerun_open_at_the_effect(recorded: Callable[..., Path]) -> Non
         session.close()
     marks = pytest.importorskip("rsltrace_viewer.rerun_export.divergence")
     diff = rsltrace.diff(recorded(), recorded(speed="1.5"))
-    assert marks.marks_of(diff).stamp_ns == 100_000_000
+    found = marks.marks_of(diff, comparison.runs)
+    assert (found.stamp_ns, found.row) == (100_000_000, 3)

@@ -430,8 +430,7 @@ class ViewerApp(Stepping):
         self.look_through()
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
-        """Offer all keys by their help in the command palette."""
-        yield from super().get_system_commands(screen)
+        """Offer all keys by their help in the command palette, and nothing of Textual's own."""
         for key in keys_of(two=self.session.b is not None, live=self.live):
             yield SystemCommand(f"{key.help}", f"key {key.shown}", self._runner(key.action))
 
