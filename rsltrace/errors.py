@@ -213,11 +213,19 @@ class GuardError(RunError):
 
 
 def nearest(word: str, names: Iterable[str]) -> str | None:
-    """Return the name that ``word`` was most probably meant to be: one of the same letters, or
-    the most similar one; None if none is near."""
+    """Return the name that ``word`` was most probably meant to be, None if none is near.
+
+    It has the same letters, or is the most similar one; else its last part is (``/robot/scan`` of
+    ``scna``).
+    """
     import difflib  # only for whoever made a mistake
 
-    close = difflib.get_close_matches(word, list(dict.fromkeys(names)), n=3)
+    every = list(dict.fromkeys(names))
+    close = difflib.get_close_matches(word, every, n=3)
+    if not close:
+        by_end = {name.rsplit("/", 1)[-1]: name for name in reversed(every)}
+        ends = difflib.get_close_matches(word.rsplit("/", 1)[-1], by_end, n=3)
+        close = [by_end[end] for end in ends]
     swapped = [name for name in close if sorted(name) == sorted(word)]
     return next(iter([*swapped, *close]), None)
 
@@ -231,3 +239,14 @@ def did_you_mean(word: str, names: Iterable[str], otherwise: str = "") -> str:
     if near is None:
         return otherwise
     return f"did you mean {near!r}?" if otherwise else f"; did you mean {near!r}?"
+
+
+_NAMES_MAX = 8
+
+
+def near_or_all(word: str, names: Iterable[str]) -> str:
+    """Return how a message about an unknown name ends: which name was probably meant, or which
+    there are."""
+    every = list(dict.fromkeys(names))
+    shown = ", ".join(every[:_NAMES_MAX]) + (", …" if len(every) > _NAMES_MAX else "")
+    return did_you_mean(word, every) or f"; there are {shown or 'none'}"

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.conditions.trace_events import TraceCondition
-from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.errors import TraceError, near_or_all
 from rsltrace.job.values.times import TimeInRun, parse_time_in_run
 from rsltrace.terminal import line_writer
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
@@ -94,8 +94,6 @@ class EventLines:
 def _hex(value: int) -> str:
     return f"{value:016x}" if value else "-"
 
-
-_NAMES_MAX = 12
 
 if TYPE_CHECKING:
     _TimeParam = click.ParamType[TimeInRun]
@@ -270,8 +268,7 @@ def _named(
             if (e.name and fnmatchcase(e.name, glob)) or (by_id and str(e.id) == glob)
         }
         if not matching:
-            listed = f"; there are: {', '.join(names[:_NAMES_MAX]) or 'none'}"
-            near = did_you_mean(glob, names) or listed
+            near = near_or_all(glob, names)
             raise TraceError(f"{trace.name} has no {what} {printable(glob)}{near}")
         found |= matching
     return found

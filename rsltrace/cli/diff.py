@@ -25,7 +25,7 @@ _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 200
 _HEIGHT_MIN = 21
 _PROMPTS = 3
 """Lines a terminal shows beside the report: the command, perhaps on two lines, and the prompt."""
-_ASCII = {ord("└"): "`-", ord("…"): "...", ord("→"): "->"}
+_ASCII = str.maketrans({"└": "`-", "…": "...", "→": "->", "≠": "!=", "↓": "v", "↑": "^"})
 
 
 if TYPE_CHECKING:

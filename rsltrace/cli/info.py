@@ -266,10 +266,12 @@ def _guard_lines(trace: Trace) -> list[str]:
     lines = ["", f"state hashes leave out: {_short(left_out)}"] if left_out else []
     if not trace.guarded:
         return lines
-    rows = [("  source", "done", "node", "call", "times")]
+    rows = [("  source", "done", "node", "call", "times", "code")]
     for met in sorted(trace.guarded, key=lambda met: (not met.is_finding, met.source, met.node)):
         row = (f"  {met.source.value}", met.mode.value, printable(met.node) or "-")
-        rows.append((*row, printable(met.call), str(met.count)))
+        places = trace.finding_places.get((met.node, met.call), [])
+        code = printable(places_text(places, ", ")) or "-"
+        rows.append((*row, printable(met.call), str(met.count), code))
     findings = sum(met.count for met in trace.guarded if met.is_finding)
     title = f"guard findings: {findings}" if findings else "guard: no findings"
     return [*lines, "", title, *table(rows, right=frozenset((4,)))]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import faulthandler
 import json
+import shlex
 import sys
 from collections import Counter
 from collections.abc import Callable
@@ -404,7 +405,9 @@ def _report(
         )
         return
     kept = result.kept and f" ({result.kept})"
-    tell(f"wrote {result.path}{kept}: {result.stop_reason}")
+    has_next = checked is not None and checked.violated
+    then = "" if has_next else f"; next: rsltrace view {shlex.quote(str(result.path))}"
+    tell(f"wrote {result.path}{kept}: {result.stop_reason}{then}")
     say(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
 
 
@@ -413,7 +416,11 @@ def _warn(result: RunResult) -> None:
     found = [met for met in result.guarded if met.is_finding]
     if not found:
         return
+    from rsltrace.trace.words.code import places_text
+
     calls: Counter[tuple[str, str]] = Counter()
+    places: dict[tuple[str, str], dict[str, None]] = {}
+    lines = _finding_places(result.path)
     copied = {met.node for met in found if met.call == _ENVIRONMENT}
     for met in found:
         what, _, library = met.call.partition(READ_BY)
@@ -421,11 +428,14 @@ def _warn(result: RunResult) -> None:
             what = f"environment variables{READ_BY}{library}"
         elif met.node in copied and what.startswith(f"{_ENVIRONMENT}["):
             continue  # reads of the whole environment are reported once
-        calls[met.source.value, f"{what} in {met.node or 'the run'}"] += met.count
+        key = met.source.value, f"{what} in {met.node or 'the run'}"
+        calls[key] += met.count
+        places.setdefault(key, {}).update(dict.fromkeys(lines.get((met.node, met.call), ())))
     tell("guard: these calls can make runs differ (see docs/guard.md):")
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
+        at = printable(places_text(list(places[source, call]), ", "))
         times = f", {count} times" if count > 1 else ""
-        tell(f"  {source}: {printable(call)}{times}")
+        tell(f"  {source}: {printable(call)}{at and f' at {at}'}{times}")
     if (
         any(met.source is NondeterminismSource.ADDRESS for met in found)
         and not has_fixed_addresses()
@@ -433,6 +443,18 @@ def _warn(result: RunResult) -> None:
         tell("  memory addresses differ in every process on this machine")
     if len(calls) > _SHOWN_MAX:
         tell(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}")
+
+
+def _finding_places(path: Path | None) -> dict[tuple[str, str], list[str]]:
+    if path is None or not path.is_file():
+        return {}
+    from rsltrace.trace.reader import Trace
+
+    try:
+        with Trace.open(path) as trace:
+            return trace.finding_places
+    except RsltraceError:
+        return {}  # the trace is gone
 
 
 _SHOWN_MAX = 8

@@ -49,17 +49,15 @@ def rerun(
 
     sdk.require()
     import rsltrace_viewer.rerun_export.show as show
-    from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
     from rsltrace_viewer.rerun_export.export import export
 
     from rsltrace.cli.output.search_progress import working
 
-    timeline = EVENT if by_event else SIM_TIME
     how = show.choose(spawn=spawn, web=web, output=output)
     traces = [trace] if other is None else [trace, other]
     if output is not None:
         with working(f"writing {output}"):
-            done = export(traces, output, force=force, timeline=timeline)
+            done = export(traces, output, force=force, by_event=by_event)
         _tell_what_is_left_out(done.left_out)
         if not quiet:
             say(
@@ -71,7 +69,7 @@ def rerun(
     elif how is not None:
         with show.temporary_recording() as target:
             with working("making the recording"):
-                done = export(traces, target, timeline=timeline)
+                done = export(traces, target, by_event=by_event)
             _tell_what_is_left_out(done.left_out)
             show.open_viewer(target, how)
 

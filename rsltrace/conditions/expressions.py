@@ -25,7 +25,7 @@ from rsltrace.conditions.evaluation import (
 )
 from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
 from rsltrace.conditions.message_fields import wrong_field
-from rsltrace.conditions.names import RunNames, near_name, nodes_called, short_name
+from rsltrace.conditions.names import RunNames, nodes_called, short_name
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 
@@ -175,8 +175,7 @@ class _NameChecker:
             return self._several(name)
         if called or not self._names.are_all:
             return ""
-        near = near_name(name, self._names.nodes)
-        return f"there is no node {name!r}" + (f"; did you mean {near!r}?" if near else "")
+        return f"there is no node {name!r}{did_you_mean(name, self._names.nodes)}"
 
     def _several(self, name: str) -> str:
         these = ", ".join(nodes_called(name, self._names.nodes))
@@ -273,8 +272,7 @@ def node_named(moment: PausedRun, name: str) -> object:
         return nodes[called[0]]
     if called:
         raise NameError(f"several nodes are called {name!r}: {', '.join(called)}")
-    near = near_name(name, nodes)
-    raise NameError(f"there is no node {name!r}" + (f"; did you mean {near!r}?" if near else ""))
+    raise NameError(f"there is no node {name!r}{did_you_mean(name, nodes)}")
 
 
 def message_of(moment: PausedRun | EventView, message: object) -> object:

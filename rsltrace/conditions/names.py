@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from rsltrace.errors import nearest
+from rsltrace.errors import near_or_all
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.words.entities import is_named
 
@@ -38,20 +38,7 @@ class RunNames:
         names = tuple(names)
         if not self.are_all or any(is_named(pattern, name) for name in names):
             return ""
-        if (near := near_name(pattern, names)) is not None:
-            return f"no {what} is called {pattern!r}; did you mean {near!r}?"
-        listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-        return f"no {what} is called {pattern!r}; there are {listed or 'none'}"
-
-
-def near_name(word: str, names: Iterable[str]) -> str | None:
-    """Return the name that was probably meant, by itself or by its last part."""
-    names = tuple(names)
-    by_end = {name.rsplit("/", 1)[-1]: name for name in reversed(names)}
-    near = nearest(word, names)
-    if near is None and (end := nearest(word.rsplit("/", 1)[-1], by_end)) is not None:
-        near = by_end[end]
-    return near
+        return f"no {what} is called {pattern!r}{near_or_all(pattern, names)}"
 
 
 def names_of(

@@ -17,6 +17,7 @@ from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.conditions.view import SentOutput
 from rsltrace.trace.format import EVENT_REST
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.words.logs import parse_log
 
 if TYPE_CHECKING:
@@ -212,6 +213,13 @@ class CurrentEventView:
 
     def findings(self) -> Sequence[str]:
         return () if self.is_next else [one.source.value for one in self._ledger.findings]
+
+    def __repr__(self) -> str:
+        if self.index < 0:
+            return "nothing has run yet"
+        node, kind = self.node and f"{self.node}: ", EventKind(self.kind).label
+        what = f"{node}{kind} {self.entity_name}".rstrip()
+        return f"event {self.index}  {format_seconds(self.stamp_ns)}  {what}"
 
 
 def call_of(callback: Any, args: tuple[Any, ...]) -> CallbackCall:

@@ -26,10 +26,10 @@ from rsltrace.conditions.expressions import (
     no_such_field,
     node_named,
 )
-from rsltrace.conditions.names import RunNames, nodes_called, short_name
+from rsltrace.conditions.names import RunNames, nodes_called
 from rsltrace.conditions.view import EventView
 from rsltrace.debug.current_event import source
-from rsltrace.errors import ConditionError, DebugError, did_you_mean
+from rsltrace.errors import ConditionError, DebugError, did_you_mean, near_or_all
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import graph_overview
 
@@ -184,9 +184,7 @@ def full_name(run: StoppedRun, name: str) -> str:
         return found[0]
     if found:
         raise DebugError(f"{name!r} matches {', '.join(found)}: give the full name")
-    there = ", ".join(nodes) or "none yet"
-    hint = did_you_mean(name, [*nodes, *map(short_name, nodes)], f"there are {there}")
-    raise DebugError(f"no node is called {name!r}; {hint}")
+    raise DebugError(f"no node is called {name!r}{near_or_all(name, nodes)}")
 
 
 def evaluate(run: StoppedRun, expression: str, node: str | None) -> dict[str, Any]:

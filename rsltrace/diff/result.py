@@ -16,7 +16,7 @@ from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CallDifference,
     CauseStep,
-    EventSummary,
+    EventRow,
     Setting,
 )
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
@@ -29,16 +29,14 @@ if TYPE_CHECKING:
 class Divergence(Judgement):
     """One place where the runs diverge. ``independent`` ones follow from no earlier one.
 
-    ``chain`` is the way from the root to it. ``before_a``/``before_b`` are the last events before
-    it in each run, ``same_node_*`` the last ones in the same node. ``next_step`` is a command that
-    shows or reproduces the place, in the viewer if ``next_opens_viewer``.
+    ``chain`` is the way from the root to it. ``rows`` are the last rows before it and its own,
+    ``node_rows`` the last before it in the same node. ``next_step`` is a command that shows or
+    reproduces the place, in the viewer if ``next_opens_viewer``.
     """
 
     chain: tuple[CauseStep, ...] = ()
-    before_a: tuple[EventSummary, ...] = ()
-    before_b: tuple[EventSummary, ...] = ()
-    same_node_a: tuple[EventSummary, ...] = ()
-    same_node_b: tuple[EventSummary, ...] = ()
+    rows: tuple[EventRow, ...] = ()
+    node_rows: tuple[EventRow, ...] = ()
     reaches: tuple[AffectedTopic, ...] = ()
     next_step: str = ""
     next_opens_viewer: bool = False

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TypeVar
 
-from rsltrace.errors import DeadlockError, RunError, did_you_mean
+from rsltrace.errors import DeadlockError, RunError, near_or_all
 from rsltrace.job import FaultSpec, Job, load_job
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time, parse_time_in_run
@@ -212,9 +212,7 @@ class Simulation:
             return names[found[0]]
         if found:
             raise RunError(f"several nodes are named {name}: {', '.join(found)}; give one of these")
-        there = f"there are: {', '.join(names) or 'none'}"
-        hint = did_you_mean(f"/{name.lstrip('/')}", names, there)
-        raise RunError(f"there is no node named {name}; {hint}")
+        raise RunError(f"there is no node named {name}{near_or_all(name, names)}")
 
     def step(self) -> bool:
         """Run the next time step: all that is ready now, or else all that is due next.

@@ -405,6 +405,15 @@ class Trace:
         return {event: findings for event, findings in kept.items() if findings}
 
     @cached_property
+    def finding_places(self) -> dict[tuple[str, str], list[str]]:
+        """The lines of the findings, by node and call, in the order they were met."""
+        places: dict[tuple[str, str], dict[str, None]] = {}
+        for finding in chain.from_iterable(self.findings.values()):
+            if finding.place:
+                places.setdefault((finding.node, finding.call), {})[finding.place] = None
+        return {call: list(found) for call, found in places.items()}
+
+    @cached_property
     def answers(self) -> dict[int, list[Finding]]:
         """The findings, and answers from outside that the run put in order."""
         answers: dict[int, list[Finding]] = {}

@@ -113,7 +113,7 @@ def test_a_bag_without_messages(bag_maker: Maker, storage: str) -> None:
 def test_selections_that_leave_nothing(bag_maker: Maker, samples: list[Sample]) -> None:
     bag_maker(Path("bag"), samples, topics=["/quiet"])
     assert message("bag", topics=["/t1", "/imu/*"]) == (
-        "bag: no topic matches '/imu/*': the bag has /quiet, /t0, /t1, /t2"
+        "bag: no topic matches '/imu/*'; there are /quiet, /t0, /t1, /t2"
     )
     assert message("bag", exclude=["*"]) == (
         "bag: every topic is excluded: the bag has /quiet, /t0, /t1, /t2"

@@ -279,9 +279,9 @@ def test_cat_selects_across_segments(tmp_path: Path) -> None:
     ("words", "said"),
     [
         (["--node", "taler"], "has no node taler; did you mean '/talker'?"),
-        (["--node", "/talker", "--node", "x"], "has no node x; there are: /listener, /talker"),
+        (["--node", "/talker", "--node", "x"], "has no node x; there are /listener, /talker"),
         (["--topic", "/x"], "has no topic or service /x; "),
-        (["--entity", "99"], "has no entity 99; there are: "),
+        (["--entity", "99"], "has no entity 99; there are "),
     ],
 )
 def test_a_name_that_matches_nothing_is_an_error(
@@ -291,6 +291,21 @@ def test_a_name_that_matches_nothing_is_an_error(
     result = call("cat", path, *words)
     assert (result.exit_code, result.stdout) == (2, "")
     assert said in result.stderr
+
+
+@pytest.mark.parametrize("name", ["localizer", "/localiser"])
+def test_every_command_says_which_name_was_meant(name: str) -> None:
+    folder = Path(__file__).parents[2] / "sample_traces/delayed_input"
+    a, b = folder / "a.mcap", folder / "b.mcap"
+    for words in (
+        ["cat", a, "--node", name],
+        ["diff", a, b, "--node", name],
+        ["latency", a, "--from", "/odom", "--via", f"/{name}x"],
+        ["cat", a, "--where", f"node /{name}x"],
+    ):
+        result = call(*words)
+        assert result.exit_code == 2
+        assert "; did you mean '/localizer'?" in result.stderr, words
 
 
 @pytest.mark.parametrize(

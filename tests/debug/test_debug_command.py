@@ -60,6 +60,7 @@ def test_a_session_in_a_script(folder: Path) -> None:
             "continue",
             "continue",
             "print data",
+            "print event",
             "p last",
             "p node('filter').state > 3",
             "info message",
@@ -89,6 +90,8 @@ def test_a_session_in_a_script(folder: Path) -> None:
     )
     value = float(answers["print data"][0])
     assert value > 3
+    here = r"event \d+  0\.\d{9}  /watch: subscription /smooth"
+    assert re.fullmatch(here, answers["print event"][0])
     assert 0 < float(answers["p last"][0]) <= 3, "the callback has not run yet"
     assert answers["p node('filter').state > 3"] == ["True"]
     assert answers["info message"][0].split() == ["name", "/smooth"]

@@ -87,7 +87,7 @@ def test_next_and_reverse_next_stay_in_a_node(session: DebugSession) -> None:
         places.append(stopped.position)
     assert session.reverse_next().position == places[1]
     assert session.reverse_next().position == places[0]
-    with pytest.raises(DebugError, match="did you mean 'filter'"):
+    with pytest.raises(DebugError, match="did you mean '/filter'"):
         session.next("filtr")
 
 

@@ -97,10 +97,12 @@ def test_a_changed_output(tmp_path: Path) -> None:
     assert (cause.a.entity.name, link_text(cause.link)) == ("tick", "published /a")
     assert cause.a == cause.b
     assert (itself.a, itself.b) == (first.a, first.b)
-    assert [view.index for view in first.before_a] == list(range(step(20, 1) - 5, step(20, 1)))
-    assert first.before_a == first.before_b
-    assert {view.entity.node for view in first.same_node_a} == {"/left"}
-    assert [view.index for view in first.same_node_a] == [step(n, 1) for n in range(15, 20)]
+    *before, own = first.rows
+    assert [row.a.index for row in before] == list(range(step(20, 1) - 5, step(20, 1)))
+    assert all((row.sign, row.a) == (RowSign.MATCH, row.b) for row in before)
+    assert (own.sign, own.a, own.b) == (RowSign.DIFFERS, first.a, first.b)
+    assert {row.a.entity.node for row in first.node_rows} == {"/left"}
+    assert [row.a.index for row in first.node_rows] == [step(n, 1) for n in range(15, 20)]
     assert [(r.topic, r.after_ns) for r in first.reaches] == [("/l", 0), ("/s", 0)]
     # The job is not here: only what reads the trace is offered.
     assert first.next_step.startswith("rsltrace cat ")
@@ -518,7 +520,7 @@ def test_the_function_is_also_the_package(tmp_path: Path) -> None:
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)), context=2)
     assert isinstance(diff, rsltrace.Diff)
-    assert len(diff.divergences[0].before_a) == 2
+    assert len(diff.divergences[0].rows) == 2 + 1
     assert diff.verdict is rsltrace.Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     assert rsltrace.diff.traces.diff.diff_traces is not None
     assert list(inspect.signature(rsltrace.diff).parameters)[:3] == ["a", "b", "context"]

@@ -173,6 +173,19 @@ def test_lines_of_a_job_that_was_put_together_are_those_of_the_file_here(
     assert told(a, b) == {key: values}
 
 
+def test_a_job_file_below_the_working_directory_goes_by_its_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for folder in ("arm", "base"):
+        Path(folder).mkdir()
+    a, b = recorded(Path("arm")), recorded(Path("base"), JOB.replace("0.05", "0.06"))
+    a.name, b.name = "arm/run.mcap", "base/run.mcap"
+    assert list(told(a, b)) == ["arm/robot.yaml:9: delay.topics./scan.drop"]
+    (tmp_path / "arm/robot.yaml").write_text(JOB.replace("0.05", "0.5"))
+    assert list(told(a, b)) == ["robot.yaml:9: delay.topics./scan.drop"], "another job by now"
+
+
 @pytest.mark.parametrize("text", ["", "a: [", "- 1\n- 2\n", "\x00", "&a [*a]", "nodes: 3\n"])
 def test_a_damaged_job_file_has_no_lines(tmp_path: Path, text: str) -> None:
     a, b = recorded(tmp_path), recorded(tmp_path, JOB, "seed=7")

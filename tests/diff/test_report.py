@@ -39,6 +39,7 @@ from rsltrace.diff.facts.evidence import (
     CauseLink,
     CauseLinkKind,
     CauseStep,
+    EventRow,
     EventSummary,
     FieldDifference,
     FieldNote,
@@ -60,6 +61,7 @@ from rsltrace.diff.facts.remarks import (
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import FORMATS, render
 from rsltrace.diff.result import BagDiff, ComparedRun, Diff, Divergence, EntityCount
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.words.entities import EntityKey
@@ -171,10 +173,8 @@ def nondeterministic() -> Diff:
         b,
         messages=(message, log),
         chain=(CauseStep(tick, tick, CauseLink(CauseLinkKind.PUBLISHED, "/scan")), CauseStep(a, b)),
-        before_a=before,
-        before_b=before,
-        same_node_a=(event(100, 1200),),
-        same_node_b=(event(100, 1200),),
+        rows=same(*before),
+        node_rows=same(event(100, 1200)),
         reaches=(AffectedTopic("/points", 0, 3), AffectedTopic("/cmd_vel", 50 * MS, 2)),
         next_step="rsltrace cat runs/run1.mcap --node /scan_filter --from 1.35 --to 1.35",
     )
@@ -207,6 +207,10 @@ def nondeterministic() -> Diff:
     )
 
 
+def same(*events: EventSummary) -> tuple[EventRow, ...]:
+    return tuple(EventRow(one, one, RowSign.MATCH) for one in events)
+
+
 def missing() -> Diff:
     """An event of a that b does not have, in a run that was interrupted, without payloads."""
     gone = event(40, 900, TICK, EventKind.TIMER)
@@ -230,8 +234,13 @@ def missing() -> Diff:
                 no_fields=NoFieldsReason.NOT_RECORDED_IN_A,
             ),
         ),
-        before_a=(event(38, 880, TICK, EventKind.TIMER), event(39, 890)),
-        before_b=(event(37, 880, TICK, EventKind.TIMER), event(38, 890, output_hash=1)),
+        rows=(
+            *same(event(37, 870)),
+            EventRow(event(38, 880, TICK, EventKind.TIMER), None, RowSign.MOVED, 39, is_below=True),
+            EventRow(event(39, 890), event(38, 890, output_hash=1), RowSign.DIFFERS),
+            EventRow(None, event(39, 895, TICK, EventKind.TIMER), RowSign.MOVED, 38),
+            EventRow(gone, None, RowSign.ONLY_A),
+        ),
         next_step="rsltrace cat runs/run1.mcap --from 0.9 --to 0.9",
     )
     return Diff(
@@ -426,10 +435,8 @@ def crowd(diff: Diff) -> Diff:
         what=ExceptionInOneRun("no " * 200),
         chain=(step,) * 15 + found.chain[1:],
         messages=found.messages * 6,
-        before_a=events,
-        before_b=others,
-        same_node_a=tuple(event(i, i) for i in range(20)),
-        same_node_b=tuple(event(i, i, PLAN) for i in range(20)),
+        rows=tuple(EventRow(a, b, RowSign.DIFFERS) for a, b in zip(events, others, strict=True)),
+        node_rows=tuple(EventRow(event(i, i), None, RowSign.ONLY_A) for i in range(20)),
         reaches=found.reaches * 20,
     )
     return dataclasses.replace(
@@ -444,7 +451,7 @@ def crowd(diff: Diff) -> Diff:
 def test_a_longer_context_is_shown() -> None:
     found = nondeterministic().divergences[0]
     events = tuple(event(i, i) for i in range(60, 90))
-    found = dataclasses.replace(found, before_a=events, before_b=events)
+    found = dataclasses.replace(found, rows=same(*events))
     diff = dataclasses.replace(nondeterministic(), divergences=(found,))
     lines = render(diff, "text", DiffOptions(context=30)).splitlines()
     assert sum("  0.0" in row for row in lines) == 30

@@ -155,8 +155,8 @@ def test_variables_that_a_library_reads_are_told_as_one(
     done = command("record", "job.yaml")
     lines = [line for line in done.stderr.splitlines() if line.startswith("  environment")]
     assert lines == [
-        "  environment: environment variables, read by loguru in /n, 30 times",
-        "  environment: os.environ['MINE'] in /n",
+        "  environment: environment variables, read by loguru in /n at m.py:16, 30 times",
+        "  environment: os.environ['MINE'] in /n at m.py:17",
     ]
     sys.modules.pop("loguru", None)
 
@@ -168,4 +168,4 @@ def test_who_copies_the_environment_is_told_once(
     (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {time: 0.7s}\n")
     done = command("record", "job.yaml")
     lines = [line for line in done.stderr.splitlines() if line.startswith("  environment")]
-    assert lines == ["  environment: os.environ in /n, 2 times"]
+    assert lines == ["  environment: os.environ in /n at m.py:16, m.py:17, 2 times"]

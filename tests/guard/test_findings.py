@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -180,7 +181,9 @@ def test_info_cat_and_diff_tell(
         assert done.returncode in (0, 1), done.stderr
         return done.stdout
 
-    assert "guard findings: 3" in command("info", "a.mcap")
+    info = command("info", "a.mcap")
+    assert "guard findings: 3" in info
+    assert re.search(r"os\.environ\['SHIFT'\] +\d+  m\.py:\d+$", info, re.MULTILINE), info
     assert "! environment warn: os.environ['SHIFT'] -> '9'  at " + TICK in command("cat", "b.mcap")
     last = json.loads(command("cat", "b.mcap", "--json", "--kind", "timer").splitlines()[0])
     assert last["findings"][0]["value"] == "'9'"

@@ -195,7 +195,7 @@ def test_the_command_finds_chains_and_says_where_one_breaks(run: Path) -> None:
     assert "--via /controller" in broken.output
     named = call(run, "--from", "/imgae", "--to", "/cmd")
     assert named.exit_code == 2
-    assert "nobody publishes /imgae; did you mean /image?" in named.output
+    assert "nobody publishes /imgae; did you mean '/image'?" in named.output
     assert "no node is called /x" in call(run, "--via", "/x").output
     gap = call(run, "--chain", "/image,/late")
     assert gap.exit_code == 2

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -20,57 +19,12 @@ from rsltrace.trace.model.event import NO_EVENT, OutputKind
 
 pytest.importorskip("rerun")
 
-import pyarrow as pa
-from rerun.chunk import RrdReader
 from rsltrace_viewer.rerun_export.export import export
 from rsltrace_viewer.rerun_export.messages import chunks as chunks_module
 
+from tests.rerun.recording import Recording
+
 STEPS = 30
-
-
-def rows_of(batch: pa.RecordBatch) -> list[dict[str, Any]]:
-    """Return rows as dicts, times as integers of nanoseconds."""
-    columns = [
-        column.cast(pa.int64()) if pa.types.is_temporal(column.type) else column
-        for column in batch.columns
-    ]
-    return pa.RecordBatch.from_arrays(columns, names=batch.schema.names).to_pylist()
-
-
-class Recording:
-    """A recording as one list of rows (dicts) per entity; static rows apart."""
-
-    def __init__(self, path: Path) -> None:
-        self.rows: dict[str, list[dict[str, Any]]] = {}
-        self.static: dict[str, dict[str, Any]] = {}
-        self.timelines: set[str] = set()
-        reader = RrdReader(str(path))
-        self.blueprints = reader.blueprints()
-        self.recordings = reader.recordings()
-        self.views = set()
-        for chunk in reader.stream():
-            place = str(chunk.entity_path)
-            rows = rows_of(chunk.to_record_batch())
-            self.timelines |= set(chunk.timeline_names)
-            if chunk.is_static:
-                for row in rows:
-                    self.static.setdefault(place, {}).update(row)
-            else:
-                self.rows.setdefault(place, []).extend(rows)
-        for store in self.blueprints:
-            for chunk in reader.stream(store=store):
-                for row in rows_of(chunk.to_record_batch()):
-                    self.views.update(row.get("ViewBlueprint:class_identifier") or [])
-
-    def values(self, place: str, component: str) -> list[Any]:
-        """Return a component of an entity, row by row, in the order of events."""
-        rows = [r for r in self.rows[place] if r.get(component) is not None]
-        rows.sort(key=lambda row: (row.get("event") or 0, row["rerun.controls.RowId"]))
-        return [row[component] for row in rows]
-
-    def events(self, place: str, component: str) -> list[int]:
-        """Return the events at which a component of an entity was set, in order."""
-        return sorted(r["event"] for r in self.rows[place] if r.get(component) is not None)
 
 
 @pytest.fixture(scope="module")
@@ -250,10 +204,11 @@ def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Pa
     assert both.static["/run_b/topics/voltage"]["SeriesLines:names"] == ["b data"]
 
     diverged = sent_at()[20]
-    agreement = sorted(
-        (row["event"], *row["StateChange:state"]) for row in both.rows["/divergence/agreement"]
-    )
-    assert agreement == [(0, "the runs agree"), (diverged, "the runs differ")]
+    agreement = both.rows["/divergence/agreement"]
+    by_row = sorted((r["row"], *r["StateChange:state"]) for r in agreement if "row" in r)
+    assert by_row[:2] == [(0, "the runs agree"), (diverged, "the runs differ")]
+    by_time = [r["StateChange:state"] for r in agreement if "sim_time" in r]
+    assert by_time == [["the runs agree"], ["the runs differ"]]
     (text,) = both.static["/divergence"]["TextDocument:text"]
     assert f"the first {diverged} events agree" in " ".join(text.split())
     assert "pose.pose.position.x" in text
@@ -262,6 +217,42 @@ def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Pa
     assert str(b.pose.pose.position.x)[:8] in text
     chain = [row["StateChange:state"][0] for row in both.rows["/divergence/chain"]]
     assert any(f"#{diverged} " in step for step in chain)
+
+
+def test_two_runs_open_on_the_divergence_with_their_lanes_in_pairs(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "a.mcap", STEPS)
+    gallery.write_gallery(tmp_path / "b.mcap", STEPS, differs_from=20)
+    for by_event in (False, True):
+        output = tmp_path / f"{by_event}.rrd"
+        export([tmp_path / "a.mcap", tmp_path / "b.mcap"], output, by_event=by_event)
+        both = Recording(output)
+        lanes = [path for path in sorted(both.rows) if path.startswith("/lanes/robot")]
+        assert lanes == ["/lanes/robot/a", "/lanes/robot/b"]
+        row = sent_at()[20]
+        stamp = next(r["sim_time"] for r in both.rows["/run_a/events"] if r["row"] == row)
+        (opens,) = both.layout["TimePanelBlueprint:timeline"]
+        assert opens == ("row" if by_event else "sim_time")
+        (selected,) = both.layout["TimePanelBlueprint:time_selection"]
+        assert selected["min"] == (row if by_event else stamp)
+        tabs = [both.view_names.get(tab, "") for tab in both.active_tabs]
+        assert ("Callbacks by row" if by_event else "Callbacks by time") in tabs
+
+
+def test_commands_are_steps_and_axes_have_their_colours(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "run.mcap", 3)
+    export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
+    static = Recording(tmp_path / "run.rrd").static
+    steps = {p for p, curve in static.items() if "SeriesLines:interpolation_mode" in curve}
+    assert {p for p in steps if p.startswith("/topics/cmd_vel/")} == {
+        "/topics/cmd_vel/linear",
+        "/topics/cmd_vel/angular",
+    }
+    assert not [p for p in steps if p.startswith(("/topics/odom", "/topics/scan"))]
+    position = static["/topics/odom/pose.pose.position"]
+    assert position["SeriesLines:names"] == ["x", "y", "z"]
+    for place, colour in enumerate(position["SeriesLines:colors"]):
+        red_green_blue = colour.to_bytes(4, "big")[:3]
+        assert max(red_green_blue) == red_green_blue[place], "x is red, y green, z blue"
 
 
 @pytest.mark.long
@@ -285,9 +276,8 @@ def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
     (text,) = both.static["/divergence"]["TextDocument:text"]
     assert text.startswith("# The runs are identical")
     assert not [path for path in both.rows if path.startswith("/divergence/distance")]
-    assert [r["StateChange:state"] for r in both.rows["/divergence/agreement"]] == [
-        ["the runs agree"]
-    ]
+    states = [r["StateChange:state"] for r in both.rows["/divergence/agreement"]]
+    assert states == [["the runs agree"]] * 2, "by time and by row"
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ pytest.importorskip("rerun")
 
 import pyarrow as pa
 import rerun as rr
-from rsltrace_viewer.rerun_export.columns import FrameTree, clock_for, lists
+from rsltrace_viewer.rerun_export.columns import FrameTree, clocks_for, lists
 from rsltrace_viewer.rerun_export.divergence import document
 from rsltrace_viewer.rerun_export.events.chunks import hashes, step_for
 from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerBoard
@@ -86,6 +86,12 @@ def test_curves_are_the_numbers_that_stand_together() -> None:
     }
 
 
+def test_switches_and_counts_have_nothing_between_two_messages() -> None:
+    message = {"on": True, "mode": 2, "speed": {"x": 0.5}, "pins": [1, 0]}
+    found = {curve.path: curve.discrete for curve in curves_of(pa.array([message]))}
+    assert found == {"": True, "speed": False, "pins": True}
+
+
 def test_frames_are_shown_by_the_root_they_hang_on() -> None:
     tree = FrameTree()
     tree.add_edge("map", "odom")
@@ -103,10 +109,10 @@ def test_frames_in_a_circle_end_somewhere() -> None:
 
 
 def test_time_of_day_is_shown_as_a_date_and_simulated_time_as_a_duration() -> None:
-    assert not clock_for([0, 5 * S]).dated
-    assert clock_for([0, 1_700_000_000 * S]).dated
+    assert not clocks_for([0, 5 * S])[1].dated
+    assert clocks_for([0, 1_700_000_000 * S])[0].dated
     stamps = np.array([2**64 - 1, 1], dtype=np.uint64)
-    assert clock_for([0]).array(stamps).cast(pa.int64()).to_pylist() == [2**63 - 1, 1]
+    assert clocks_for([0])[0].array(stamps).cast(pa.int64()).to_pylist() == [2**63 - 1, 1]
 
 
 def marker(**fields: Any) -> dict[str, Any]:

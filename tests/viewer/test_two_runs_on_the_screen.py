@@ -115,6 +115,11 @@ class Row:
     numbers: tuple[int | None, ...]
     time_ns: int
     text: str
+    unit_ns: int = 1
+    """The digits of the time that there is room for."""
+
+    def is_at(self, stamp_ns: int) -> bool:
+        return self.time_ns == stamp_ns - stamp_ns % self.unit_ns
 
 
 def rows_on(screen: str) -> list[Row]:
@@ -135,9 +140,11 @@ def rows_on(screen: str) -> list[Row]:
         text = line[what:].partition("│")[0]
         text = re.sub(r" +[▁▂▃▄▅▆▇█]?$", "", text.rstrip())
         seconds, _, part = time.partition(".")
-        assert len(part) == 9, line
+        assert len(part) in (6, 9), line
+        unit_ns = 10 ** (9 - len(part))
         number = tuple(int(text) if text else None for text in texts)
-        found.append(Row(line[1], number, int(seconds) * 10**9 + int(part), text))
+        time_ns = int(seconds) * 10**9 + int(part) * unit_ns
+        found.append(Row(line[1], number, time_ns, text, unit_ns))
     return found
 
 
@@ -146,7 +153,7 @@ def check_alone(rows: list[Row], own: list[Read], other: list[Read]) -> int:
     compared = 0
     assert [row.numbers for row in rows] == [(event.index,) for event in own]
     for row, event in zip(rows, own, strict=True):
-        assert row.time_ns == event.stamp_ns
+        assert row.is_at(event.stamp_ns)
         for value in re.findall(r"[\w.ω]+=([^\s…\[]+)(?= |$)", row.text):
             assert said(value.strip(","), event.values), (row, event.values)
             compared += 1
@@ -173,7 +180,7 @@ def check_both(rows: list[Row], a: list[Read], b: list[Read]) -> dict[str, int]:
     for place, row in enumerate(rows):
         i, j = row.numbers
         event = a[i] if i is not None else b[j or 0]
-        assert row.time_ns == event.stamp_ns
+        assert row.is_at(event.stamp_ns)
         moved = re.search(r"([↓↑]) ([ab]) (\d+)", row.text)
         if moved:
             counts["moved"] += 1
@@ -222,6 +229,120 @@ def screens(drive: Drive, pair: tuple[Path, Path]) -> tuple[list[list[Row]], lis
 
     drive(pair, steps, size=(300, height))
     return found, traces
+
+
+SIZES = ((80, 24), (120, 40), (200, 60))
+
+
+def check_everywhere(drive: Drive, pair: tuple[Path, Path], folder: Path) -> None:
+    """Check a pair on a screen that holds all of it, on screens of every size around the
+    divergence, and in Rerun's recording."""
+    found, (a, b) = screens(drive, pair)
+    check_both(found[0], a, b)
+    for size in SIZES:
+
+        async def steps(viewer: Any) -> None:
+            for keys in (["z"], ["pagedown"], ["z"], ["pageup"], ["end"]):
+                await viewer.press(*keys)
+                check_page(rows_on(viewer.text), found[0], a, b)
+
+        drive(pair, steps, size=size)
+    check_recording([row.numbers for row in found[0]], pair, (a, b), folder / "pair.rrd")
+
+
+def check_page(page: list[Row], rows: list[Row], a: list[Read], b: list[Read]) -> None:
+    """Check that a page is a part of the rows, with the values of their events."""
+    assert page
+    first = [row.numbers for row in rows].index(page[0].numbers)
+    shown = rows[first : first + len(page)]
+    assert [row.numbers for row in page] == [row.numbers for row in shown]
+    for row, whole in zip(page, shown, strict=True):
+        assert row.sign == whole.sign
+        assert row.is_at(whole.time_ns)
+        i, j = whole.numbers
+        if moved := re.search(r"[↓↑] [ab] (\d+)", whole.text):
+            i, j = (i, int(moved[1])) if j is None else (int(moved[1]), j)
+            there = re.search(r"[↓↑] [ab] \d+ ", row.text)
+            assert there is None or there[0] == moved[0] + " "
+        for _, x, y in _SHOWN.findall(row.text) if None not in (i, j) else ():
+            if "…" not in x + y and not row.text.endswith(y):
+                assert said(x, a[i or 0].values), (row, whole)
+                assert said(y.rstrip(","), b[j or 0].values), (row, whole)
+
+
+def check_recording(
+    rows: list[tuple[int | None, ...]],
+    pair: tuple[Path, Path],
+    events: tuple[list[Read], list[Read]],
+    output: Path,
+) -> None:
+    """Check that a recording has the rows of the screen, and the events and values of the runs."""
+    pytest.importorskip("rerun")
+    from rsltrace_viewer.rerun_export.export import export
+
+    from tests.rerun.recording import Recording
+
+    export(pair, output)
+    both = Recording(output)
+    assert both.timelines == {"sim_time", "row"}
+    for side, own in enumerate(events):
+        table = sorted(both.rows[f"/run_{'ab'[side]}/events"], key=lambda row: row["row"])
+        assert [row["number"] for row in table] == [[event.index] for event in own]
+        assert [row["sim_time"] for row in table] == [event.stamp_ns for event in own]
+        numbers = {row["row"]: row["number"][0] for row in table}
+        assert numbers == {
+            place: row[side] for place, row in enumerate(rows) if row[side] is not None
+        }
+        lanes = [path for path in both.rows if re.fullmatch(f"/lanes/.*/{'ab'[side]}", path)]
+        busy = [
+            row["row"]
+            for path in lanes
+            for row in both.rows[path]
+            if row.get("row") is not None and row["StateChange:state"] != [""]
+        ]
+        assert sorted(busy) == sorted(numbers), "an event is in one lane, in its row"
+        for path, found in both.rows.items():
+            curve = re.fullmatch(rf"/run_{'ab'[side]}/topics/(?!rsltrace).*", path)
+            for row in found if curve else ():
+                values = {float(v) for v in own[numbers[row["row"]]].values if is_number(v)}
+                for value in row.get("Scalars:scalars") or ():
+                    assert value in values or value != value, (path, row)
+
+
+def is_number(text: str) -> bool:
+    return re.fullmatch(r"-?(inf|nan|[0-9.]+(e[-+]?[0-9]+)?)", text) is not None
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name == "missing_event" else pytest.mark.long)
+        for name in NAMES
+    ],
+)
+def test_samples_in_every_size_and_in_rerun(drive: Drive, name: str, tmp_path: Path) -> None:
+    check_everywhere(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"), tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.ros
+@pytest.mark.parametrize("part", range(10))
+def test_planted_pairs_in_every_size_and_in_rerun(drive: Drive, part: int, tmp_path: Path) -> None:
+    """Fifty of the faults that ``make truth`` plants."""
+    pytest.importorskip("rclpy")
+    from campaigns.truth import faults
+    from campaigns.truth.campaign import try_case
+
+    faults.load()
+    names = [name for name in faults.FAULTS if faults.FAMILIES[name] != "recordings"]
+    step = len(names) // 50
+    for name in names[part * step : 50 * step : 10 * step]:
+        folder = tmp_path / name.replace("/", "_")
+        folder.mkdir()
+        try_case(name, 0, folder)
+        pair = folder / "a.mcap", folder / "b.mcap"
+        if read(pair[0]) and read(pair[1]):
+            check_everywhere(drive, pair, folder)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -289,6 +410,8 @@ def test_constructed_pairs(drive: Drive, simulator: Any, tmp_path: Path, case: s
     simulator.Simulation(whole, tmp_path / "b.mcap", tuple(faults)).run()
     found, (a, b) = screens(drive, (tmp_path / "a.mcap", tmp_path / "b.mcap"))
     counts = check_both(found[0], a, b)
+    pair = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    check_recording([row.numbers for row in found[0]], pair, (a, b), tmp_path / "pair.rrd")
     assert check_alone(found[1], a, b) > 20
     assert check_alone(found[2], b, a) > 20
     expected = {

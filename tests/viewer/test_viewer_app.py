@@ -433,6 +433,8 @@ def test_a_click_follows_a_link(made: Path, drive: Drive) -> None:
 @pytest.mark.long
 def test_the_command_palette_offers_the_keys(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
+        offered = [one.help for one in viewer.app.get_system_commands(viewer.app.screen)]
+        assert all(text.startswith("key ") for text in offered), "none of Textual's own"
         await viewer.press("ctrl+p")
         await viewer.type("next exception")
         await viewer.settle()

@@ -7,12 +7,14 @@ import shutil
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rsltrace_viewer.model.logs import LogLine, event_of, read_logs
 from rsltrace_viewer.model.overview import (
     Met,
+    Overview,
     Times,
     callbacks_of,
     nodes_of,
@@ -51,6 +53,13 @@ def test_the_overview_counts_what_the_trace_has(long_run: Run) -> None:
     logs = list(read_logs(long_run))[-1]
     troubles = {one.what: one.count for one in troubles_of(long_run, overview, logs)}
     assert troubles["exceptions"] == 1
+
+
+def test_what_goes_wrong_is_not_told_before_it_has(run: Run) -> None:
+    part = Overview(share=0.5)
+    screen = SimpleNamespace(_session=SimpleNamespace(logs={}, checks={}))
+    title, *_ = OverviewScreen._troubles(screen, [(run, part)])  # type: ignore[arg-type]
+    assert title == ((("nothing went wrong so far", "title"),), None)
 
 
 def test_log_records_lead_to_the_events_that_logged_them(long_run: Run) -> None:

@@ -189,10 +189,10 @@ def test_the_cursor_goes_where_the_selection_is(
         def follows(timeline: str) -> None:
             here = session.current()
             assert here is not None
-            value = here[1] if timeline == "event" else here[0].stamp(here[1])
+            value = session.place if timeline == first else here[0].stamp(here[1])
             cursor.comes_to(timeline, value)
 
-        first, second = ("event", "sim_time") if count == 1 else ("sim_time", "event")
+        first, second = "event" if count == 1 else "row", "sim_time"
         follows(first)
         await shown.press("end")
         follows(first)

@@ -23,7 +23,7 @@ from rsltrace.checks.latency.instances import (
     passages,
 )
 from rsltrace.checks.latency.paths import ChainSelection, Hop, sink_hop
-from rsltrace.errors import TraceError, nearest
+from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.reader import Trace
@@ -382,18 +382,10 @@ def _not_there(
     ends = () if sink is None else (sink_hop(sink).topic,)
     for topic in (start, end, *topics):
         if topic is not None and topic not in sent and topic not in ends:
-            return f"nobody publishes {topic}" + _near(topic, sent)
+            return f"nobody publishes {topic}{near_or_all(topic, sent)}"
     if start is not None and start == end:
         return f"{start} is both ends of the chain; name a loop by its topics (--chain)"
     for one in via:
         if not nodes_called(trace, [one]):
-            return f"no node is called {one}" + _near(one, _nodes(trace))
+            return f"no node is called {one}{near_or_all(one, _nodes(trace))}"
     return ""
-
-
-def _near(name: str, names: Sequence[str]) -> str:
-    near = nearest(name, names)
-    if near is not None:
-        return f"; did you mean {near}?"
-    listed = ", ".join(names[:8]) + (", …" if len(names) > 8 else "")
-    return f"; there are {listed or 'none'}"

@@ -172,7 +172,11 @@ def _reverse_continue(shell: PromptContext, rest: str) -> None:
 
 @_add("goto", "g", usage="PLACE", topic="going back")
 def _goto(shell: PromptContext, rest: str) -> None:
-    """Go to an event (812) or a time of the run (2.5s), ahead or back; no breakpoint stops."""
+    """Go to the place before an event (812) or to a time (2.5s), ahead or back.
+
+    No breakpoint stops. At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to
+    then.
+    """
     shell.stopped(shell.session.go_to(_place(rest)))
 
 

@@ -26,6 +26,8 @@ from rsltrace.diff.row_sign import RowSign
 Ints = npt.NDArray[np.int64]
 _NONE = -1
 _COLUMN_MIN = 1024
+ALIGNED_MAX = 2_000_000
+"""Rows after the first difference; beyond, events are not compared."""
 
 
 _SIGNS = tuple(RowSign)
@@ -159,6 +161,18 @@ class AlignedRows:
         if a is None or b is None:
             elsewhere = self.partner(a if a is not None else b or 0, of_b=a is None)
         return AlignedRow(a, b, _SIGNS[self._signs.at(offset)], elsewhere)
+
+    def sign_changes(self) -> tuple[list[int], list[RowSign]]:
+        """Return the rows that have another sign than the one before, and their signs."""
+        signs = np.concatenate(([_MATCH], self._signs.values))
+        changes = np.flatnonzero(signs[1:] != signs[:-1])
+        places = [0, *(self.agreeing + changes).tolist()]
+        found = [RowSign.MATCH, *(_SIGNS[sign] for sign in signs[1:][changes].tolist())]
+        if self.agreeing == 0 and len(changes) and changes[0] == 0:
+            places, found = places[1:], found[1:]
+        if self._aligned < self.count:
+            places, found = [*places, self._aligned], [*found, RowSign.UNKNOWN]
+        return places, found
 
     def partner(self, index: int, *, of_b: bool) -> int | None:
         """Return the index that an event of a (``of_b``: of b) has in the other run."""

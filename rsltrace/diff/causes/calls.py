@@ -80,7 +80,7 @@ def unrecorded_answer(run: ComparedTrace, view: EventSummary) -> UnrecordedAnswe
     if one is None:
         return None
     call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
-    place = one.stack.partition(" in ")[0]
+    place = one.place
     return UnrecordedAnswer(shortened(printable(call), _CALL_MAX), place, one.source.value)
 
 

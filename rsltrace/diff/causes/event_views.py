@@ -55,12 +55,7 @@ class EventViews:
             ),
         )
 
-    def before(self, index: int, count: int) -> tuple[EventSummary, ...]:
-        """Return the last ``count`` events before ``index``, in order."""
-        end = min(index, self._run.trace.event_count)
-        return tuple(self.view(i) for i in range(max(end - count, 0), end))
-
-    def before_in_node(self, index: int, count: int, node: int) -> tuple[EventSummary, ...]:
+    def before_in_node(self, index: int, count: int, node: int) -> list[int]:
         """Return the last ``count`` events of a node before ``index``, in order.
 
         Two segments are looked at: what lies further back is no context any more.
@@ -76,7 +71,7 @@ class EventViews:
                 found[:0] = part["index"][own].tolist()
                 if len(found) >= count:
                     break
-        return tuple(self.view(i) for i in found[-count:] if count)
+        return found[-count:]
 
     def summary(self, outputs: list[OutputRow]) -> str:
         """Return outputs as a short text: ``/t1, call /s1``."""

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
+
+from rsltrace.diff.alignment.aligned_rows import AlignedRows
 from rsltrace.diff.alignment.blocks import EventPair
 from rsltrace.diff.alignment.rows import ComparedTrace, outputs_of
 from rsltrace.diff.causes.calls import call_differences
@@ -50,6 +53,7 @@ from rsltrace.diff.facts.evidence import (
     CauseLinkKind,
     CauseStep,
     EntityChanges,
+    EventRow,
     EventSummary,
     MessageDifference,
     Setting,
@@ -58,6 +62,7 @@ from rsltrace.diff.facts.evidence import (
 from rsltrace.diff.facts.remarks import Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Divergence
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
@@ -79,6 +84,7 @@ class Explainer:
     options: DiffOptions
     settings: Sequence[Setting]
     found: Sequence[FoundDivergence]
+    rows: AlignedRows
     _judged: dict[int, Judgement] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -299,16 +305,63 @@ class Explainer:
         return self._with_context(bare, place_a, place_b)
 
     def _with_context(self, bare: Divergence, place_a: int, place_b: int) -> Divergence:
-        count = self.options.context
-        view = bare.a or bare.b
-        node = self.run_a.matching.node_number(view.entity) if view is not None else 0
+        """Add the rows up to the divergence, and its own, also of an event that moved."""
+        count, rows = self.options.context, self.rows
+        if not count:
+            return bare
+        sides = (bare.a, place_a, self._viewer_a, False), (bare.b, place_b, self._viewer_b, True)
+        own = [rows.place_of(view.index, of_b=of_b) for view, _, _, of_b in sides if view]
+        own = own or [min(rows.place_of(place, of_b=of_b) for _, place, _, of_b in sides)]
+        first = min(own)
+        own += [there for place in own if (there := self._moved_to(place)) is not None]
+        last = min(max(own) + 1, first + max(count, 2), rows.count)
+        some = bare.a or bare.b
+        node = self.run_a.matching.node_number(some.entity) if some is not None else 0
+        of_node: set[int] = set()
+        for _, place, viewer, of_b in sides:
+            found = np.array(viewer.before_in_node(place, count, node), dtype=np.int64)
+            of_node.update(rows.places_of(found, of_b=of_b).tolist())
+        before = sorted(place for place in of_node if place < first)[-count:]
         return replace(
             bare,
-            before_a=self._viewer_a.before(place_a, count),
-            before_b=self._viewer_b.before(place_b, count),
-            same_node_a=self._viewer_a.before_in_node(place_a, count, node),
-            same_node_b=self._viewer_b.before_in_node(place_b, count, node),
+            rows=self._rows(range(max(min(own) - count, 0), last)),
+            node_rows=self._rows(before),
         )
+
+    def _moved_to(self, place: int) -> int | None:
+        """Return the other row of an event that moved."""
+        if place >= self.rows.count:
+            return None
+        row = self.rows.row(place)
+        if row.elsewhere is None:
+            return None
+        return self.rows.place_of(row.elsewhere, of_b=row.b is None)
+
+    def _rows(self, places: Iterable[int]) -> tuple[EventRow, ...]:
+        found = []
+        for place in places:
+            row = self.rows.row(place)
+            a, b = (
+                None if index is None else self.view(index, of_b=of_b)
+                for index, of_b in ((row.a, False), (row.b, True))
+            )
+            there = self._moved_to(place)
+            found.append(
+                EventRow(
+                    a,
+                    b,
+                    row.sign,
+                    row.elsewhere,
+                    there is not None and there > place,
+                    self._different_messages(*row.pair) if row.sign is RowSign.DIFFERS else (),
+                )
+            )
+        return tuple(found)
+
+    def _different_messages(self, a: int | None, b: int | None) -> tuple[MessageDifference, ...]:
+        view_a = None if a is None else self.view(a, of_b=False)
+        view_b = None if b is None else self.view(b, of_b=True)
+        return message_differences(self.run_a, self.run_b, view_a, view_b, DiffOptions())
 
     def _reaches(self, found: FoundDivergence) -> tuple[AffectedTopic, ...]:
         keys = self.run_a.matching.keys

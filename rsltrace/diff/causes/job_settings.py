@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import difflib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
@@ -31,7 +33,7 @@ _PATHS = frozenset(("parameter_files", "path", "file", "script", "program"))
 _NOTHING: tuple[object, ...] = (None, [], {})
 _NO_VALUES = tuple((nothing,) for nothing in _NOTHING)
 
-Path = tuple["str | int", ...]
+KeyPath = tuple["str | int", ...]
 
 
 def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
@@ -45,16 +47,15 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
     for change in _changes((), (), resolved_a, resolved_b):
         if change.is_of_another_version(text_a.text, text_b.text):
             continue
-        places = text_a.place(change.path_a, change.a), text_b.place(change.path_b, change.b)
-        depth, line = max(places, key=lambda place: place[0])
+        depth, line = text_a.place(change.path_a, change.a)
+        of_b = text_b.place(change.path_b, change.b)
+        name = text_a.name or text_b.name or "job.yaml"
+        if of_b[0] > depth:
+            (depth, line), name = of_b, text_b.name or name
         key = _shared_key(change, resolved_a, resolved_b)
         order = (change.may_be_one_file, line or _LINES_MAX)
-        found.append(
-            (
-                order,
-                Setting(SettingKind.JOB, _name(a, b), *change.shown(), key, line if depth else 0),
-            )
-        )
+        setting = Setting(SettingKind.JOB, name, *change.shown(), key, line if depth else 0)
+        found.append((order, setting))
     return tuple(setting for _, setting in sorted(found, key=lambda item: item[0]))
 
 
@@ -62,8 +63,8 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
 class _Change:
     """A leaf that differs: where each side has it (or would), and the values, each in a tuple."""
 
-    path_a: Path
-    path_b: Path
+    path_a: KeyPath
+    path_b: KeyPath
     a: tuple[Any] | None
     b: tuple[Any] | None
 
@@ -109,6 +110,14 @@ class _JobText:
         """From files and options: the lines of its text are of none."""
 
     @cached_property
+    def name(self) -> str:
+        """The file's path if it is below the working directory, else its name."""
+        name = str(self._trace.job.get("name") or "")
+        path, is_recorded = job_file(self._trace, name)
+        is_below = is_recorded and not os.path.isabs(path) and ".." not in Path(path).parts
+        return Path(path).as_posix() if is_below else name
+
+    @cached_property
     def _root(self) -> Any:
         if not self.text or not is_of_file(self._trace):
             return None
@@ -123,7 +132,7 @@ class _JobText:
         except (OSError, ValueError):
             return ""
 
-    def place(self, path: Path, leaf: tuple[Any] | None) -> tuple[int, int]:
+    def place(self, path: KeyPath, leaf: tuple[Any] | None) -> tuple[int, int]:
         """Return how much of a path the file has, and the line (from 1) where that is, or 0, 0.
 
         Where the leaf is not there, neither is the last step: what the file has at an entry's
@@ -185,7 +194,7 @@ def _written(step: str | int) -> str:
     return str(step).removesuffix(_NANOSECONDS)
 
 
-def _key(path: Path, value: Any) -> str:
+def _key(path: KeyPath, value: Any) -> str:
     """Return a path as ``--set`` takes it: nodes by their names where they have one."""
     steps: list[str] = []
     for step in path:
@@ -204,7 +213,7 @@ def _shared_key(change: _Change, job_a: Any, job_b: Any) -> str:
     return keys[0] if keys[0] == keys[1] else _numbered(change.path_a)
 
 
-def _numbered(path: Path) -> str:
+def _numbered(path: KeyPath) -> str:
     return ".".join(_written(step) for step in path)
 
 
@@ -212,13 +221,13 @@ def _inner(value: Any, step: str | int) -> Any:
     return value.get(step) if isinstance(value, dict) else value[step]
 
 
-def _is_named_by_users(path: Path) -> bool:
+def _is_named_by_users(path: KeyPath) -> bool:
     """Whether a key of the job is a name that its author chose, not one that rsltrace knows."""
     parents = ("arguments", "parameters", "remappings", "topics", "services")
     return isinstance(path[-1], int) or any(parent in parents for parent in path[:-1])
 
 
-def _changes(path_a: Path, path_b: Path, a: Any, b: Any) -> Iterator[_Change]:
+def _changes(path_a: KeyPath, path_b: KeyPath, a: Any, b: Any) -> Iterator[_Change]:
     """Yield the leaves that differ."""
     if isinstance(a, dict) and isinstance(b, dict):
         for key in sorted({*a, *b}):
@@ -239,7 +248,9 @@ def _holds_parts(a: list[Any], b: list[Any]) -> bool:
     return len(a) == len(b) or all(isinstance(item, dict) for item in (*a, *b))
 
 
-def _changed_entries(path_a: Path, path_b: Path, a: list[Any], b: list[Any]) -> Iterator[_Change]:
+def _changed_entries(
+    path_a: KeyPath, path_b: KeyPath, a: list[Any], b: list[Any]
+) -> Iterator[_Change]:
     if len(a) == len(b):
         changes = [(0, len(a), 0, len(b))]
     else:
@@ -286,14 +297,10 @@ def _is_time(value: Any, key: str | int) -> bool:
     return type(value) is int and str(key).endswith(_NANOSECONDS)
 
 
-def _name(a: Trace, b: Trace) -> str:
-    return a.job.get("name") or b.job.get("name") or "job.yaml"
-
-
 def _differing_lines(a: Trace, b: Trace) -> Iterator[Setting]:
     if a.job_text == b.job_text:
         return
-    name = _name(a, b)
+    name = _JobText(a).name or _JobText(b).name or "job.yaml"
     if is_effective(a) or is_effective(b):
         name = f"effective {name}"  # put together from several files: no line of one of them
     (numbers_a, lines_a), (numbers_b, lines_b) = _lines(a), _lines(b)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.words.entities import EntityKey
@@ -310,6 +311,22 @@ class MessageDifference:
     def is_input(self) -> bool:
         """Whether it is what the event received."""
         return self.position < 0
+
+
+@dataclass(frozen=True, slots=True)
+class EventRow:
+    """A row of both runs, as the viewer shows it: an event of a, of b, or the same of both.
+
+    ``elsewhere`` is the number of the event in the other run, where that has it in another row,
+    which ``is_below`` this one or above. ``messages`` is in what the two differ.
+    """
+
+    a: EventSummary | None
+    b: EventSummary | None
+    sign: RowSign
+    elsewhere: int | None = None
+    is_below: bool = False
+    messages: tuple[MessageDifference, ...] = ()
 
 
 # -- entities ----------------------------------------------------------------------------------

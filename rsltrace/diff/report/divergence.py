@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from difflib import SequenceMatcher
-from itertools import zip_longest
+from itertools import takewhile
 
-from rsltrace.diff.facts.evidence import CauseStep, EventSummary, MessageDifference, Presence
+from rsltrace.diff.facts.evidence import (
+    CauseStep,
+    EventRow,
+    EventSummary,
+    MessageDifference,
+    Presence,
+)
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
 from rsltrace.diff.report.line import (
@@ -20,16 +25,16 @@ from rsltrace.diff.report.line import (
     wrapped,
 )
 from rsltrace.diff.result import Divergence
+from rsltrace.diff.row_sign import RowSign
+from rsltrace.diff.sentences.pair_text import pair_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.words.kinds import flag_names
-from rsltrace.trace.words.phrases import event_title, seconds_text
+from rsltrace.trace.words.phrases import event_title
 
 CONTEXT = 5
 """Events before a divergence that are shown by default."""
 _DEPTH_MAX = 6
-_SIDE_BY_SIDE = 100
-"""Columns of a screen in which two lists of events stand side by side."""
 
 _REACHES_LINES = 2
 
@@ -198,93 +203,60 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
 
 
 def _before(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
-    """Return the last events before: of both runs, and of the node where that says more."""
+    """Return the rows up to the divergence: of both runs, and of the node where that says more."""
     keep = options.context if options.context > CONTEXT else 2
-    sections = [_listed("events before it", found.before_a, found.before_b, width, keep, least=1)]
-    seen = {event.index for event in (*found.before_a, *found.before_b)}
-    own = (*found.same_node_a, *found.same_node_b)
+    rows = found.rows
+    before = tuple(takewhile(lambda row: row.sign is RowSign.MATCH, rows))
+    alike = all(row.elsewhere is None for row in rows) and not any(
+        row.sign is RowSign.MATCH for row in rows[len(before) :]
+    )
+    if alike:  # then comes what is shown already
+        sections = [_listed("events before it", before, width, keep, least=1)]
+    else:
+        sections = [_listed("events around it", rows, width, keep, least=1)]
     some = found.a or found.b
-    if some is not None and any(event.index not in seen for event in own):
+    if some is not None and any(row not in rows for row in found.node_rows):
         title = f"earlier events of {printable(some.entity.node) or 'the run'}"
-        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, keep, least=0))
+        sections.append(_listed(title, found.node_rows, width, keep, least=0))
     return sections
 
 
-def _listed(
-    title: str,
-    a: tuple[EventSummary, ...],
-    b: tuple[EventSummary, ...],
-    width: int,
-    keep: int,
-    least: int,
-) -> Section:
-    if not a and not b:
+def _listed(title: str, rows: tuple[EventRow, ...], width: int, keep: int, least: int) -> Section:
+    if not rows:
         return NOTHING
-    alike = list(map(event_key, a)) == list(map(event_key, b))
-    if alike:
-        rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=52)]
-        heading = line((f"{title} (the same in both)", Style.TITLE))
-        return Section(heading, rows, keep, "events", least, drop="first", rank=7)
-    if width < _SIDE_BY_SIDE:
-        how, rows = "(= is the same in both)", _below_each_other(a, b, width)
+    if all(row.sign is RowSign.MATCH for row in rows):
+        how = "(the same in both)"
+        cells = [event_cells(row.a) for row in rows if row.a is not None]
+        heading = line((f"{title} {how}", Style.TITLE))
     else:
-        how, rows = "(a left, b right; = is the same in both)", _side_by_side(a, b, width)
-    heading = line((f"{title} ", Style.TITLE), (how, Style.FAINT))
-    return Section(heading, rows, keep, "events", least, drop="first", rank=7)
+        how = "(of a and b: = the same, ≠ differs, ~ moved, - only in a, + only in b)"
+        cells = [_row_cells(row) for row in rows]
+        heading = cut(line((f"{title} ", Style.TITLE), (how, Style.FAINT)), width)
+    shown = [cut(row, width) for row in in_columns(cells, widest=52)]
+    return Section(heading, shown, keep, "events", least, drop="first", rank=7)
 
 
-def _beside(
-    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...]
-) -> list[tuple[EventSummary | None, EventSummary | None]]:
-    """Return two lists of events as pairs, with the same events beside each other."""
-    keys_a, keys_b = ([event_key(event) for event in side] for side in (a, b))
-    found = SequenceMatcher(None, keys_a, keys_b, autojunk=False).get_opcodes()
-    if len(found) > 1 and found[0][0] in ("delete", "insert"):
-        found = found[1:]  # what the other list, which is as long, does not reach back to
-    pairs: list[tuple[EventSummary | None, EventSummary | None]] = []
-    for _, i, i_end, j, j_end in found:
-        pairs += zip_longest(a[i:i_end], b[j:j_end])
-    return pairs
-
-
-def _side_by_side(
-    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...], width: int
-) -> list[Line]:
-    """Return two lists of events as two columns."""
-    half = (width - 5) // 2
-    rows = []
-    for left, right in _beside(a, b):
-        text = f"  {_brief(left, half):<{half}}"
-        if left is not None and right is not None and event_key(left) == event_key(right):
-            rows.append(line(text, f"= {right.index}"))
-        else:
-            other = (_brief(right, half), Style.SIDE_B)
-            rows.append(line((text, Style.SIDE_A), ("| ", Style.FAINT), other))
-    return rows
-
-
-def _below_each_other(
-    a: tuple[EventSummary, ...], b: tuple[EventSummary, ...], width: int
-) -> list[Line]:
-    """Return two lists of events as one, for a narrow screen: ``=`` what is in both."""
-    rows: list[list[Piece]] = []
-    for left, right in _beside(a, b):
-        if left is not None and right is not None and event_key(left) == event_key(right):
-            rows.append([("=", Style.FAINT), *event_cells(left)])
-            continue
-        for name, style, event in (("a", Style.SIDE_A, left), ("b", Style.SIDE_B, right)):
-            if event is not None:
-                rows.append([(name, style), *event_cells(event)])
-    return [cut(row, width) for row in in_columns(rows, widest=52)]
-
-
-def _brief(event: EventSummary | None, width: int) -> str:
-    if event is None:
-        return ""
-    done = f" -> {printable(event.summary)}" if event.summary else ""
-    return shortened(
-        f"{event.index} {seconds_text(event.stamp_ns)} {event_text(event)}{done}", width
-    )
+def _row_cells(row: EventRow) -> list[Piece]:
+    """Return a row as cells of a table: sign, numbers in a and b, time, what ran, what it did or
+    in what the runs differ."""
+    event = row.a or row.b
+    assert event is not None
+    style = "" if row.a and row.b else Style.SIDE_A if row.a else Style.SIDE_B
+    numbers = [str(one.index) if one is not None else "" for one in (row.a, row.b)]
+    did = event_cells(event)[-1][0]
+    what = []
+    if row.elsewhere is not None:
+        what.append(f"{'↓' if row.is_below else '↑'} {'b' if row.a else 'a'} {row.elsewhere}")
+    elif row.a is None or row.b is None:
+        what.append(f"only in {'a' if row.a else 'b'}")
+    what.append(printable(pair_text(row.messages)) or did)
+    return [
+        (row.sign.value, Style.FAINT),
+        *((number, Style.FAINT) for number in numbers),
+        (format_seconds(event.stamp_ns), Style.FAINT),
+        (event_text(event), style),
+        (" ".join(filter(None, what)), style),
+    ]
 
 
 def moved_text(moved_ns: int) -> str:
@@ -326,15 +298,3 @@ def event_cells(event: EventSummary) -> list[Piece]:
         (event_text(event), ""),
         (f"-> {done}" if done else "", ""),
     ]
-
-
-def event_key(event: EventSummary) -> tuple[object, ...]:
-    """Return what is equal for events that are the same except for their place in the run."""
-    return (
-        event.entity,
-        event.stamp_ns,
-        event.kind,
-        event.input_hash,
-        event.output_hash,
-        event.flags,
-    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.diff.alignment.aligned_rows import AlignedRows
+from rsltrace.diff.alignment.aligned_rows import ALIGNED_MAX, AlignedRows
 from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EqualBlock
 from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.alignment.rows import ComparedTrace, first_difference
@@ -17,8 +17,6 @@ from rsltrace.diff.traces.comparison import first_item
 from rsltrace.trace.reader import Trace
 
 _EVENTS_PER_BLOCK = 2000
-_ALIGNED_MAX = 2_000_000
-"""Rows after the first difference; beyond, events are not compared."""
 
 Block = AlignedBlock | EqualBlock
 
@@ -69,7 +67,7 @@ class AlignedRuns:
             return
         self.rows.take(block)
         at_end = isinstance(block, AlignedBlock) and block.at_end
-        self.done = at_end or self.rows.matched > _ALIGNED_MAX
+        self.done = at_end or self.rows.matched > ALIGNED_MAX
 
     @property
     def progress(self) -> float:

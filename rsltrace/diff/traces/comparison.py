@@ -7,6 +7,7 @@ from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 
+from rsltrace.diff.alignment.aligned_rows import ALIGNED_MAX, AlignedRows
 from rsltrace.diff.alignment.blocks import (
     AlignedBlock,
     AlignedBlocks,
@@ -47,7 +48,7 @@ from rsltrace.diff.traces.ended_runs import (
     who_ended,
 )
 from rsltrace.diff.traces.tolerance import interruptions, messages_within, side
-from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
@@ -92,7 +93,7 @@ def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
         for glob in globs:
             if not any(fnmatchcase(name, glob) for name in known):
                 raise TraceError(
-                    f"neither run has a {what} {printable(glob)}{did_you_mean(glob, known)}"
+                    f"neither run has a {what} {printable(glob)}{near_or_all(glob, sorted(known))}"
                 )
 
 
@@ -118,6 +119,7 @@ class _TraceComparison:
             self._only_names = real is None
             self._start = start if real is None else real
             self._remarks += [RenamedProgram(*names) for names in self._matching.renamed]
+        self._rows = AlignedRows(a.event_count, b.event_count, self._start)
         self._counts = _EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
@@ -180,7 +182,7 @@ class _TraceComparison:
 
     def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
-        return Explainer(self._run_a, self._run_b, self._options, settings, found)
+        return Explainer(self._run_a, self._run_b, self._options, settings, found, self._rows)
 
     def _ended(self, over: Trace) -> Divergence:
         explainer = self._explainer([])
@@ -205,6 +207,8 @@ class _TraceComparison:
         start: AlignedBlock | None = None
         for block in blocks:
             self._aligned_to = (block.end_a, block.end_b)
+            if self._rows.matched < ALIGNED_MAX:
+                self._rows.take(block)
             if isinstance(block, EqualBlock):
                 self._counts.take_equal(block)
                 continue

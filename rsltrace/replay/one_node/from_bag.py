@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.errors import ReplayError, did_you_mean
+from rsltrace.errors import ReplayError, near_or_all
 from rsltrace.job import BagSpec, Job, StopSpec
 from rsltrace.replay.one_node.output_comparison import (
     Key,
@@ -66,9 +66,8 @@ class _NodeProbe(RunSession):
         if world.error is not None:
             raise world.error
         if found is None:
-            names = [one.fully_qualified_name for one in graph.nodes]
-            hint = did_you_mean(node, names, f"its nodes are {', '.join(names)}")
-            raise ReplayError(f"the job makes no node {node}: {hint}")
+            hint = near_or_all(node, (one.fully_qualified_name for one in graph.nodes))
+            raise ReplayError(f"the job makes no node {node}{hint}")
         return NodeTopics(
             node,
             place - hooks,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.errors import ReplayError, did_you_mean
+from rsltrace.errors import ReplayError, near_or_all
 from rsltrace.job import Job
 from rsltrace.replay.one_node.result import SENT, Column, RecordingColumns
 from rsltrace.simulation.loop.recorded_input_loop import NEVER, RecordedStep
@@ -166,9 +166,8 @@ def find_node(columns: RecordingColumns, name: str) -> Entity:
     for node in nodes:
         if node.name == wanted:
             return node
-    names = list(dict.fromkeys(node.name for node in nodes))
-    hint = did_you_mean(wanted, names, f"its nodes are {', '.join(names)}")
-    raise ReplayError(f"{trace.name} has no node {wanted}: {hint}")
+    hint = near_or_all(wanted, (node.name for node in nodes))
+    raise ReplayError(f"{trace.name} has no node {wanted}{hint}")
 
 
 def _maker(entry: int) -> str:

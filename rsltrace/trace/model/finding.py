@@ -246,6 +246,11 @@ class Finding:
     value: str
     stack: str
 
+    @property
+    def place(self) -> str:
+        """``module.py:16`` of the user's line that made the call, "" if none did."""
+        return self.stack.partition("\n")[0].partition(" in ")[0]
+
 
 @dataclass(frozen=True, slots=True)
 class GuardCount:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, replace
@@ -11,7 +10,7 @@ from functools import cached_property, partial
 from itertools import takewhile
 from pathlib import Path
 
-from rsltrace.errors import BagError
+from rsltrace.errors import BagError, near_or_all
 from rsltrace.trace.mcap.chunk import PUBLISH_TIME_BYTES
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX
 from rsltrace.trace.model.texts import format_duration
@@ -28,11 +27,9 @@ def select_topics(
     ``*`` matches ``/`` too. Raises ``BagError`` with the topics of the bag if a glob of ``topics``
     matches nothing, or nothing is left.
     """
-    there_are = f"the bag has {', '.join(sorted(set(names))) or 'no topics'}"
+    there = sorted(set(names))
     for glob in unmatched(topics, names):
-        close = difflib.get_close_matches(glob, names, n=1)
-        hint = f"did you mean {close[0]!r}?" if close else there_are
-        raise BagError(f"{bag}: no topic matches {glob!r}: {hint}", glob=glob)
+        raise BagError(f"{bag}: no topic matches {glob!r}{near_or_all(glob, there)}", glob=glob)
     selected = {
         name
         for name in names
@@ -40,7 +37,8 @@ def select_topics(
         and not any(fnmatchcase(name, glob) for glob in exclude)
     }
     if not selected:
-        raise BagError(f"{bag}: every topic is excluded: {there_are}")
+        listed = ", ".join(there) or "no topics"
+        raise BagError(f"{bag}: every topic is excluded: the bag has {listed}")
     return selected
 
 

@@ -21,6 +21,8 @@ from rsltrace_viewer.rerun_export.moments import join
 if TYPE_CHECKING:
     from rerun import ComponentDescriptor
 
+    from rsltrace.diff.alignment.aligned_rows import AlignedRows
+
 # Colours: by topic in one run; by run, with shades by topic, in two; neutral for lanes, so that
 # red and green are left to what differs and what agrees.
 #
@@ -33,8 +35,22 @@ _BY_RUN = {
 }
 
 
-def colour(root: str, number: int) -> int:
-    """Return the colour (0xRRGGBBAA) of topic or curve ``number`` in a run (``a``, ``b`` or "")."""
+_BY_AXIS = {
+    "x": (0xE53935FF, 0xFFA39EFF),
+    "y": (0x43A047FF, 0xA9DFABFF),
+    "z": (0x2979FFFF, 0xA6C8FFFF),
+    "w": (0xFFB300FF, 0xFFE39BFF),
+}
+"""As in RViz, the lighter ones for b."""
+
+AXES = frozenset(_BY_AXIS)
+
+
+def colour(root: str, number: int, name: str = "") -> int:
+    """Return the colour (0xRRGGBBAA) of topic or curve ``number`` in a run (``a``, ``b`` or ""); a
+    curve that is called ``x``, ``y``, ``z`` or ``w`` has that of the axis."""
+    if name in _BY_AXIS:
+        return _BY_AXIS[name][root == "b"]
     shades = _BY_RUN.get(root, _BY_TOPIC)
     return shades[number % len(shades)]
 
@@ -50,16 +66,35 @@ def lane(number: int) -> int:
 Column = tuple["ComponentDescriptor | str", pa.Array]
 """A component (or the name of one of ours) with its values: one per row, or a list per row."""
 
+Times = tuple[tuple[str, pa.Array], ...]
+
 SIM_TIME = "sim_time"
-EVENT = "event"
+EVENT, ROW = "event", "row"
+"""What counts events: of one run by itself, of two by their aligned rows."""
 _INT64_MAX = 2**63 - 1
 
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """How simulated time is shown: as a date where it is one, else as the time since zero."""
+    """The timelines of a run. Simulated time is a date where it is one (``dated``), else the time
+    since zero. Events of two runs count as their aligned ``rows``."""
 
     dated: bool
+    rows: AlignedRows | None = None
+    of_b: bool = False
+
+    @property
+    def order(self) -> str:
+        """The timeline that counts events."""
+        return EVENT if self.rows is None else ROW
+
+    def places(self, events: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """Return where events of this run are on that timeline."""
+        return events if self.rows is None else self.rows.places_of(events, of_b=self.of_b)
+
+    def times(self, stamps_ns: npt.NDArray[Any], events: npt.NDArray[np.int64]) -> Times:
+        """Return the columns of both timelines."""
+        return (SIM_TIME, self.array(stamps_ns)), (self.order, pa.array(self.places(events)))
 
     @property
     def timeline_type(self) -> str:
@@ -77,9 +112,10 @@ _DATES_FROM_NS = 315_532_800 * 1_000_000_000
 """1980. A simulation starts near zero; what is recorded on a robot has the time of day."""
 
 
-def clock_for(start_ns: Sequence[int]) -> Clock:
-    """Return how to show the time of runs that started then: as dates if one of them began so."""
-    return Clock(dated=any(start >= _DATES_FROM_NS for start in start_ns))
+def clocks_for(start_ns: Sequence[int], rows: AlignedRows | None = None) -> list[Clock]:
+    """Return the timelines of runs that started then: with dates if one of them began so."""
+    dated = any(start >= _DATES_FROM_NS for start in start_ns)
+    return [Clock(dated, rows, of_b=bool(nth)) for nth in range(len(start_ns))]
 
 
 def make_chunk(

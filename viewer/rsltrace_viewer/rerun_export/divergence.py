@@ -19,17 +19,20 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
+from rsltrace.diff.alignment.aligned_rows import AlignedRows
 from rsltrace.diff.facts.evidence import CauseLinkKind, CauseStep, EventSummary
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.markdown import code_block
 from rsltrace.diff.result import Diff, Divergence
+from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.values import link_text
+from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.model.texts import format_seconds, printable
 from rsltrace.trace.words.phrases import event_title
 from rsltrace_viewer.rerun_export.columns import (
-    EVENT,
+    ROW,
     SIM_TIME,
     Clock,
     lane,
@@ -72,7 +75,9 @@ def curve_keys(run: Shown) -> dict[Key, str]:
     return keys
 
 
-def distance_chunks(shown: Sequence[Shown], clock: Clock, found: Distances) -> Iterator[Chunk]:
+def distance_chunks(
+    shown: Sequence[Shown], clocks: Sequence[Clock], found: Distances
+) -> Iterator[Chunk]:
     """Yield the distances between two runs, and note in ``found`` what there is."""
     ours, theirs = (curve_keys(run) for run in shown)
     for key in ours.keys() & theirs.keys():
@@ -83,11 +88,16 @@ def distance_chunks(shown: Sequence[Shown], clock: Clock, found: Distances) -> I
         if np.array_equal(a[0], b[0]) and np.array_equal(a[2], b[2], equal_nan=True):
             found.equal.add(key)
             continue
-        stamps, events, apart = _distance(a, b)
+        # What counts is the row, where events of both runs stand.
+        a, b = (
+            (stamps, clock.places(events), values)
+            for clock, (stamps, events, values) in zip(clocks, (a, b), strict=True)
+        )
+        stamps, rows, apart = _distance(a, b)
         if not len(stamps):
             continue
         path = found.paths[key] = join("divergence", "distance", *key)
-        times = ((SIM_TIME, clock.array(stamps)), (EVENT, pa.array(events)))
+        times = ((SIM_TIME, clocks[0].array(stamps)), (ROW, pa.array(rows)))
         column = lists(np.ones(len(apart), dtype=np.int64), pa.array(apart))
         yield from make_chunk(path, times, ((rr.Scalars.descriptor_scalars(), column),))
         name = pa.array([[f"|a-b| {key[0]} {key[1]}".strip()]])
@@ -111,14 +121,16 @@ def _joined(points: list[Points]) -> tuple[_Ints, _Ints, _Floats] | None:
 def _distance(
     a: tuple[_Ints, _Ints, _Floats], b: tuple[_Ints, _Ints, _Floats]
 ) -> tuple[_Ints, _Ints, _Floats]:
-    """Return stamps, events and distances wherever one of the runs has a new value."""
+    """Return stamps, rows and distances wherever one of the runs has a new value."""
     stamps = np.union1d(a[0], b[0])
     stamps = stamps[stamps >= max(a[0][0], b[0][0])]
     last_a, last_b = (np.searchsorted(each[0], stamps, "right") - 1 for each in (a, b))
-    events = np.where(a[0][last_a] == stamps, a[1][last_a], b[1][last_b])
+    rows = np.maximum.accumulate(
+        np.where(a[0][last_a] == stamps, a[1][last_a], b[1][last_b])
+    )  # those of equal times may stand the other way round
     with np.errstate(invalid="ignore", over="ignore"):
         apart = np.sqrt(np.sum((a[2][last_a] - b[2][last_b]) ** 2, axis=1))
-    return stamps, events, apart
+    return stamps, rows, apart
 
 
 DOCUMENT = "/divergence"
@@ -126,6 +138,21 @@ AGREEMENT = "/divergence/agreement"
 CHAIN = "/divergence/chain"
 _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
+_SIGNS = {
+    RowSign.MATCH: _AGREE,
+    RowSign.DIFFERS: _DIFFER,
+    RowSign.ONLY_A: "only in a",
+    RowSign.ONLY_B: "only in b",
+    RowSign.MOVED: "moved",
+    RowSign.UNKNOWN: "not compared",
+}
+_SIGN_COLOURS = dict(
+    zip(
+        _SIGNS.values(),
+        (_GREEN, _RED, 0x4FA3FFFF, 0xFF9D3BFF, 0xFFCA28FF, 0x757575FF),
+        strict=True,
+    )
+)
 _WIDTH = 60
 """Characters of a line in the text panel."""
 
@@ -141,12 +168,13 @@ class DivergenceMarks:
     """Topics that the divergence reaches."""
     stamp_ns: int | None
     """When the runs diverge."""
+    row: int | None
+    """In which row."""
 
 
-def marks_of(diff: Diff) -> DivergenceMarks:
+def marks_of(diff: Diff, runs: AlignedRuns) -> DivergenceMarks:
     """Return what the layout needs to know."""
-    first = diff.shown
-    here = _either(first.a, first.b) if first is not None else None
+    here, row = _divergence(diff, runs)
     fields: dict[tuple[str, str], None] = {}
     for divergence in diff.divergences:
         for message in divergence.messages:
@@ -157,10 +185,27 @@ def marks_of(diff: Diff) -> DivergenceMarks:
     lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
     topics = dict.fromkeys(reach.topic for each in diff.divergences for reach in each.reaches)
     stamp_ns = here.stamp_ns if here is not None else None
-    return DivergenceMarks(DOCUMENT, lanes, tuple(fields), tuple(topics), stamp_ns)
+    return DivergenceMarks(DOCUMENT, lanes, tuple(fields), tuple(topics), stamp_ns, row)
 
 
-def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk]:
+def _divergence(diff: Diff, runs: AlignedRuns) -> tuple[EventSummary | None, int | None]:
+    """Return the event at which the runs diverge, that of the earlier row, and its row."""
+    first = diff.shown
+    sides = () if first is None else ((first.a, False), (first.b, True))
+    found = [
+        (runs.rows.place_of(view.index, of_b=of_b), view)
+        for view, of_b in sides
+        if view is not None
+    ]
+    if not found:
+        return None, runs.first_place
+    row, here = min(found, key=lambda one: one[0])
+    return here, row
+
+
+def divergence_chunks(
+    diff: Diff, runs: AlignedRuns, start_ns: int, clock: Clock
+) -> Iterator[Chunk]:
     """Yield the text and the marks. ``start_ns`` is when the earlier of the runs started."""
     yield from make_chunk(
         DOCUMENT,
@@ -171,47 +216,50 @@ def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk
         ),
     )
     first = diff.shown
-    yield from _agreement(diff, first, start_ns, clock)
+    yield from _agreement(diff, runs, start_ns, clock)
     if first is not None:
-        yield from _chain(first, clock)
+        yield from _chain(first, runs.rows, clock)
 
 
-def _agreement(
-    diff: Diff, first: Divergence | None, start_ns: int, clock: Clock
-) -> Iterator[Chunk]:
+def _agreement(diff: Diff, runs: AlignedRuns, start_ns: int, clock: Clock) -> Iterator[Chunk]:
+    """Yield the lane of agreement: by time up to the divergence, by row what each row is."""
     state = rr.StateChange.descriptor_state()
-    here = _either(first.a, first.b) if first is not None else None
-    stamps, events, states = [start_ns], [0], [_AGREE]
+    here, _ = _divergence(diff, runs)
+    stamps, states = [start_ns], [_AGREE]
     if here is not None or diff.diverged:
-        end_ns = min(diff.a.end_ns, diff.b.end_ns)
-        stamps.append(here.stamp_ns if here is not None else end_ns)
-        events.append(here.index if here is not None else diff.agreeing)
+        stamps.append(here.stamp_ns if here is not None else min(diff.a.end_ns, diff.b.end_ns))
         states.append(_DIFFER)
-    yield from make_chunk(
-        AGREEMENT,
-        ((SIM_TIME, clock.array(np.array(stamps))), (EVENT, pa.array(events))),
-        ((state, pa.array(states)),),
-    )
-    yield from lane_colours(AGREEMENT, {_AGREE: _GREEN, _DIFFER: _RED})
+    times = clock.array(np.array(stamps))
+    yield from make_chunk(AGREEMENT, ((SIM_TIME, times),), ((state, pa.array(states)),))
+    places, signs = runs.rows.sign_changes()
+    by_row = [_SIGNS[sign] for sign in signs]
+    yield from make_chunk(AGREEMENT, ((ROW, pa.array(places)),), ((state, pa.array(by_row)),))
+    yield from lane_colours(AGREEMENT, _SIGN_COLOURS)
 
 
-def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
+def _chain(first: Divergence, aligned: AlignedRows, clock: Clock) -> Iterator[Chunk]:
     """Yield the lane of causes: each from its event to the next, the divergence to the end."""
+
+    def place(a: EventSummary | None, b: EventSummary | None) -> int:
+        view = _either(a, b)
+        return 0 if view is None else aligned.place_of(view.index, of_b=a is None)
+
     steps = [(view, step) for step in first.chain if (view := _either(step.a, step.b))]
     rows = [
-        (view.index, view.stamp_ns, f"{i + 1}. {printable(_step(s))}")
+        (place(s.a, s.b), view.stamp_ns, f"{i + 1}. {printable(_step(s))}")
         for i, (view, s) in enumerate(steps)
     ]
     here = _either(first.a, first.b)
-    if here is not None and (not rows or rows[-1][0] != here.index):
-        rows.append((here.index, here.stamp_ns, f"divergence: {_event(here)}"))
+    at = place(first.a, first.b)
+    if here is not None and (not rows or rows[-1][0] != at):
+        rows.append((at, here.stamp_ns, f"divergence: {_event(here)}"))
     if not rows:
         return
     rows.sort()
     rows.append((rows[-1][0] + 1, rows[-1][1] + 1, ""))
-    indexes, stamps, texts = zip(*rows, strict=True)
+    places, stamps, texts = zip(*rows, strict=True)
     state = rr.StateChange.descriptor_state()
-    yield from make_chunk(CHAIN, ((EVENT, pa.array(indexes)),), ((state, pa.array(texts)),))
+    yield from make_chunk(CHAIN, ((ROW, pa.array(places)),), ((state, pa.array(texts)),))
     times = clock.array(np.array(stamps[:-1]))
     yield from make_chunk(CHAIN, ((SIM_TIME, times),), ((state, pa.array(texts[:-1])),))
     yield from lane_colours(CHAIN, {text: lane(i) for i, text in enumerate(texts[:-1])})
@@ -222,10 +270,7 @@ def document(diff: Diff) -> str:
 
     The events before a divergence are left out: they are on the timelines.
     """
-    divergences = tuple(
-        replace(each, before_a=(), before_b=(), same_node_a=(), same_node_b=())
-        for each in diff.divergences
-    )
+    divergences = tuple(replace(each, rows=(), node_rows=()) for each in diff.divergences)
     shown = replace(diff, divergences=divergences)
     report = report_lines(shown, DiffOptions(everything=True), width=_WIDTH)
     verdict = "The runs diverge" if diff.diverged else diff.verdict.value

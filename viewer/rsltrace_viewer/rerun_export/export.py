@@ -11,12 +11,13 @@ from pathlib import Path
 import rerun as rr
 
 from rsltrace.diff.result import Diff
+from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for, joining_chunks
+from rsltrace_viewer.rerun_export.columns import clocks_for, joining_chunks
 from rsltrace_viewer.rerun_export.divergence import (
     Distances,
     DivergenceMarks,
@@ -44,14 +45,14 @@ class Exported:
 
 
 def export(
-    traces: Sequence[Path], output: Path, *, force: bool = False, timeline: str = SIM_TIME
+    traces: Sequence[Path], output: Path, *, force: bool = False, by_event: bool = False
 ) -> Exported:
     """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
 
-    It opens on ``timeline``. Two traces are compared, and where they diverge is explained and
-    marked. The recording appears when it is complete, or not at all: then what was there before
-    stays. Raises TraceError for damaged traces, and OutputError if ``output`` exists (without
-    ``force``) or cannot be written.
+    It opens on simulated time, or ``by_event``. Two traces are compared, and where they diverge is
+    explained and marked. The recording appears when it is complete, or not at all: then what was
+    there before stays. Raises TraceError for damaged traces, and OutputError if ``output`` exists
+    (without ``force``) or cannot be written.
     """
     assert len(traces) in (1, 2)
     check_output_file(output, traces, force=force, example="run.rrd")
@@ -74,7 +75,7 @@ def export(
         except RuntimeError as error:
             raise OutputError(f"{output} cannot be written: {error}") from error
         try:
-            left_out = _send(opened, recording, diff, timeline)
+            left_out = _send(opened, recording, diff, by_event=by_event)
             recording.flush()
             recording.disconnect()  # this writes the index at the end of the file
             size = work.stat().st_size
@@ -96,31 +97,41 @@ def export(
 
 
 def _send(
-    opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None, timeline: str
+    opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None, *, by_event: bool
 ) -> list[str]:
     """Send it all; return what is left out."""
-    clock = clock_for([trace.start_ns for trace in opened])
+    runs = _aligned(opened) if diff is not None else None
+    rows = runs.rows if runs is not None else None
+    clocks = clocks_for([trace.start_ns for trace in opened], rows)
     labels = ("",) if len(opened) == 1 else ("a", "b")
     names = " and ".join(f"{Path(trace.name).name} {run_name(trace)}" for trace in opened)
     recording.send_recording_name(names)
     shown = [
         export_run(trace, label, clock, recording)
-        for trace, label in zip(opened, labels, strict=True)
+        for trace, label, clock in zip(opened, labels, clocks, strict=True)
     ]
     marks: DivergenceMarks | None = None
     if len(opened) == 2:
         trees = [run.seen.frames for run in shown]
         recording.send_chunks(joining_chunks(list(labels), trees))
     distances = Distances()
-    if diff is not None:
-        marks = marks_of(diff)
-        recording.send_chunks(distance_chunks(shown, clock, distances))
+    if diff is not None and runs is not None:
+        marks = marks_of(diff, runs)
+        recording.send_chunks(distance_chunks(shown, clocks, distances))
         start_ns = min(trace.start_ns for trace in opened)
-        recording.send_chunks(divergence_chunks(diff, start_ns, clock))
-    layout = blueprint(shown, marks, distances, timeline)
+        recording.send_chunks(divergence_chunks(diff, runs, start_ns, clocks[0]))
+    layout = blueprint(shown, marks, distances, by_event=by_event)
     recording.send_blueprint(layout, make_active=True, make_default=True)
     return [
         f"{trace.name}: no messages on {topic}: {why}"
         for trace, run in zip(opened, shown, strict=True)
         for topic, why in run.left_out.items()
     ]
+
+
+def _aligned(opened: Sequence[Trace]) -> AlignedRuns:
+    """Return the rows of two runs, all that can be compared."""
+    runs = AlignedRuns(*opened)
+    while not runs.done:
+        runs.take(runs.fetch())
+    return runs

@@ -3,9 +3,10 @@
     python -m rsltrace_viewer.rerun_export.follow TRACE [OTHER]
 
 exports the traces, opens the viewer, and then reads one JSON object per line from its standard
-input: ``{"event": 812, "sim_time": 2500000000}``. The newest of them is where the cursor goes, on
-the timeline that the viewer shows. It writes such lines as well: ``{"said": text}`` and, the last,
-``{"failed": text}``. At the end of its input, or of the viewer, all of it ends.
+input: ``{"event": 812, "sim_time": 2500000000}``, for two traces with ``row`` in place of
+``event``. The newest of them is where the cursor goes, on the timeline that the viewer shows. It
+writes such lines as well: ``{"said": text}`` and, the last, ``{"failed": text}``. At the end of its
+input, or of the viewer, all of it ends.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.errors import RsltraceError, SetupError
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
+from rsltrace_viewer.rerun_export.columns import EVENT, ROW
 from rsltrace_viewer.rerun_export.control import Viewer, controlled
 
 _STDIN, _STDOUT = 0, 1
@@ -64,25 +65,22 @@ def follow(traces: list[str]) -> None:
     selection = Selection()
     with suppress(Gone), tempfile.TemporaryDirectory(prefix="rsltrace-") as folder:
         recording = Path(folder) / "run.rrd"
-        # Several events have the same time; those of two runs have nothing else in common.
-        timeline = EVENT if len(traces) == 1 else SIM_TIME
         _say(said="making a recording for Rerun …")
-        _export(traces, recording, timeline, selection)
+        _export(traces, recording, selection)
         with controlled(pause=selection.look) as viewer:
             _say(said="Rerun loads the recording …")
             viewer.open(recording)
             _say(said="Rerun follows the selected event")
-            _move(viewer, selection, timeline)
+            _move(viewer, selection, EVENT if len(traces) == 1 else ROW)
 
 
-def _export(traces: list[str], recording: Path, timeline: str, selection: Selection) -> None:
+def _export(traces: list[str], recording: Path, selection: Selection) -> None:
     """Make a recording of traces, in another process, which ends when nobody waits for it.
 
     :raises SetupError: it cannot be made.
     """
-    command = [sys.executable, "-m", "rsltrace", "rerun", *traces, "-o", str(recording), "-q"]
-    if timeline == EVENT:
-        command.append("--by-event")
+    command = [sys.executable, "-m", "rsltrace", "rerun", *traces, "--by-event", "-q"]
+    command += ["-o", str(recording)]
     with tempfile.TemporaryFile() as complaints:
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=complaints
@@ -100,12 +98,13 @@ def _export(traces: list[str], recording: Path, timeline: str, selection: Select
             raise SetupError(f"there is no recording for Rerun: {why}")
 
 
-def _move(viewer: Viewer, selection: Selection, first: str) -> None:
-    """Have the cursor follow the selection; at first on a timeline, then on the one that is shown.
+def _move(viewer: Viewer, selection: Selection, order: str) -> None:
+    """Have the cursor follow the selection: at first in the order of events, as several have the
+    same time, then on the timeline that is shown.
 
     :raises SetupError: the viewer has ended.
     """
-    complained = ""
+    complained, first = "", order
     while viewer.status is None:
         selection.look(_LOOK_S)
         selected = selection.take()
@@ -113,7 +112,7 @@ def _move(viewer: Viewer, selection: Selection, first: str) -> None:
             continue
         try:
             timeline = first or viewer.timeline()
-            timeline = timeline if timeline in selected else EVENT
+            timeline = timeline if timeline in selected else order
             viewer.seek(timeline, selected[timeline])
             first = ""
         except (RuntimeError, OSError) as error:  # whatever its client raises, gRPC or not

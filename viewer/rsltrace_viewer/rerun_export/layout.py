@@ -15,8 +15,10 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.api import Container, View
 
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
+from rsltrace.trace.model.texts import NS_PER_S
+from rsltrace_viewer.rerun_export.columns import EVENT, ROW, SIM_TIME
 from rsltrace_viewer.rerun_export.divergence import Distances, Key, curve_keys
+from rsltrace_viewer.rerun_export.events.chunks import NUMBER
 from rsltrace_viewer.rerun_export.moments import NO_NODE
 from rsltrace_viewer.rerun_export.run import Shown
 
@@ -44,17 +46,18 @@ def blueprint(
     shown: Sequence[Shown],
     marks: DivergenceMarks | None = None,
     distances: Distances | None = None,
-    timeline: str = SIM_TIME,
+    *,
+    by_event: bool = False,
 ) -> rrb.Blueprint:
     """Return the layout for one run, or for two with what was found to differ; it opens on
-    ``timeline``."""
+    simulated time or ``by_event``."""
     world = _world(shown)
     plots = _plots(shown, marks, distances or Distances())
     above: list[Part] = []
     if marks is not None:
         above.append(rrb.TextDocumentView(origin=marks.document, name="What differs"))
     above += [part for part in (world, plots) if part is not None]
-    below = rrb.Tabs(*_below(shown, marks), name="Run")
+    below = rrb.Tabs(*_below(shown, marks), active_tab=int(by_event), name="Run")
     if not above:
         root: Part = below
     else:
@@ -63,29 +66,36 @@ def blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        _time_panel(shown, marks, timeline),
+        _time_panel(shown, marks, by_event=by_event),
         auto_views=False,
         auto_layout=False,
     )
 
 
 def _time_panel(
-    shown: Sequence[Shown], marks: DivergenceMarks | None, timeline: str
+    shown: Sequence[Shown], marks: DivergenceMarks | None, *, by_event: bool
 ) -> rrb.TimePanel:
-    """Of two runs, the viewer opens on the divergence and plays what is around it, slowly enough
-    to be watched, over and over."""
-    if marks is None or marks.stamp_ns is None or timeline != SIM_TIME:
+    """Of two runs, the viewer opens on the divergence and plays from there, slowly enough to be
+    watched, over and over: a layout can say where a loop begins, but not where a cursor stands."""
+    timeline = _order(shown) if by_event else SIM_TIME
+    start = None if marks is None else marks.row if by_event else marks.stamp_ns
+    if start is None:
         return rrb.TimePanel(state="collapsed", timeline=timeline)
-    around_ns = _in_sight_ns(shown)
-    start_ns = max(marks.stamp_ns - around_ns, 0)
+    around = _EVENTS_IN_SIGHT // 2 if by_event else _in_sight_ns(shown)
     return rrb.TimePanel(
         state="collapsed",
-        timeline=SIM_TIME,
+        timeline=timeline,
         play_state="playing",
         loop_mode="selection",
-        time_selection=rr.encodings.AbsoluteTimeRange(start_ns, marks.stamp_ns + around_ns),
-        playback_speed=min(2 * around_ns / _LOOP_NS, 1.0),
+        time_selection=rr.encodings.AbsoluteTimeRange(start, start + around),
+        playback_speed=1.0 if by_event else min(around / _LOOP_NS, 1.0),
+        fps=around * NS_PER_S / _LOOP_NS if by_event else None,
     )
+
+
+def _order(shown: Sequence[Shown]) -> str:
+    """Return the timeline that counts events."""
+    return EVENT if len(shown) == 1 else ROW
 
 
 def _world(shown: Sequence[Shown]) -> Part | None:
@@ -236,14 +246,18 @@ def _below(shown: Sequence[Shown], marks: DivergenceMarks | None) -> list[Part]:
     lanes = list(marks.lanes) if marks is not None else []
     logs: list[str] = []
     rates: list[str] = []
+    nodes = sorted({name for run in shown for name in run.nodes if name != NO_NODE})[:_LANES_MAX]
+    lanes += [run.paths.lane(name) for name in nodes for run in shown if name in run.nodes]
     for run in shown:
-        nodes = sorted(run.nodes, key=lambda name: name == NO_NODE)
-        lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX] if name != NO_NODE]
-        rates += [f"{run.paths.node(name)}/rate" for name in nodes]
-        logs += [f"{run.paths.node(name)}/log" for name in nodes]
-    by_time = _lanes(lanes, "by time", _in_sight_ns(shown))
-    by_event = _lanes(lanes, "by event", _EVENTS_IN_SIGHT // 2)
-    parts: list[Part] = [rrb.Horizontal(by_time, by_event, name="Callbacks")]
+        names = sorted(run.nodes, key=lambda name: name == NO_NODE)
+        rates += [f"{run.paths.node(name)}/rate" for name in names]
+        logs += [f"{run.paths.node(name)}/log" for name in names]
+    # A range is in units of one timeline, so there is a panel for each; one is in sight.
+    order = _order(shown)
+    parts: list[Part] = [
+        _lanes(lanes, "Callbacks by time", _in_sight_ns(shown)),
+        _lanes(lanes, f"Callbacks by {order}", _EVENTS_IN_SIGHT // 2),
+    ]
     if any(run.log_records for run in shown):
         parts.append(
             rrb.TextLogView(
@@ -251,14 +265,14 @@ def _below(shown: Sequence[Shown], marks: DivergenceMarks | None) -> list[Part]:
                 contents=_only(logs),
                 name="Log",
                 columns=rrb.TextLogColumns(
-                    timeline_columns=[SIM_TIME, EVENT],
+                    timeline_columns=[SIM_TIME, order],
                     text_log_columns=["loglevel", "body"]
                     if len(shown) == 1
                     else ["entitypath", "loglevel", "body"],
                 ),
             )
         )
-    tables: list[Part] = [_table(run) for run in shown]
+    tables: list[Part] = [_table(run, order) for run in shown]
     parts.append(tables[0] if len(tables) == 1 else rrb.Horizontal(*tables, name="Events"))
     parts.append(rrb.TimeSeriesView(origin="/", contents=_only(rates), name="Callbacks per second"))
     return parts
@@ -280,15 +294,16 @@ def _lanes(paths: list[str], name: str, around: int) -> rrb.StateTimelineView:
     )
 
 
-def _table(run: Shown) -> rrb.DataframeView:
+def _table(run: Shown, order: str) -> rrb.DataframeView:
     path = run.paths.events
+    columns = _TABLE if order == EVENT else (NUMBER, *_TABLE)
     return rrb.DataframeView(
         origin=path,
         contents="$origin",
         name=f"Events {run.paths.label}".strip(),
         query=rrb.archetypes.DataframeQuery(
-            timeline=EVENT,
-            select=[EVENT, SIM_TIME, *(f"{path}:{name}" for name in _TABLE)],
+            timeline=order,
+            select=[order, SIM_TIME, *(f"{path}:{name}" for name in columns)],
             auto_scroll=True,
         ),
     )

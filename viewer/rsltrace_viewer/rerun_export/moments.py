@@ -29,6 +29,7 @@ from rsltrace.trace.reader import Trace
 #            nodes/NODE/KIND/NAME            the events of one entity, and its rate
 #            topics/TOPIC                    its messages as data, and what Rerun draws of them
 #            services/SERVICE/request        the same for the messages of services
+#     lanes/NODE/a, lanes/NODE/b             of two runs: the lanes, the pairs next to each other
 #     frames/FRAME                           of two runs: what joins their frames
 #     divergence                             of two runs: what the diff says, and marks
 #
@@ -84,6 +85,10 @@ class Paths:
     def node(self, name: str) -> str:
         """Return the path of a node."""
         return join(self.root, "nodes", name)
+
+    def lane(self, name: str) -> str:
+        """Return the path of a node's lane: those of two runs stand next to each other."""
+        return join("lanes", name, self.label) if self.label else self.node(name)
 
     def callback(self, entity: Entity) -> str:
         """Return the path of an entity that runs callbacks or sends something."""

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import xxhash
 
-from rsltrace_viewer.rerun_export.columns import EVENT
+from rsltrace_viewer.rerun_export.columns import SIM_TIME
 from rsltrace_viewer.rerun_export.control import LOADED_S_MAX, controlled
 
 _SOFTWARE_DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
@@ -51,7 +51,7 @@ def take(
         until = time.monotonic() + LOADED_S_MAX
         while viewer.client.get_state().loading and time.monotonic() < until:
             time.sleep(0.1)
-        viewer.seek(timeline, int(value if timeline == EVENT else value * 1e9))
+        viewer.seek(timeline, int(value * 1e9 if timeline == SIM_TIME else value))
         time.sleep(settle_s)
         viewer.client.save_screenshot(str(picture.absolute()))
         return [

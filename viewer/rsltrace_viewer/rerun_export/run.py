@@ -17,7 +17,7 @@ from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import output_of
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_chunk
+from rsltrace_viewer.rerun_export.columns import Clock, make_chunk
 from rsltrace_viewer.rerun_export.events.chunks import EventRows
 from rsltrace_viewer.rerun_export.messages.chunks import MessageRows, Seen
 from rsltrace_viewer.rerun_export.moments import NO_NODE, Moments, Paths
@@ -84,10 +84,7 @@ class LogRows:
             rows = pa.array(places)
             yield from make_chunk(
                 path,
-                (
-                    (SIM_TIME, self._clock.array(stamps[places])),
-                    (EVENT, pa.array(events[places])),
-                ),
+                self._clock.times(stamps[places], events[places]),
                 (
                     (rr.TextLog.descriptor_text(), texts.take(rows)),
                     (rr.TextLog.descriptor_level(), levels.take(rows)),
@@ -106,10 +103,7 @@ class LogRows:
                 self.count += 1
                 yield from make_chunk(
                     f"{self._paths.node(name)}/log",
-                    (
-                        (SIM_TIME, self._clock.array(np.array([event["stamp"]]))),
-                        (EVENT, pa.array([output.event])),
-                    ),
+                    self._clock.times(np.array([event["stamp"]]), np.array([output.event])),
                     (
                         (rr.TextLog.descriptor_text(), pa.array([text])),
                         (rr.TextLog.descriptor_level(), pa.array(["CRITICAL"])),

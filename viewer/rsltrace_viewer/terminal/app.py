@@ -82,7 +82,10 @@ class ViewerApp(Stepping):
         """Have Rerun follow."""
         here = self.session.current()
         if self._rerun is not None and here is not None:
-            self._rerun.select(here[1], here[0].stamp(here[1]))
+            both = self.session.comparison
+            of_b = both is not None and here[0] is both.run_b
+            row = both.place_of(here[1], other=of_b) if both is not None else None
+            self._rerun.select(here[1], here[0].stamp(here[1]), row)
 
     def _rerun_said(self, text: str, is_over: bool) -> None:
         if is_over:
@@ -427,8 +430,7 @@ class ViewerApp(Stepping):
         self.look_through()
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
-        """Offer all keys by their help in the command palette."""
-        yield from super().get_system_commands(screen)
+        """Offer all keys by their help in the command palette, and nothing of Textual's own."""
         for key in keys_of(two=self.session.b is not None, live=self.live):
             yield SystemCommand(f"{key.help}", f"key {key.shown}", self._runner(key.action))
 

@@ -108,10 +108,11 @@ class RerunFollower:
         os.set_blocking(self._process.stdin.fileno(), False)
         Thread(target=self._listen, args=(self._process, say), daemon=True).start()
 
-    def select(self, event: int, stamp_ns: int) -> None:
-        """Have the cursor go to an event, or its simulated time, without waiting for it."""
+    def select(self, event: int, stamp_ns: int, row: int | None = None) -> None:
+        """Have the cursor go to an event, its row or its simulated time, without waiting for it."""
         if self._process is not None and self._process.stdin is not None:
-            line = json.dumps({"event": event, "sim_time": stamp_ns}) + "\n"
+            where = {"event" if row is None else "row": event if row is None else row}
+            line = json.dumps({**where, "sim_time": stamp_ns}) + "\n"
             with suppress(OSError):  # it has ended, and has said so
                 os.write(self._process.stdin.fileno(), line.encode())
 

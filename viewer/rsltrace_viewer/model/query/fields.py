@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.conditions.trace_events import TraceCondition
-from rsltrace.errors import ConditionError, TraceError
+from rsltrace.errors import ConditionError, TraceError, near_or_all
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import WITH_TOPIC
@@ -161,8 +161,8 @@ def _read_node(run: Run, token: Token) -> EventFilter:
     for part in alternatives(token):
         matching = {node.id for node in run.nodes if is_named(part.text, node.name)}
         if not matching:
-            names = ", ".join(node.name for node in run.nodes[:8])
-            raise QueryError(f"no node matches; there are {names}", part.start, part.end)
+            near = near_or_all(part.text, (node.name for node in run.nodes))
+            raise QueryError(f"no node matches{near}", part.start, part.end)
         owners |= matching
     return conditions.of_nodes(run, frozenset(owners))
 
@@ -191,10 +191,8 @@ def _read_topic(run: Run, token: Token) -> EventFilter:
             if e.kind in WITH_TOPIC and is_named(part.text, e.name)
         }
         if not matching:
-            names = ", ".join(run.topics[:8])
-            raise QueryError(
-                f"no topic or service matches; there are {names}", part.start, part.end
-            )
+            near = near_or_all(part.text, run.topics)
+            raise QueryError(f"no topic or service matches{near}", part.start, part.end)
         found |= matching
     return conditions.OfEntities(conditions.ids(found), outputs=True)
 

@@ -18,7 +18,7 @@ from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.topic_fields import OF_MESSAGE, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
-from rsltrace.errors import ConditionError, RsltraceError
+from rsltrace.errors import ConditionError, RsltraceError, near_or_all
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.decode import to_plain
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
@@ -137,8 +137,8 @@ def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token
     for part in alternatives(token):
         matching = {name for name in names if is_named(part.text, name)}
         if not matching:
-            known = ", ".join(names[:8])
-            raise QueryError(f"no {what} matches; there are {known}", part.start, part.end)
+            near = near_or_all(part.text, names)
+            raise QueryError(f"no {what} matches{near}", part.start, part.end)
         wanted |= matching
     return TopicCondition(lambda part, among: part.all(of(part.topic) in wanted))
 
@@ -210,8 +210,8 @@ def _where(topics: list[str], token: Token) -> TopicCondition:
         if found is None:
             raise QueryError("say /topic: EXPRESSION", token.start, token.end)
         if found[1] not in topics:
-            known = ", ".join(topics[:8])
-            raise QueryError(f"no topic matches; there are {known}", token.start, token.end)
+            near = near_or_all(found[1], topics)
+            raise QueryError(f"no topic matches{near}", token.start, token.end)
         expression = parse_expression(found[2], has_own=True)
     except ConditionError as error:
         raise QueryError(error.message, *place_of(token, error)) from None

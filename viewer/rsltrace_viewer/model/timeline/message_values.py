@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from rsltrace.diff.sentences.pair_text import TURNS, number
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
@@ -32,7 +33,6 @@ _FLAT = frozenset(
 ) | {"nav_msgs/msg/OccupancyGrid"}
 """Types with one long array of numbers, which is decoded at once."""
 _EMPTY = ("0", "false", '""', "[]")
-_TURNS = {"x": "ωx", "y": "ωy", "z": "ω"}
 
 
 def message_values(message: object, varying: Collection[str] = ()) -> str:
@@ -217,18 +217,6 @@ def differing_values(a: object, b: object) -> tuple[str, str]:
     return texts[0], texts[1]
 
 
-def field_name(path: str, *, whole: bool = False) -> str:
-    """Return how a row calls a field: ``x``, of an angular velocity ``ω``; ``whole``: with the
-    field it is in. A message that has nothing but ``data`` needs no name."""
-    names = path.split(".")
-    name = names[-1].rstrip("_")
-    if "angular" in names[:-1]:
-        name = _TURNS.get(name, name)
-    if path == "data":
-        return ""
-    return ".".join([*names[-2:-1], name]) if whole else name
-
-
 def _leaves(value: Any, path: str, in_full: bool = False) -> Iterator[tuple[str, str]]:
     if isinstance(value, (bool, np.bool_)):
         yield path, "true" if value else "false"
@@ -256,7 +244,7 @@ def _fields(message: Any, path: str, in_full: bool) -> Iterator[tuple[str, str]]
         return
     turns = "angular" in path and names == ["x", "y", "z"]
     for name in names:
-        inner = _TURNS[name] if turns else name.rstrip("_")
+        inner = TURNS[name] if turns else name.rstrip("_")
         yield from _leaves(getattr(message, name), f"{path}.{inner}".lstrip("."), in_full)
 
 
@@ -270,12 +258,6 @@ def _items(values: Any) -> str:
 
 def _yaw(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def number(value: float, digits: int = 4) -> str:
-    """Return a number in so many digits: ``0.31``, ``1.234e+06``."""
-    text = f"{value:.{digits}g}"
-    return "0" if text == "-0" else text
 
 
 # What events sent and got, with values, for rows. Read apart from the rows: messages have to be

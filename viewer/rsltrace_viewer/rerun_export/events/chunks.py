@@ -21,9 +21,10 @@ from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.events import group_equal, output_text
 from rsltrace.trace.words.kinds import flag_names, kind_label
 from rsltrace_viewer.rerun_export.columns import (
-    EVENT,
     SIM_TIME,
     Clock,
+    Column,
+    Times,
     constant,
     lane,
     lane_colours,
@@ -219,6 +220,9 @@ class Rates:
         yield from np.flatnonzero(self._counts.any(axis=1)).tolist()
 
 
+NUMBER = "number"
+"""The column of the table that has the number of an event in its run."""
+
 _BATCH_EVENTS = 65_536
 _BATCH_OUTPUTS = 262_144
 """A batch ends with either: rows enough to be fast, few enough to be small."""
@@ -253,13 +257,12 @@ class EventRows:
         """Yield all chunks, the rates last. Raises TraceError where the trace is damaged."""
         for events, outputs in self._batches():
             self.rates.add(events)
-            stamps = self._clock.array(events["stamp"])
-            indexes = pa.array(events["index"].astype(np.int64))
+            times = self._clock.times(events["stamp"], events["index"].astype(np.int64))
             sent = self._labels.sent(events["outputs"].astype(np.int64), outputs)
             callbacks = self._labels.callbacks(events["entity"])
-            yield from self._table(events, stamps, indexes, callbacks, sent)
-            yield from self._lanes(events, stamps, callbacks)
-            yield from self._entities(events, stamps, indexes, sent)
+            yield from self._table(events, times, callbacks, sent)
+            yield from self._lanes(events, times, callbacks)
+            yield from self._entities(events, times, sent)
         self.active_nodes = [n for n, a in zip(self.node_names, self._active, strict=True) if a]
         for path, states in self._lane_states.items():
             yield from lane_colours(path, {text: lane(i) for i, text in enumerate(states)})
@@ -293,8 +296,7 @@ class EventRows:
     def _table(
         self,
         events: npt.NDArray[np.void],
-        stamps: pa.Array,
-        indexes: pa.Array,
+        times: Times,
         callbacks: pa.Array,
         sent: pa.Array,
     ) -> list[Chunk]:
@@ -302,8 +304,9 @@ class EventRows:
         caused = causes != np.uint64(NO_EVENT)
         return make_chunk(
             self._paths.events,
-            ((SIM_TIME, stamps), (EVENT, indexes)),
+            times,
             (
+                *self._numbers(events),
                 ("node", self._labels.nodes(events["entity"])),
                 ("kind", self._labels.kinds(events["kind"])),
                 ("callback", callbacks),
@@ -315,40 +318,46 @@ class EventRows:
             ),
         )
 
+    def _numbers(self, events: npt.NDArray[np.void]) -> list[Column]:
+        """Of two runs, rows are on the timeline: the numbers of events are data."""
+        numbers = pa.array(events["index"].astype(np.int64))
+        return [] if self._clock.rows is None else [(NUMBER, numbers)]
+
     def _lanes(
-        self, events: npt.NDArray[np.void], stamps: pa.Array, callbacks: pa.Array
+        self, events: npt.NDArray[np.void], times: Times, callbacks: pa.Array
     ) -> Iterator[Chunk]:
         """Yield the lanes. By event, a lane is filled where its node runs, and empty elsewhere; by
         time, where a callback takes none, it shows the last callback that ran."""
         state = rr.StateChange.descriptor_state()
         nodes = self._node_of[np.minimum(events["entity"], len(self._node_of) - 1)]
-        indexes = events["index"].astype(np.int64)
-        following = np.append(nodes[1:], -1)
+        (_, stamps), (timeline, rows) = times
+        shown = rows.to_numpy()
+        following, next_places = np.append(nodes[1:], -1), np.append(shown[1:], -1)
         by_node, numbers, starts = _grouped(nodes)
         for number, own in zip(numbers.tolist(), np.split(by_node, starts[1:]), strict=True):
             self._active[number] = True
-            path = self._paths.node(self.node_names[number])
+            path = self._paths.lane(self.node_names[number])
             texts = callbacks.take(pa.array(own))
             self._lane_states.setdefault(path, {}).update(dict.fromkeys(texts.unique().to_pylist()))
             yield from make_chunk(
                 path, ((SIM_TIME, stamps.take(pa.array(own))),), ((state, texts),)
             )
-            # Where another node runs next, an empty text ends the lane.
-            last = own[following[own] != number]
-            places = np.concatenate([indexes[own], indexes[last] + 1])
+            # Where another node runs next, or nothing in this run, an empty text ends the lane.
+            ends = (following[own] != number) | (next_places[own] != shown[own] + 1)
+            last = own[ends]
+            places = np.concatenate([shown[own], shown[last] + 1])
             order = np.argsort(places, kind="stable")
             with_ends = pa.concat_arrays([texts, constant("", len(last), pa.string())])
             yield from make_chunk(
                 path,
-                ((EVENT, pa.array(places[order])),),
+                ((timeline, pa.array(places[order])),),
                 ((state, with_ends.take(pa.array(order))),),
             )
 
     def _entities(
         self,
         events: npt.NDArray[np.void],
-        stamps: pa.Array,
-        indexes: pa.Array,
+        times: Times,
         sent: pa.Array,
     ) -> Iterator[Chunk]:
         order, ids, starts = _grouped(events["entity"])
@@ -361,7 +370,7 @@ class EventRows:
             rows = pa.array(own)
             yield from make_chunk(
                 self._paths.callback(entity),
-                ((SIM_TIME, stamps.take(rows)), (EVENT, indexes.take(rows))),
+                tuple((name, column.take(rows)) for name, column in times),
                 (
                     (rr.TextLog.descriptor_text(), sent.take(rows)),
                     (rr.TextLog.descriptor_level(), levels.take(rows)),
@@ -369,10 +378,7 @@ class EventRows:
             )
 
     def _rates(self) -> Iterator[Chunk]:
-        times = (
-            (SIM_TIME, self._clock.array(self.rates.stamps_ns)),
-            (EVENT, pa.array(self.rates.events)),
-        )
+        times = self._clock.times(self.rates.stamps_ns, self.rates.events)
         by_node: dict[str, list[int]] = {}
         for entity_id in self.rates.running():
             entity = self._trace.entities.get(entity_id)
@@ -384,9 +390,7 @@ class EventRows:
         for name, ids in by_node.items():
             yield from self._rate(f"{self._paths.node(name)}/rate", times, ids, name)
 
-    def _rate(
-        self, path: str, times: tuple[tuple[str, pa.Array], ...], ids: list[int], name: str
-    ) -> Iterator[Chunk]:
+    def _rate(self, path: str, times: Times, ids: list[int], name: str) -> Iterator[Chunk]:
         scalars = pa.array(self.rates.of(ids))
         yield from make_chunk(path, times, ((rr.Scalars.descriptor_scalars(), scalars),))
         label = f"{self._paths.label} {name}".strip()

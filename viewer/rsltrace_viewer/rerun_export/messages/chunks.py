@@ -16,6 +16,7 @@ import numpy.typing as npt
 import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk, McapReader
+from rerun.components import InterpolationMode
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.format import (
@@ -27,8 +28,7 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import (
-    EVENT,
-    SIM_TIME,
+    AXES,
     Clock,
     Column,
     FrameTree,
@@ -44,6 +44,7 @@ from rsltrace_viewer.rerun_export.messages.rows import (
     Stream,
     Waiting,
     curves_of,
+    is_command,
     left_out,
     loaded_chunk,
     loaded_columns,
@@ -153,7 +154,7 @@ class MessageRows:
         batch = chunk.to_record_batch()
         columns = loaded_columns(batch)
         if chunk.is_static:
-            yield from self._static(path, columns)
+            yield from self._static(path, topic, columns)
             return
         stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
         stream = (path, tuple(f.name for f, _ in columns))
@@ -181,13 +182,13 @@ class MessageRows:
             path = path.rpartition("/")[0]
         return "", ""
 
-    def _static(self, path: str, columns: LoadedColumns) -> list[Chunk]:
+    def _static(self, path: str, topic: str, columns: LoadedColumns) -> list[Chunk]:
         """Names of curves and the like."""
         for f, column in columns:
             if f.name == "SeriesLines:names":
                 names = tuple(f"{self._paths.label} {n}".strip() for n in column[0].as_py())
                 self.seen.curves[path] = names
-                return self._curve_names(path, names)
+                return self._curve_names(path, names, steps=is_command(topic))
         return loaded_chunk(path, (), columns)
 
     def _as_it_is(self, rows: ComponentRows) -> Iterator[Chunk]:
@@ -237,7 +238,8 @@ class MessageRows:
                 ):
                     self._markers.log(rows.path, message, stamp_ns, event)
                 continue
-            yield from self._curves(rows, curves_of(messages))
+            steps = is_command(rows.topic, type_name)
+            yield from self._curves(rows, curves_of(messages), steps=steps)
             draw = SHAPES.get(type_name)
             if draw is not None:
                 yield from self._draw(rows, draw(messages, self._paint(rows.topic)), messages)
@@ -276,7 +278,7 @@ class MessageRows:
         start_ns = np.array([self._trace.start_ns])
         return make_chunk(
             path,
-            ((SIM_TIME, self._clock.array(start_ns)), (EVENT, pa.array([0]))),
+            self._clock.times(start_ns, np.array([0])),
             ((rr.CoordinateFrame.descriptor_frame(), pa.array([f"{self._prefix}{frame}"])),),
         )
 
@@ -335,7 +337,9 @@ class MessageRows:
 
     # Curves.
 
-    def _curves(self, rows: ComponentRows, curves: Iterator[Curves]) -> Iterator[Chunk]:
+    def _curves(
+        self, rows: ComponentRows, curves: Iterator[Curves], *, steps: bool = False
+    ) -> Iterator[Chunk]:
         for curve in curves:
             path = rows.path + (join(curve.path) if curve.path else "")
             scalars = rr.Scalars.descriptor_scalars()
@@ -346,22 +350,26 @@ class MessageRows:
                 names = tuple(f"{self._paths.label} {name}".strip() for name in curve.names)
                 self.seen.curves[path] = names
                 self.seen.topic_of[path] = rows.topic
-                yield from self._curve_names(path, names)
+                yield from self._curve_names(path, names, steps=steps or curve.discrete)
 
     def _note_points(self, path: str, rows: ComponentRows, values: pa.ListArray) -> None:
         if self._paths.label:
             points = (rows.stamps_ns, rows.events, values)
             self.seen.points.setdefault(path, []).append(points)
 
-    def _curve_names(self, path: str, names: tuple[str, ...]) -> list[Chunk]:
+    def _curve_names(self, path: str, names: tuple[str, ...], *, steps: bool) -> list[Chunk]:
         one = np.array([len(names)])
+        axes = [name.rpartition(" ")[2] for name in names]
         columns: list[Column] = [
             (rr.SeriesLines.descriptor_names(), lists(one, pa.array(list(names))))
         ]
-        if self._paths.label:
-            paints = [colour(self._paths.label, i) for i in range(len(names))]
+        if self._paths.label or AXES.issuperset(axes):
+            paints = [colour(self._paths.label, i, axis) for i, axis in enumerate(axes)]
             paint = pa.array(paints, type=pa.uint32())
             columns.append((rr.SeriesLines.descriptor_colors(), lists(one, paint)))
+        if steps:
+            mode = pa.array([InterpolationMode.StepAfter.value] * len(names), type=pa.uint8())
+            columns.append((rr.SeriesLines.descriptor_interpolation_mode(), lists(one, mode)))
         return make_chunk(path, (), columns)
 
     def _ends(self) -> Iterator[Chunk]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import rerun as rr
 
 from rsltrace.trace.model.texts import printable
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, FrameTree
+from rsltrace_viewer.rerun_export.columns import SIM_TIME, Clock, FrameTree
 from rsltrace_viewer.rerun_export.messages.shapes import rotated
 from rsltrace_viewer.rerun_export.moments import join
 
@@ -261,8 +261,7 @@ class MarkerRows:
             if change.what is not None:
                 if change.frame:
                     self._note_frame(at, change.frame)
-                self._set_time(stamp_ns)
-                self._recording.set_time(EVENT, sequence=event)
+                self._set_time(stamp_ns, event)
                 self._recording.log(at, change.what)
                 self._log_frame(at)
             if change.expires_ns is not None:
@@ -291,8 +290,7 @@ class MarkerRows:
         if first:
             self._frames.frames[path] = frame
             self._frames.drawn.add(path)
-            self._set_time(self._start_ns)
-            self._recording.set_time(EVENT, sequence=0)
+            self._set_time(self._start_ns, 0)
             self._log_frame(path)
 
     def _log_frame(self, path: str) -> None:
@@ -303,7 +301,10 @@ class MarkerRows:
             name = f"{self._label}/{frame}" if self._label else frame
             self._recording.log(path, rr.CoordinateFrame(frame=name))
 
-    def _set_time(self, stamp_ns: int) -> None:
+    def _set_time(self, stamp_ns: int, event: int | None = None) -> None:
+        if event is not None:
+            place = int(self._clock.places(np.array([event]))[0])
+            self._recording.set_time(self._clock.order, sequence=place)
         if self._clock.dated:
             self._recording.set_time(SIM_TIME, timestamp=np.datetime64(stamp_ns, "ns"))
         else:

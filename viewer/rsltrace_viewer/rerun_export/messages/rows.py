@@ -20,7 +20,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoders
 from rsltrace.trace.model.texts import NO_FIELD
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists
+from rsltrace_viewer.rerun_export.columns import Clock, Times, lists
 from rsltrace_viewer.rerun_export.messages.shapes import items, numbers
 
 # Numeric fields of messages as curves: what makes any topic plottable, whatever its type.
@@ -37,11 +37,15 @@ _TIME_FIELDS = ({"sec", "nanosec"}, {"seconds", "nanoseconds"})
 
 @dataclass(frozen=True, slots=True)
 class Curves:
-    """Curves with one point per message: ``scalars`` has a list of values per row."""
+    """Curves with one point per message: ``scalars`` has a list of values per row.
+
+    What is ``discrete`` (switches, counts, enumerations) has no values between two messages.
+    """
 
     path: str
     names: tuple[str, ...]
     scalars: pa.Array
+    discrete: bool = False
 
 
 def curves_of(structs: pa.StructArray) -> Iterator[Curves]:
@@ -64,7 +68,8 @@ def _curves(structs: pa.StructArray, path: str) -> Iterator[Curves]:
         shown = names[:_CURVES_MAX]
         values = np.stack([numbers(structs.field(name)) for name in shown], axis=1)
         counts = np.full(len(structs), len(shown), dtype=np.int64)
-        yield Curves(path, tuple(shown), lists(counts, pa.array(values.reshape(-1))))
+        discrete = not any(_is_floating(structs.type.field(name).type) for name in shown)
+        yield Curves(path, tuple(shown), lists(counts, pa.array(values.reshape(-1))), discrete)
     for name, array in inner:
         below = f"{path}.{name}" if path else name
         if pa.types.is_struct(array.type):
@@ -80,13 +85,34 @@ def _array(array: pa.Array, path: str) -> Iterator[Curves]:
     most = int(np.max(counts)) if len(counts) else 0
     if 0 < most <= _ITEMS_MAX:
         names = tuple(f"[{place}]" for place in range(most))
-        yield Curves(path, names, lists(counts, pa.array(numbers(values))))
+        discrete = not _is_floating(array.type.value_type)
+        yield Curves(path, names, lists(counts, pa.array(numbers(values))), discrete)
 
 
 def _is_number(kind: pa.DataType) -> bool:
-    return bool(
-        pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)
+    return bool(pa.types.is_integer(kind) or pa.types.is_boolean(kind) or _is_floating(kind))
+
+
+def _is_floating(kind: pa.DataType) -> bool:
+    return bool(pa.types.is_floating(kind))
+
+
+# What is sent to be done holds until the next message, so its curves are steps.
+
+_COMMAND_TYPES = frozenset(
+    (
+        *("geometry_msgs.msg.Twist", "geometry_msgs.msg.TwistStamped", "geometry_msgs.msg.Wrench"),
+        *("ackermann_msgs.msg.AckermannDrive", "ackermann_msgs.msg.AckermannDriveStamped"),
+        *("trajectory_msgs.msg.JointTrajectory", "control_msgs.msg.JointJog"),
     )
+)
+_COMMAND_NAMES = ("cmd", "command", "setpoint", "target", "goal")
+
+
+def is_command(topic: str, type_name: str = "") -> bool:
+    """Whether messages on a topic are commands, by their type or its name."""
+    name = topic.rpartition("/")[2].lower()
+    return type_name in _COMMAND_TYPES or any(word in name for word in _COMMAND_NAMES)
 
 
 # Which topics Rerun's loader may read: it has no limits of its own for what a type says.
@@ -176,7 +202,6 @@ _BYTES_PER_CHUNK = 1 << 20
 Stream = tuple[str, tuple[str, ...]]
 """A path and the columns of its rows: such rows follow each other."""
 
-Times = tuple[tuple[str, pa.Array], ...]
 LoadedColumns = tuple[tuple[pa.Field, pa.Array], ...]
 """Columns as the loader made them; the metadata of a field says which component it holds."""
 
@@ -233,7 +258,7 @@ class Waiting:
             arrays = [pa.concat_arrays(list(parts)) for parts in zip(*self.parts, strict=True)]
         stamps = np.concatenate(self.stamps_ns)
         events = np.concatenate(self.events)
-        times = ((SIM_TIME, clock.array(stamps)), (EVENT, pa.array(events)))
+        times = clock.times(stamps, events)
         columns = tuple(zip(self.fields, arrays, strict=True))
         return ComponentRows(self.topic, self.path, times, stamps, events, columns)
 

@@ -166,9 +166,12 @@ class OverviewScreen(Screen[Choice | None]):
         ]
         heads = [(f"{f'run {name}':>10}", "muted") for name in "ab"] if len(runs) > 1 else []
         whole = all(overview.share >= 1 for _, overview in runs) and len(logs) == len(runs)
-        wrong = any(one.count for known in found for one in known.values())
         checks = self._session.checks
-        if whole and not wrong and not any(one.violated or one.error for one in checks.values()):
+        wrong = any(one.count for known in found for one in known.values())
+        wrong = wrong or any(one.violated or one.error for one in checks.values())
+        if not wrong and not whole:
+            yield ((("nothing went wrong so far", "title"),), None)
+        elif not wrong:
             yield ((("nothing went wrong", "title"),), None)
             usual = "no exceptions, no errors or warnings logged, no findings of the guard"
             yield (((usual, "good"),), None)
