@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NoReturn
 
-from rsltrace.conditions.names import near_name, nodes_called
-from rsltrace.errors import TraceError
+from rsltrace.conditions.names import nodes_called
+from rsltrace.errors import TraceError, near_or_all
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.operation import is_built_in
@@ -85,7 +85,5 @@ def _not_begun(history: RunHistory, node: str) -> Reason | None:
 
 
 def _fail(trace: Trace, what: str, word: str, names: list[str]) -> NoReturn:
-    near, there = near_name(word, names), ", ".join(dict.fromkeys(names[:12])) or "none"
-    hint = f"did you mean {near!r}?" if near else f"there are {there}"
-    text = f"has no {what} that is called {word!r}; {hint}"
+    text = f"has no {what} that is called {word!r}{near_or_all(word, names)}"
     raise TraceError(f"{trace.name} {printable(text)}")
