@@ -43,10 +43,8 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
         end, name = ends.pop(), _ENDS[signal.Signals(number)]
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):
-            os.write(
-                2,
-                f"\nrsltrace: {name}, closing the trace (repeat to force, twice to kill)\n".encode(),
-            )
+            what = f"{name}, closing the trace (repeat to force, twice to kill)"
+            os.write(2, f"\nrsltrace: {what}\n".encode())
         end(Stop(name, 128 + number))
 
     for caught in _ENDS:
