@@ -125,7 +125,7 @@ def test_a_cluster_fetches_what_may_be_kept_when_later_runs_come_first(
 def test_nothing_is_said_to_be_kept_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with (
-        pytest.raises(ExploreError, match="Not a directory; name another folder with -o$"),
+        pytest.raises(ExploreError, match=r"Not a directory; name another folder with -o$"),
         ResultsFolder(tmp_path / "file/search", {}, resume=False),
     ):
         pass
