@@ -297,8 +297,13 @@ _CALLS = {
     *("eval", "exec", "compile", "__import__", "import_module", "run_module", "run_path"),
     *("exec_module", "load_module"),
 }
-_MODULES = set("pickle marshal shelve dill cloudpickle jsonpickle runpy imp code".split())
-_SHELLS = {"os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"}
+_MODULES = set(
+    "pickle marshal shelve dill cloudpickle jsonpickle runpy imp code codeop yaml".split()
+)
+_SHELLS = {
+    *("os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"),
+    "asyncio.create_subprocess_shell",
+}
 
 
 class _CodeFinder(ast.NodeVisitor):
@@ -360,6 +365,62 @@ def test_text_becomes_code_only_where_that_is_meant() -> None:
     assert RUNS_CODE.keys() <= found.keys(), "what no module does any more goes from the list"
 
 
+_MARKUP = {"from_markup", "Template"}
+
+
+def _formats_of_others(source: str) -> list[str]:
+    """Return formats that are no texts or constants of the module, and what reads markup."""
+    found = []
+    tree = ast.parse(source)
+    texts = {
+        name.id
+        for node in ast.walk(tree)
+        if isinstance(node, ast.For)
+        and not any(isinstance(one, (ast.Call, ast.Attribute)) for one in ast.walk(node.iter))
+        for name in ast.walk(node.target)
+        if isinstance(name, ast.Name)
+    }
+    """Those that a loop takes out of a literal."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.Call):
+            continue
+        called = node.func
+        if (called.id if isinstance(called, ast.Name) else getattr(called, "attr", "")) in _MARKUP:
+            found.append(ast.unparse(called))
+        if not isinstance(called, ast.Attribute) or called.attr not in ("format", "format_map"):
+            continue
+        text = called.value
+        while isinstance(text, ast.Subscript):
+            text = text.value
+        name = getattr(text, "id", "")
+        if not (isinstance(text, ast.Constant) or name.isupper() or name in texts):
+            found.append(ast.unparse(called))
+    return found
+
+
+_FORMATS = {
+    "rsltrace/simulation/middleware/events/failure.py": "summary.format",  # of a traceback
+    "rsltrace/adapters/rclpy/messages/decoder_source.py": "conversion.format",  # of a table there
+}
+
+
+def test_formats_are_texts_of_ours() -> None:
+    """A format can read attributes (``{0.__class__}``), and markup can show what is not there."""
+    root = Path(__file__).parents[1]
+    for folder in ("rsltrace", "viewer"):
+        for path in (root / folder).rglob("*.py"):
+            file = str(path.relative_to(root))
+            found = set(_formats_of_others(path.read_text(encoding="utf-8")))
+            assert found <= set(_FORMATS.get(file, "").split()), file
+
+
+@pytest.mark.parametrize(
+    "source", ["text.format(1)", "a.text.format_map(b)", "Text.from_markup(a)"]
+)
+def test_a_format_of_somebody_else_is_found(source: str) -> None:
+    assert _formats_of_others(source)
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -367,6 +428,8 @@ def test_text_becomes_code_only_where_that_is_meant() -> None:
         "builtins.exec(text)",
         "compile(tree, 'x', 'eval')",
         "import pickle",
+        "import yaml",
+        "asyncio.create_subprocess_shell(text)",
         "from pickle import loads",
         "__import__(name)",
         "importlib.import_module(name)",

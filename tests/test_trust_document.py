@@ -9,9 +9,8 @@ ROOT = Path(__file__).parents[1]
 
 
 def test_every_promise_is_held_by_a_test() -> None:
-    rows = re.findall(
-        r"^\| (?!promise|text|---)(.*) \| (.*) \|$", (ROOT / "docs/trust.md").read_text(), re.M
-    )
+    promises = (ROOT / "docs/trust.md").read_text().partition("## Recording")[2]
+    rows = re.findall(r"^\| (?!promise|text|---)(.*) \| (.*) \|$", promises, re.M)
     assert rows
     for promise, held_by in rows:
         file = ""

@@ -19,6 +19,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 from typing import NoReturn
 
@@ -31,6 +32,7 @@ _POLL_S = 0.004
 LEFT_S = 30.0
 
 
+@lru_cache
 def entry_point() -> Callable[[], object]:
     """Return what the ``rsltrace`` command calls."""
     (entry,) = importlib.metadata.entry_points(group="console_scripts", name="rsltrace")
@@ -54,6 +56,7 @@ def preload(*, ros: bool) -> None:
     modules += ["tty", "html", "rich._export_format", "textual.drivers.linux_driver"]
     for name in modules:
         importlib.import_module(name)
+    entry_point()  # a signal that comes while a fork looks for it would be no fault of ours
     b"x".decode("utf-8-sig")  # another user may not be able to read Python's own files
     if ros:
         for name in ("rclpy.node", "std_msgs.msg", "std_srvs.srv", "rsltrace.run"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import asdict
 from datetime import datetime, timezone
@@ -250,12 +251,15 @@ def _waits(trace: Trace) -> list[str]:
 
 def _node_lines(trace: Trace, counts: TraceCounts) -> list[str]:
     nodes = _nodes(trace)
+    owned: defaultdict[int, list[int]] = defaultdict(list)
+    for entity in trace.entities.values():
+        owned[entity.node].append(entity.id)
     rows = [("  node", "entities", "events", "outputs")]
     for node in nodes:
-        owned = [e.id for e in trace.entities.values() if e.node == node.id]
-        events = sum(counts.events[e].count for e in owned if e in counts.events)
-        outputs = sum(counts.outputs[e].count for e in owned if e in counts.outputs)
-        rows.append((f"  {printable(node.name)}", str(len(owned)), str(events), str(outputs)))
+        own = owned[node.id]
+        events = sum(_count(counts.events, entity) for entity in own)
+        outputs = sum(_count(counts.outputs, entity) for entity in own)
+        rows.append((f"  {printable(node.name)}", str(len(own)), str(events), str(outputs)))
     title = f"nodes: {len(nodes)}"
     return [title, *table(rows, right=frozenset((1, 2, 3)))] if nodes else [title]
 

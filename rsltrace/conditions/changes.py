@@ -11,7 +11,7 @@ from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_seconds
 
-_NOT_THERE = "(not there)"
+NOT_THERE = "(not there)"
 
 
 class TimeCondition(ActiveCondition):
@@ -55,7 +55,7 @@ class WatchCondition(ActiveCondition):
             value = self._expression.value(moment)
         except Exception as error:
             self.note = error_text(error)
-            return 0, _NOT_THERE
+            return 0, NOT_THERE
         self.note = ""
         try:
             found = self._hasher.digest(value, self._expression.text)

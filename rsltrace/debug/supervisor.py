@@ -169,9 +169,14 @@ class Supervisor:
         return {"index": cause + 1, "stamp_ns": sender["stamp_ns"], "event": sender}
 
     def _last_changed(self, request: Message) -> Message:
+        from rsltrace.conditions.changes import NOT_THERE
+
         name = self._node(request)
         text = f"watch node({name!r}).{request['attribute']}"
-        hit = self.tree.last_hit({"breakpoints": [{"number": 0, "text": text}]}, self._index + 1)
+        conditions = [{"number": 0, "text": text}]
+        hit = self.tree.last_hit({"breakpoints": conditions}, self._index + 1)
+        while hit is not None and hit["text"].endswith(f"-> {NOT_THERE}"):  # the node was destroyed
+            hit = self.tree.last_hit({"breakpoints": conditions}, int(hit["index"]))
         if hit is None:
             raise DebugError(f"{request['attribute']} of {name} has not changed so far")
         return dict(hit["position"])

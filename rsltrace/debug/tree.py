@@ -90,19 +90,22 @@ class CheckpointTree:
             self.family.kill(root)
             raise
 
-    def ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
+    def ask_cursor(
+        self, request: Message, *, whole: bool = False, limit_s: float | None = None
+    ) -> Any:
         """Send a request to the process at the session's position.
 
         :raises Lost: that process ended; another one stands there now.
         """
         try:
-            return self._ask(self._cursor, request, whole=whole)
+            return self._ask(self._cursor, request, whole=whole, limit_s=limit_s)
         except Lost as error:
             raise self._recover(self.position, error) from None
 
     def ask_copy(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
-        """Have a copy run user code; the copy may be killed."""
-        answer = self.ask_cursor(request, whole=True)
+        """Have a copy run user code, or the cursor itself if it cannot be copied; it may be
+        killed."""
+        answer = self.ask_cursor(request, whole=True, limit_s=limit_s)
         if "with" not in answer:
             return answer["ok"]
         copy = SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
@@ -416,7 +419,8 @@ class CheckpointTree:
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":
                 process.lines.send({"id": 0, "do": "pause"})
-                self._paused_s = time.monotonic()
+                if self._paused_s is None:  # a second Ctrl-C does not wait longer
+                    self._paused_s = time.monotonic()
             else:
                 self._waiting.append(request)
         if self._client.ended and process is not None:

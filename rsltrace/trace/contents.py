@@ -9,6 +9,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -126,17 +127,20 @@ def check_contents(trace: Trace) -> None:
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         if not len(outputs):
             continue
+        outputs = outputs[np.lexsort((outputs["entity"], outputs["kind"]))]
         stamps = events["stamp"][outputs["event"] - events["index"][0]]
-        pairs = np.stack((outputs["kind"], outputs["entity"]), axis=1)
-        for kind, entity in np.unique(pairs, axis=0).tolist():
-            chosen = (outputs["kind"] == kind) & (outputs["entity"] == entity)
+        keys = outputs[["kind", "entity"]]
+        begins = np.flatnonzero(np.append(True, keys[1:] != keys[:-1])).tolist()
+        for begin, end in pairwise((*begins, len(outputs))):
+            kind, entity = keys[begin].item()
+            chosen = outputs[begin:end]
             if kind == OutputKind.ENTITY:
-                _check_entity(trace, outputs[chosen])
+                _check_entity(trace, chosen)
                 entities.add(entity)
             elif kind in _WITH_MESSAGE:
-                kept = chosen & (outputs["sequence"] != NO_SEQUENCE)
+                kept = chosen["sequence"] != NO_SEQUENCE
                 if kept.any():
-                    _check_messages(trace, messages, outputs[kept], stamps[kept])
+                    _check_messages(trace, messages, chosen[kept], stamps[begin:end][kept])
     if not trace.complete:
         return  # what events that were never written had to do with may be there
     for channel_id, found in messages.items():

@@ -30,7 +30,7 @@ pytestmark = pytest.mark.ros
 
 HALVES = (
     ("traces", "records", "schemas", "texts", "pasted", "servers", "golden"),
-    ("bags", "jobs", "nodes", "kills", "disks", "serving", "replays"),
+    ("bags", "jobs", "nodes", "kills", "disks", "serving", "replays", "sources"),
 )
 """Two processes, so that two cores share the work; each loads what it attacks once."""
 

@@ -11,7 +11,9 @@ import os
 import re
 import subprocess
 import sys
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
@@ -29,9 +31,10 @@ from trace_maker import (
 
 from rsltrace.cli.main import cli
 from rsltrace.trace.cdr import log_content
-from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.model.texts import printable
+from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import table
 from tests.golden_files import check_golden
 
@@ -93,6 +96,34 @@ def indexes(*arguments: object) -> list[int]:
 
 def test_info_of_a_run(run: tuple[Path, Feeder]) -> None:
     golden("info.txt", output("info", run[0]))
+
+
+def test_info_reads_the_entities_as_often_of_many_nodes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once for each node took minutes for a trace of a few megabytes."""
+
+    class Counted(dict[int, Entity]):
+        reads = 0
+
+        def values(self) -> Any:
+            Counted.reads += 1
+            return super().values()
+
+    entities = Trace.entities.func
+    counted = cached_property(lambda trace: Counted(entities(trace)))
+    counted.__set_name__(Trace, "entities")
+    monkeypatch.setattr(Trace, "entities", counted)
+    reads = []
+    for nodes in (1, 50):
+        with Opened(tmp_path / f"{nodes}.mcap") as feeder:
+            for number in range(nodes):
+                feeder.entity(EntityKind.NODE, f"/n{number}")
+            feeder.writer.close(result={"stop_reason": "nothing", "exit_code": "0"})
+        Counted.reads = 0
+        assert f"nodes: {nodes}\n" in output("info", tmp_path / f"{nodes}.mcap")
+        reads.append(Counted.reads)
+    assert reads[0] == reads[1]
 
 
 def test_info_of_an_interrupted_run(interrupted: Path) -> None:

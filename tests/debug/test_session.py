@@ -142,6 +142,8 @@ def test_who_changed_sent_and_when_it_became_true(session: DebugSession) -> None
     assert made.event["kind"] == "construct"
     with pytest.raises(DebugError, match="has not changed"):
         session.last_changed("filter", "nothing")
+    session.go_on()  # to the end, where the node is gone
+    assert session.last_changed("filter", "warned") == changed
     session.go_to(700)
     true = session.first_true("when filter.state > 100")
     assert true == changed

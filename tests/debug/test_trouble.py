@@ -254,6 +254,29 @@ def test_a_callback_that_does_not_come_back(job: Callable[..., Path]) -> None:
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("presses", [False, True])
+def test_an_endless_expression_ends_where_no_copy_can_be_made(
+    presses: bool, job: Callable[..., Path]
+) -> None:
+    open_socket, _ = NOT_COPIED["socket"]
+    with DebugSession(job(open_socket, "pass")) as session:
+        session.run_to(80)
+        stop = threading.Event()
+
+        def keep_pressing() -> None:
+            while presses and not stop.wait(1.0):
+                session.pause()
+
+        thread = threading.Thread(target=keep_pressing)
+        thread.start()
+        with pytest.raises(DebugError, match=r"did not come back.* back at 80"):
+            session.evaluate("sum(iter(int, 1))")
+        stop.set()
+        thread.join()
+        assert session.evaluate("ticks.n") == 79
+
+
+@pytest.mark.long
 def test_a_run_is_paused_and_goes_on(job: Callable[..., Path]) -> None:
     with DebugSession(job("pass", duration="3600s")) as session:
         timer = threading.Timer(1.0, session.pause)

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.errors import ExploreError
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.search import Explorer, SearchBudget
 from rsltrace.search.explore.small.causes import reduce_failures
@@ -119,3 +120,12 @@ def test_a_cluster_fetches_what_may_be_kept_when_later_runs_come_first(
         if cluster._with_trace(one, "a", tmp_path / str(number)).trace:
             there.append(number)
     assert there == [5, 4, 3, 2, 1]
+
+
+def test_nothing_is_said_to_be_kept_where_nothing_can_be_written(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with (
+        pytest.raises(ExploreError, match=r"Not a directory; name another folder with -o$"),
+        ResultsFolder(tmp_path / "file/search", {}, resume=False),
+    ):
+        pass

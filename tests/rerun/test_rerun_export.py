@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 from collections.abc import Callable
 from pathlib import Path
 
@@ -454,6 +455,21 @@ def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match=r"run\.mcap"):
         export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
     assert not (tmp_path / "run.rrd").exists()
+
+
+@pytest.mark.parametrize("size", [4096, 40_000, 100_000])
+def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path, size: int) -> None:
+    trace_maker.write_run(tmp_path / "run.mcap", 300)
+    (tmp_path / "run.rrd").write_bytes(b"precious")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        with pytest.raises(OutputError, match=r"run\.rrd cannot be written: File too large"):
+            export([tmp_path / "run.mcap"], tmp_path / "run.rrd", force=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert (tmp_path / "run.rrd").read_bytes() == b"precious"
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 @pytest.mark.long

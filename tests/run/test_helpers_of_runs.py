@@ -175,6 +175,9 @@ def wire(nodes):
 
 def broken(nodes):
     raise ValueError('cannot wire')
+
+def wrong(one, two):
+    pass
 """
 
 
@@ -210,3 +213,8 @@ def test_hooks_in_python_and_what_goes_wrong(record_job: Any) -> None:
     assert "ValueError: cannot wire" in str(result.error)
     with pytest.raises(JobError, match=r"job\.yaml:2:16: .*has no 'brokn'; did you mean 'broken'"):
         record_job(TALKER + "hooks: {after: nodes_under_test:brokn}\n", HOOKS)
+    for name in ("before", "after"):
+        with pytest.raises(
+            JobError, match=r"job\.yaml:2:1\d: .*wrong is called with the .*missing"
+        ):
+            record_job(TALKER + f"hooks: {{{name}: nodes_under_test:wrong}}\n", HOOKS)

@@ -273,6 +273,34 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
         assert trace.complete
 
 
+def test_a_third_interrupt_ends_a_process_that_unwinds(job_file: Any, tmp_path: Path) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Stuck}]\n",
+        "class Stuck(Talker):\n"
+        "    def tick(self):\n"
+        "        print('stuck', flush=True)\n"
+        "        import sys\n"
+        "        sys.setrecursionlimit(10**9)\n"
+        "        def f(n): return f(n + 1)\n"
+        "        f(0)\n",
+    )
+    process = _start(tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "stuck\n"
+    assert process.stderr is not None
+    time.sleep(2)  # the recursion is deep now
+    process.send_signal(signal.SIGINT)
+    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    for _ in range(2):
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGINT
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert not trace.complete
+
+
 @pytest.mark.long
 def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
     job_file: Any, tmp_path: Path

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal import follow
 from rsltrace_viewer.terminal.screens.report import PickScreen
 from trace_maker import Opened, boundaries, write_run
 
+from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import EventKind
 
 Drive = Callable[..., None]
@@ -60,6 +62,16 @@ def test_one_event(tmp_path: Path, drive: Drive) -> None:
         assert viewer.app.session.lane_window.window.order
 
     drive(path, steps)
+
+
+@pytest.mark.parametrize("stamp_ns", [2**63 - 1, 2**64 - 1])
+def test_times_that_no_run_has(tmp_path: Path, stamp_ns: int) -> None:
+    path = tmp_path / "late.mcap"
+    with Opened(path) as feeder:
+        feeder.event(EventKind.CLOCK_JUMP, 0, stamp_ns)
+        feeder.writer.close(result={"stop_reason": "nothing", "exit_code": "0"})
+    with pytest.raises(TraceError, match=r"late\.mcap: an event is later than any time of ROS"):
+        Run.open(path)
 
 
 @pytest.mark.long

@@ -21,6 +21,7 @@ NAMES = (
     "serving",
     "golden",
     "replays",
+    "sources",
 )
 
 

@@ -33,6 +33,7 @@ _WRITING: tuple[tuple[str, ...], ...] = (
     ("diff", "a.mcap", "b.mcap", "-o", "report.txt"),
     ("diff", "a.mcap", "b.mcap", "-o", "report.txt", "--format", "junit"),
     ("view", "a.mcap", "--export", "screen.svg"),
+    ("rerun", "a.mcap", "-o", "out.rrd"),
     ("check", "job.yaml", "--graph", "graph.svg"),
     ("init", "new.yaml", "--from", "robot.py:Arm"),
 )
@@ -66,6 +67,7 @@ def _begin(case: Case, corpus: Corpus) -> str:
         "bag",
         "report.txt",
         "screen.svg",
+        "out.rrd",
         "graph.svg",
         "new.yaml",
         "job.schema.json",
@@ -128,7 +130,7 @@ def _no_room(rng: Random, case: Case, corpus: Corpus) -> None:
         found = _inputs_kept(case, before, runs[-1]) + _outputs_whole(case, runs[-1])
         if old and runs[-1].status:
             found += recordings.judge(case, runs, old=old)
-        if words[0] in ("diff", "export", "view") and runs[-1].status == 2:
+        if words[0] in ("diff", "export", "view", "rerun") and runs[-1].status == 2:
             target = case.folder / words[words.index("-o" if "-o" in words else "--export") + 1]
             if target.exists():
                 text = f"{target.name} was left, half-written"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]
 import os
 import signal
 import sys
@@ -20,12 +21,14 @@ if TYPE_CHECKING:
 @contextmanager
 def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
     """End the run cleanly at the first SIGINT, SIGTERM or SIGHUP; a second one interrupts the
-    callback that is stuck."""
+    callback that is stuck, a third one ends the process, whatever that callback does."""
+    from rsltrace.guard.redirect import copy_of
     from rsltrace.simulation.loop.stop import Stop
 
     ends: list[Callable[[Stop], None]] = []
     old: dict[int, Any] = {}
     process = os.getpid()
+    set_handler = copy_of(_signal.signal)  # not that of nodes, in whose code a signal may come
 
     def handle(number: int, frame: object) -> None:
         if os.getpid() != process:  # a node's fork, which has no run to end
@@ -33,11 +36,15 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
             os.kill(os.getpid(), number)
             return
         if not ends:
+            # By the kernel: Python runs no handler while it unwinds a very deep recursion.
+            for caught in old:
+                set_handler(int(caught), int(signal.SIG_DFL))
             raise KeyboardInterrupt(128 + number)
         end, name = ends.pop(), _ENDS[signal.Signals(number)]
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):
-            os.write(2, f"\nrsltrace: {name}, closing the trace (repeat to force)\n".encode())
+            what = f"{name}, closing the trace (repeat to force, twice to kill)"
+            os.write(2, f"\nrsltrace: {what}\n".encode())
         end(Stop(name, 128 + number))
 
     for caught in _ENDS:

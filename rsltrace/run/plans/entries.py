@@ -356,12 +356,26 @@ def add_job_location(job: Job, entry: JobEntry, error: RunError | None) -> None:
 def hook_entries(
     job: Job, name: str, target: Target | None, argument: Callable[[], object]
 ) -> list[JobEntry]:
-    """Return a hook of the job, if it has it, as an entry. A hook may return more nodes."""
+    """Return a hook of the job, if it has it, as an entry. A hook may return more nodes.
+
+    :raises JobError: it cannot be imported, or does not take its argument.
+    """
     if target is None:
         return []
     where = locate(job, ("hooks", name))
     function: Any = load_target(target, where=where) if isinstance(target, str) else target
     title = f"hook {name}: {target_text(target)}"
+    given = {"before": "the job", "after": "the list of nodes"}[name]
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        signature = None  # unknown
+    try:
+        if signature is not None:
+            signature.bind(None)
+    except TypeError as error:
+        wrong = f"{target_text(target)} is called with {given}, as its only argument: {error}"
+        raise _error_with_line(job, ("hooks", name), wrong) from None
     return [JobEntry(title, lambda: function(argument()) or [], [], key=title)]
 
 

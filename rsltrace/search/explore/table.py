@@ -65,7 +65,7 @@ class ResultsFolder:
             for name in (LEARNED, RESULTS):
                 self._files[name] = os.open(self.folder / name, flags, 0o666)
         except OSError as error:
-            raise _cannot_write(self.folder, error) from None
+            raise _cannot_write(self.folder, error, "name another folder with -o") from None
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -98,7 +98,8 @@ class ResultsFolder:
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(file, size)
-            raise _cannot_write(self.folder, error) from None
+            kept = f"the results so far are kept in {self.folder}, --resume continues"
+            raise _cannot_write(self.folder, error, kept) from None
 
     def _check(self) -> None:
         there = self.folder / SEARCH
@@ -184,9 +185,6 @@ def _replace(path: Path, text: str) -> None:
         work.write_text(text)
 
 
-def _cannot_write(folder: Path, error: OSError) -> ExploreError:
+def _cannot_write(folder: Path, error: OSError, next_step: str) -> ExploreError:
     of = error.filename or folder
-    return ExploreError(
-        f"{of} cannot be written: {error.strerror}; the results so far are kept in {folder}, "
-        "--resume continues"
-    )
+    return ExploreError(f"{of} cannot be written: {error.strerror}; {next_step}")

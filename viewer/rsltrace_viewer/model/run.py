@@ -30,6 +30,9 @@ _SEGMENTS_KEPT = 24
 """About 0.4 MB each with outputs."""
 
 
+_STAMP_MAX = 2**63 - 1
+
+
 @dataclass(frozen=True, slots=True)
 class Segment:
     """The events of a segment: EVENT_DTYPE, shape (n,); ``first`` is the index of the first."""
@@ -62,7 +65,11 @@ class Run:
     @classmethod
     def open(cls, path: Path | str) -> Run:
         """Open a trace. Raises TraceError, TraceFormatError."""
-        return cls(Trace.open(path))
+        run = cls(Trace.open(path))
+        if run.end_ns >= _STAMP_MAX:
+            run.close()
+            raise TraceError(f"{path}: an event is later than any time of ROS")
+        return run
 
     @property
     def name(self) -> str:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Thread
 
 import rerun as rr
 
@@ -15,6 +16,7 @@ from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.trace.exports.output_file import check_output_file
+from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import clocks_for, joining_chunks
@@ -28,6 +30,8 @@ from rsltrace_viewer.rerun_export.divergence import (
 from rsltrace_viewer.rerun_export.layout import blueprint
 from rsltrace_viewer.rerun_export.run import export_run
 from rsltrace_viewer.rerun_export.sdk import APPLICATION_ID
+
+_PIECE_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,32 +72,55 @@ def export(
         )
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
-        final = Path(os.path.realpath(output))
-        work = final.with_name(f".{final.name}.part-{os.getpid()}")
         try:
-            recording.save(work)
-        except RuntimeError as error:
-            raise OutputError(f"{output} cannot be written: {error}") from error
-        try:
-            left_out = _send(opened, recording, diff, by_event=by_event)
-            recording.flush()
-            recording.disconnect()  # this writes the index at the end of the file
-            size = work.stat().st_size
-            work.replace(final)
-        except BaseException as error:
-            recording.disconnect()
-            work.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                reason = error.strerror or error
-                raise OutputError(f"{output} cannot be written: {reason}") from error
-            raise
+            with replacement_of(output) as work, _saved(recording, work):
+                left_out = _send(opened, recording, diff, by_event=by_event)
+        except OSError as error:
+            reason = error.strerror or error
+            raise OutputError(f"{output} cannot be written: {reason}") from error
         return Exported(
             output,
             sum(trace.event_count for trace in opened),
             sum(trace.size for trace in opened),
-            size,
+            output.stat().st_size,
             tuple(left_out),
         )
+
+
+@contextmanager
+def _saved(recording: rr.RecordingStream, path: Path) -> Iterator[None]:
+    """Write what is sent to a recording, and its index at the end, to a file.
+
+    Rerun writes to a pipe, not to the file: of a full disk its own writer hangs, or says nothing.
+
+    :raises OSError: not all could be written.
+    """
+    errors: list[OSError] = []
+    reading, writing = os.pipe()
+
+    def copy() -> None:
+        with open(reading, "rb", buffering=0) as source:
+            while data := source.read(_PIECE_BYTES):
+                try:
+                    if not errors:
+                        file.write(data)
+                except OSError as error:
+                    errors.append(error)
+
+    with path.open("wb") as file:
+        copier = Thread(target=copy, daemon=True)
+        copier.start()
+        try:
+            recording.save(f"/proc/self/fd/{writing}")
+        finally:
+            os.close(writing)
+        try:
+            yield
+        finally:
+            recording.disconnect()
+            copier.join()
+    if errors:
+        raise errors[0]
 
 
 def _send(

@@ -54,7 +54,7 @@ async def settle(app: Shown, pause: object) -> None:
     loop = asyncio.get_running_loop()
     end = loop.time() + _SETTLE_S
     quiet = 0
-    while quiet < 2 and loop.time() < end:
+    while quiet < 2 and loop.time() < end and app._exception is None:
         await pause(_PAUSE_S)
         busy = app.busy or any(worker.is_running for worker in app.workers)
         quiet = 0 if busy else quiet + 1
