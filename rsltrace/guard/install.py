@@ -12,6 +12,7 @@ import resource
 import sys
 import tempfile
 import zlib
+from _elementtree import Element  # type: ignore[import-not-found]
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from contextvars import ContextVar, Token
@@ -29,7 +30,6 @@ from types import (
 )
 from typing import Any
 from weakref import CallableProxyType, ProxyType, ReferenceType
-from xml.etree.ElementTree import Element
 
 from rsltrace.guard.addresses import reported_hashes
 from rsltrace.guard.call_reports import reported_calls
@@ -299,6 +299,7 @@ def own_process_ids() -> Iterator[None]:
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
 )
+# ``Element`` is taken from the C module: ``xml.etree.ElementTree`` loads slowly.
 _SHOWING_ADDRESSES = (
     *(object, FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType),
     *(BuiltinMethodType, MethodWrapperType, CodeType, CellType, FrameType),

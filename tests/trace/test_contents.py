@@ -56,7 +56,7 @@ def test_what_was_recorded_passes(path: Path) -> None:
     ("topic", "change", "said"),
     [
         ("/push", lambda data, nth: data[:-1] + bytes([data[-1] ^ 1]), "message 0 on /push is not"),
-        ("/scan", lambda data, nth: data[:-4] if nth == 3 else data, "whole message"),
+        ("/scan", lambda data, nth: data[:-4] if nth == 3 else data, "message 3 on /scan is"),
         ("/scan", lambda data, nth: data[::-1], "message 0 on /scan is not the one that event 3"),
         ("/rsltrace/entities", _renamed(b"/push", b"/pull"), "/pull|entity"),
         ("/rsltrace/entities", _renamed(b"/obstacle_filter", b"/obstacle_fister"), "entity"),
