@@ -15,6 +15,7 @@ from campaigns.attack import oracle
 from campaigns.attack.corpus import Corpus
 from campaigns.attack.families.common import Attack, Family
 from campaigns.attack.model import Case, Command, Complaint, Limits, Ran, Wrong
+from rsltrace.trace.model.finding import GuardCount, NondeterminismSource
 from rsltrace.trace.reader import Trace
 
 _SOURCES: dict[str, str] = {
@@ -358,7 +359,7 @@ def _judge(folders: Sequence[Path], runs: Sequence[Ran], uses: dict[str, str]) -
     with Trace.open(folders[0] / "out.mcap") as a, Trace.open(folders[1] / "out.mcap") as b:
         if a.digest == b.digest:
             return []
-        named = {met.node for trace in (a, b) for met in trace.guarded if met.is_finding}
+        named = {met.node for trace in (a, b) for met in trace.guarded if _is_said(met)}
         differing = [node for node in uses if _sent(a, node) != _sent(b, node)]
     found = [
         Complaint(Wrong.ANSWER, f"silent: {node}: {uses[node]}", line)
@@ -368,6 +369,11 @@ def _judge(folders: Sequence[Path], runs: Sequence[Ran], uses: dict[str, str]) -
     if not differing and not named:
         found.append(Complaint(Wrong.ANSWER, "silent: the digests differ, no message does", line))
     return found
+
+
+def _is_said(met: GuardCount) -> bool:
+    """Whether a run says what may differ: a finding, or names of a folder, which are an input."""
+    return met.is_finding or met.source is NondeterminismSource.DIRECTORY
 
 
 def _sent(trace: Trace, node: str) -> list[tuple[int, int]]:
