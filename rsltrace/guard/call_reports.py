@@ -314,13 +314,16 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
 
 
 _Report = tuple[NondeterminismSource, str, object] | None
+_SOURCES = (".py", ".pyc", ".zip", ".egg", ".pyz")
 
 
 def _open_report(arguments: tuple[Any, ...], frame: FrameType) -> _Report:
     path, mode, flags = arguments
-    if isinstance(path, int) or calling_module(frame) in SOURCE_READERS:
+    if isinstance(path, int):
         return None
     name = os.fsdecode(path)
+    if name.endswith(_SOURCES) and calling_module(frame) in SOURCE_READERS:
+        return None
     if name in ("/dev/urandom", "/dev/random"):
         return NondeterminismSource.RANDOM, f"open({name!r})", ""
     if is_installed_path(name):
