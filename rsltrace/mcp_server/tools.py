@@ -67,7 +67,7 @@ class Tools:
         if checks.status == 1:
             then = _look_at(trace, checks.page) + then
         done = await self._run(["info", path], keeper=keeper)
-        return self._told(f"overview of {trace}", done, then)
+        return self._answer(f"overview of {trace}", done, then)
 
     async def events(
         self,
@@ -101,7 +101,7 @@ class Tools:
         then = [f"event({trace!r}, N) shows one of them, why({trace!r}, N) what caused it"]
         if len(done.page.lines) >= limit and not done.page.after:
             then.append(f"events(..., skip={skip + limit}) continues")
-        return self._told(f"events of {trace}", done, then)
+        return self._answer(f"events of {trace}", done, then)
 
     async def event(
         self,
@@ -179,7 +179,7 @@ class Tools:
         then = _look_at(b, done.page)
         if done.status == 0:
             then = ["they are identical: nothing more to find here"]
-        return self._told(f"diff of {a} and {b}", done, then)
+        return self._answer(f"diff of {a} and {b}", done, then)
 
     async def latency(
         self,
@@ -223,7 +223,7 @@ class Tools:
         words += ["--force"] * replace
         done = await self._run(words, end=True, seconds=seconds)
         then = [*_look_at(output, done.page), f"overview({output!r})"]
-        return self._told(f"record {job} to {output}", done, then)
+        return self._answer(f"record {job} to {output}", done, then)
 
     async def node_state(
         self,
@@ -313,7 +313,7 @@ class Tools:
         words += _options("--edit", edits) + ["--force"] * replace
         done = await self._run(words, seconds=seconds)
         then = [f"overview({output!r}) has its checks", f"diff({trace!r}, {output!r})"]
-        return self._told(f"branch of {trace} in {output}", done, then)
+        return self._answer(f"branch of {trace} in {output}", done, then)
 
     async def explore(
         self,
@@ -342,7 +342,7 @@ class Tools:
                 f"diff('{small}/passing.mcap', '{small}/failing.mcap') shows what fails it",
                 f"overview('{small}/failing.mcap'), if the job fails in its default order",
             ]
-        return self._told(f"search of {job}", done, then)
+        return self._answer(f"search of {job}", done, then)
 
     async def verify(
         self,
@@ -359,7 +359,7 @@ class Tools:
         then = [f"explore({job!r}, 'found') searches the callback orders"]
         if done.status == 1:
             then = ["the report names the event and the perturbation; read that callback's code"]
-        return self._told(f"verify {job}", done, then)
+        return self._answer(f"verify {job}", done, then)
 
     # -- in common ---------------------------------------------------------------------------------
 
@@ -383,10 +383,10 @@ class Tools:
         path = str(self._access.existing(trace))
         words = [form, path, str(event), folders, json.dumps(list(sections))]
         done = await self._run(words, module="rsltrace.mcp_server.event_page", skip=skip)
-        return self._told(f"{form}: event {event} of {trace}", done, then)
+        return self._answer(f"{form}: event {event} of {trace}", done, then)
 
     async def _read(self, title: str, words: Sequence[str], then: Sequence[str], skip: int) -> str:
-        return self._told(title, await self._run(words, skip=skip), then)
+        return self._answer(title, await self._run(words, skip=skip), then)
 
     async def _run(
         self,
@@ -402,7 +402,7 @@ class Tools:
         keeper = keeper or PageKeeper(skip=skip, end=end)
         return await run_command(words, limit_s, module=module, keeper=keeper)
 
-    def _told(self, title: str, done: CommandResult, then: Sequence[str]) -> str:
+    def _answer(self, title: str, done: CommandResult, then: Sequence[str]) -> str:
         """Return the answer of a command.
 
         :raises RefusedError: with the same, if the command could not do it.
