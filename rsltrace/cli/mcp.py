@@ -50,7 +50,7 @@ def mcp(trust: bool, folders: tuple[Path, ...], limit_s: float) -> None:
     try:
         from rsltrace.mcp_server.server import serve
     except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] != "mcp":
+        if (error.name or "").partition(".")[0] not in ("mcp", "anyio"):  # which mcp brings
             raise
         raise SetupError(
             "the server needs the package mcp, version 2: pip install 'rsltrace[mcp]'"

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from rsltrace.run.session import RunSession
 
 _LOOK_EVERY = 64
+_LOOK_S = 0.05
 _NEVER = 1 << 62
 _cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-type]
 _getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
@@ -79,6 +80,7 @@ class Engine(EventObserver):
         self._goal = RunGoal()
         self._mark = _NEVER
         self._checkpoint_s = 0.0
+        self._look, self._looked_s = 1, 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
         self._copied_at = -1
@@ -189,7 +191,10 @@ class Engine(EventObserver):
         if goal.after:
             self._mark = 0
             return
-        mark = index + _LOOK_EVERY
+        now_s = _cpu_s()  # of callbacks that take long, look after each: a pause must not wait
+        self._look = min(2 * self._look, _LOOK_EVERY) if now_s < self._looked_s + _LOOK_S else 1
+        self._looked_s = now_s
+        mark = index + self._look
         for one in (goal.until, self.ledger.history.limit, *goal.ladder[:1]):
             if one is not None and one < mark:
                 mark = one

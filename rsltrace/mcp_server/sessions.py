@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,7 @@ from rsltrace.errors import RsltraceError
 from rsltrace.mcp_server.access import Access, RefusedError
 
 _SESSIONS_MAX = 2
+_PAUSE_S = 0.1
 
 _T = TypeVar("_T")
 _Key = tuple[Path, int, int]
@@ -26,6 +28,8 @@ class Sessions:
         self._access = access
         self._open: dict[_Key, DebugSession] = {}
         self._busy = threading.Lock()
+        self._current: threading.Event | None = None
+        """Set when the call that has the lock is given up."""
 
     async def use(self, trace: Path, do: Callable[[DebugSession], _T]) -> _T:
         """Return what ``do`` returns of the session of a trace; it runs in a thread.
@@ -36,20 +40,28 @@ class Sessions:
         """
         self._access.require_trust()
 
+        given_up = threading.Event()
+
         def work() -> _T:
             with self._busy:
-                return do(self._session(trace))
+                if given_up.is_set():
+                    raise RefusedError("this was given up before its turn")
+                self._current = given_up
+                try:
+                    return do(self._session(trace))
+                finally:
+                    self._current = None
 
         try:
             return await asyncio.wait_for(_in_thread(work), self._access.limit_s)
         except asyncio.TimeoutError:
-            self._pause()
+            self._give_up(given_up)
             raise RefusedError(
                 f"this takes more than {self._access.limit_s:g} s and was ended. Go to an earlier "
                 "event, or have the server started with a greater --limit."
             ) from None
         except asyncio.CancelledError:
-            self._pause()
+            self._give_up(given_up)
             raise
 
     def close(self) -> None:
@@ -72,10 +84,18 @@ class Sessions:
         self._open[key] = session or DebugSession(trace, trust=True)
         return self._open[key]
 
-    def _pause(self) -> None:
-        for session in list(self._open.values()):
-            with suppress(RsltraceError):
-                session.pause()
+    def _give_up(self, given_up: threading.Event) -> None:
+        """End a call: if it is its turn, pause its run, and whatever it runs after that."""
+        given_up.set()
+
+        def pause() -> None:
+            while self._current is given_up:
+                for session in list(self._open.values()):
+                    with suppress(RsltraceError):
+                        session.pause()
+                time.sleep(_PAUSE_S)
+
+        threading.Thread(target=pause, name="rsltrace pause", daemon=True).start()
 
 
 def _in_thread(work: Callable[[], _T]) -> asyncio.Future[_T]:

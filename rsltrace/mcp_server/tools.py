@@ -274,8 +274,10 @@ class Tools:
             point = session.break_at(condition)
             try:
                 place = start if start is not None else _end(session) if backwards else 0
-                session.go_to(place)
+                session.go_to(place + backwards)  # going back leaves out what holds at its start
                 stopped = session.reverse_go_on() if backwards else session.go_on()
+                if backwards and stopped.position.is_next and stopped.position.index >= place:
+                    stopped = session.reverse_go_on()
                 source = session.inspect("source") if stopped.position.event else None
                 return [*stopped_lines(stopped), *_source_lines(source)], stopped.position
             finally:
@@ -283,7 +285,7 @@ class Tools:
 
         lines, position = await self._sessions.use(self._access.existing(trace), go)
         at = position.index - (not position.is_next)
-        on = position.index + (position.is_next and not backwards)
+        on = max(at, 0) if backwards else position.index + position.is_next
         again = f"run_until({trace!r}, {condition!r}, start={on}, backwards={backwards})"
         then = [f"{again} goes on"]
         if at >= 0:

@@ -107,7 +107,10 @@ class Silent(Reason):
         ran = int(history.events["entity"][sent[-1].event]) if sent else _idle(history, sender.node)
         callback, cause = history.trace.entity(ran), None
         if callback.kind in WITH_CALLBACK:
-            cause = _solve(Question(history, callback, question.at_ns, depth=question.depth + 1))
+            asked = Question(history, callback, question.at_ns, depth=question.depth + 1)
+            cause = _solve(asked)
+            if sent and cause.event is not None and history.stamp(cause.event) < sent[-1].sent_ns:
+                cause = _solve(replace(asked, at_ns=until_ns))  # that was before the silence
         if cause is None or isinstance(cause, AsExpected):
             cause = NodeEnded.of_node(question, history.trace.node_of(sender))
         return cls._of(question, sender.id, sent[-1].sent_ns if sent else None, cause)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -58,11 +57,10 @@ class UnmatchedStamps(Reason):
             return None
         inputs = [one for one in entities if one.node == entity.node and filter_of(one) == of]
         stamps = {printable(one.name): sorted(_stamps(question, one)) for one in inputs}
-        first, *others = stamps.values()
         nearest_ns = None
         if all(stamps.values()):
-            nearest_ns = min(max((_distance(s, o) for o in others), default=0) for s in first)
-            if nearest_ns <= of[2]:
+            nearest_ns = _spread(list(stamps.values()))
+            if nearest_ns < of[2] or not nearest_ns:  # an ApproximateTimeSynchronizer wants less
                 return None
         waited = tuple((name, tuple(found[-_SHOWN:])) for name, found in stamps.items())
         what = (of[0], of[2], nearest_ns, waited)
@@ -83,9 +81,15 @@ class UnmatchedStamps(Reason):
             yield f"last stamps of {topic}: {', '.join(map(seconds_text, stamps)) or 'none'}"
 
 
-def _distance(stamp: int, others: list[int]) -> int:
-    place = bisect_left(others, stamp)
-    return min(abs(stamp - one) for one in others[max(place - 1, 0) : place + 1])
+def _spread(topics: list[list[int]]) -> int:
+    """Return how far apart the nearest stamps are, one of each topic."""
+    latest: dict[int, int] = {}
+    spreads = []
+    for stamp, topic in sorted((one, at) for at, stamps in enumerate(topics) for one in stamps):
+        latest[topic] = stamp
+        if len(latest) == len(topics):
+            spreads.append(stamp - min(latest.values()))
+    return min(spreads)
 
 
 def _stamps(question: Question, one: Entity) -> Iterator[int]:

@@ -155,7 +155,16 @@ class Question:
             for file in sorted(files, key=len)
             if f"/{path}".endswith(f"/{file}")
         ]
-        return printable(text.rpartition("\n")[2]), places[-1] if places else ""
+        return printable(_said(text)), places[-1] if places else ""
+
+
+def _said(text: str) -> str:
+    """Return the type and message of the exception that a traceback ends with, in one line."""
+    lines = text.splitlines()
+    frames = [at for at, line in enumerate(lines) if line.startswith("  File ")]
+    after = lines[frames[-1] + 1 :] if frames else lines
+    first = next((at for at, line in enumerate(after) if line and not line.startswith(" ")), 0)
+    return " ".join(" ".join(after[first:]).split())
 
 
 def filter_of(entity: Entity) -> tuple[str, str, int] | None:

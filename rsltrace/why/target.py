@@ -35,8 +35,8 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     ids = {one.id for one in own}
     there = [e for e in trace.entities.values() if e.node in ids and e.kind in WITH_CALLBACK]
     found = [one for one in there if _is_meant(one, asked)]
-    if len({(filter_of(one) or (one.kind, one.name)) for one in found}) > 1:
-        listed = ", ".join(f"{one.id} ({one.kind.label} {printable(one.name)})" for one in found)
+    if len({filter_of(e) or (e.kind, e.name, e.detail.get("callback")) for e in found}) > 1:
+        listed = ", ".join(f"{e.id} ({e.kind.label} {e.name}: {_callbacks(e)[-1]})" for e in found)
         text = f"{called[0]} has several {asked}; give a number: {listed}"
         raise TraceError(printable(text))
     if found:
@@ -61,10 +61,13 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     return _fail(trace, f"callback of {called[0]}", asked, names_there)
 
 
-def _is_meant(entity: Entity, asked: str) -> bool:
+def _callbacks(entity: Entity) -> list[str]:
     of = filter_of(entity)
-    callbacks = [str(entity.detail.get("callback") or entity.name)]
-    callbacks += [of[0]] if of else []
+    return [str(entity.detail.get("callback") or entity.name), *([of[0]] if of else [])]
+
+
+def _is_meant(entity: Entity, asked: str) -> bool:
+    callbacks = _callbacks(entity)
     names = {entity.name, str(entity.id), *callbacks, *(c.rpartition(".")[2] for c in callbacks)}
     return asked in names or f"/{asked}" == entity.name
 
