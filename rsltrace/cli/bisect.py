@@ -253,9 +253,10 @@ def _report(
         shutil.copyfile(found.before.run.path, output / _BEFORE)
         shutil.copyfile(found.after.run.path, output / _AFTER)
         kept = (output / _BEFORE, output / _AFTER)
-        write_text(output / PAGE, as_page(found, runner.repository, kept))
     if as_json:
         say(json.dumps(as_values(found, runner.repository, kept)))
     else:
         say(as_text(found, runner.repository, kept))
+    if output is not None and kept is not None:
+        write_text(output / PAGE, as_page(found, runner.repository, kept))
     return 0 if found.first is not None else 1

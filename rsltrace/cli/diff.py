@@ -14,6 +14,7 @@ from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 from rsltrace.terminal import say, tell
+from rsltrace.trace.exports.output_file import check_not_input
 
 if TYPE_CHECKING:
     from rsltrace.diff.report.line import Line
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
 _FORMATS = ("text", "json", "markdown", "junit", "github", "html")
 _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 200
+_ONE_LINE = 10_000
 _HEIGHT_MIN = 21
 _PROMPTS = 3
 """Lines a terminal shows beside the report: the command, perhaps on two lines, and the prompt."""
@@ -195,6 +197,8 @@ def _diff(
     *,
     check: bool,
 ) -> int:
+    if output is not None:
+        check_not_input(output, [Path(one) for one in (golden, *others) if "://" not in one])
     done: list[Diff | BagDiff] = []
     trouble = False
     for other in others:
@@ -272,11 +276,13 @@ def print_diffs(
 ) -> None:
     """Print diffs in a form; on a terminal, text has its size and colours."""
     from rsltrace.diff.report import render, report_lines
+    from rsltrace.diff.report.line import plain_text
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
         write_text(output, _rendered(diffs, form, options))
-        say(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
+        first = plain_text(report_lines(one_or_all, options, width=_ONE_LINE)).splitlines()[0]
+        say(_encodable(first))
     elif form != "text":
         say(_rendered(diffs, form, options), end="")
     elif sys.stdout.isatty():

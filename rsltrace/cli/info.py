@@ -17,6 +17,7 @@ from rsltrace.cli.output.text_file import write_text
 from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.contents import TraceCounts, count_trace
+from rsltrace.trace.exports.output_file import check_not_input
 from rsltrace.trace.format import (
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
@@ -164,6 +165,8 @@ def info(trace: Path, form: str, show_all: bool, check: bool, output: Path | Non
     of simulated time, between the first and the last. If the run was killed, the
     summary covers what was written. A native run has no digest; its callback times are listed.
     """
+    if output is not None:
+        check_not_input(output, [trace])
     with Trace.open(trace) as opened:
         if check:
             from rsltrace.cli.output.search_progress import working

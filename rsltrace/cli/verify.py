@@ -187,14 +187,16 @@ def _verify(
     from rsltrace.search.explore.table import PAGE
 
     again = [_again(given, perturbations, one.perturbation) for one in _two(result)]
-    if keep is not None and result.trouble is None:
-        write_text(keep / PAGE, as_page(result, keep, again))
     if as_json:
         say(as_values(result, place, again, kept=keep is not None))
     else:
         (tell if result.trouble else say)(as_text(result, place, again, kept=keep is not None))
+    if keep is not None:
+        (keep / PAGE).unlink(missing_ok=True)  # of an earlier time
     if result.trouble is not None:
         return EXIT_USAGE
+    if keep is not None:
+        write_text(keep / PAGE, as_page(result, keep, again))
     return 0 if result.agrees else 1
 
 

@@ -338,8 +338,11 @@ def _fewer_than(count: int) -> ArgumentTest:
 
 
 def _leaves_some(call: ast.Call) -> bool:
+    """Whether a ufunc is given ``where`` and no array for its results, by name or by place."""
     words = [word.arg for word in call.keywords]
-    return "where" in words and "out" not in words
+    name = call.func.attr if isinstance(call.func, ast.Attribute) else ""
+    inputs = getattr(getattr(np, name, None), "nin", len(call.args))
+    return "where" in words and "out" not in words and len(call.args) <= inputs
 
 
 def _with_callback(call: ast.Call) -> bool:

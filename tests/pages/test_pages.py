@@ -11,10 +11,13 @@ import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from mcap import records
 from mcap.opcode import Opcode
+from rsltrace_viewer.model.plots.series import Series
+from rsltrace_viewer.pages.charts import curves, histogram
 
 from campaigns.attack import mcap_parts
 from campaigns.attack.families.texts import with_strings
@@ -230,7 +233,7 @@ def test_several_runs_and_equal_ones_have_a_page(monkeypatch: pytest.MonkeyPatch
     text = made("diff", "a.mcap", "a.mcap", "b.mcap")
     contained(text)
     page = Page(text)
-    assert "1 of 2 runs diverges." in page.text
+    assert "1 of 2 runs diverges from a.mcap." in page.text
     assert page.rows[2][:2] == ["b.mcap", "schedule"]
     contained(made("diff", "a.mcap", "a.mcap"))
 
@@ -254,3 +257,22 @@ def test_a_browser_shows_them_and_has_nothing_to_complain_of(
         )
         assert "</svg>" in done.stdout
         assert "CONSOLE" not in done.stderr  # what the policy refuses is told there
+
+
+def test_a_page_does_not_replace_what_it_is_made_of(tmp_path: Path) -> None:
+    a, b = (shutil.copy(path, tmp_path / path.name) for path in sorted(PAIRS[0].glob("*.mcap"))[:2])
+    before = Path(b).read_bytes()
+    for words in (["info", str(b)], ["diff", str(a), str(b)]):
+        done = CliRunner().invoke(cli, [*words, "--format", "html", "-o", str(b)])
+        assert done.exit_code == 2
+        assert "is the trace itself; choose another name" in str(done.output) + done.stderr
+    assert Path(b).read_bytes() == before
+
+
+def test_numbers_too_large_for_a_half_are_drawn() -> None:
+    for values in ((1.7e18, 1.7e18), (-1e308, 1e308)):
+        one = Series(np.array([0.0, 1.0]), np.array(values), "")
+        text = str(curves([one], "data", None))
+        assert "nan" not in text
+        assert "points" in text
+        assert histogram([(value, False) for value in values], "data")

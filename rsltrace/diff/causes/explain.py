@@ -66,7 +66,7 @@ from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.words.phrases import seconds_text
+from rsltrace.trace.words.phrases import path_word, seconds_text
 
 ANCESTORS_MAX = 5
 """Events shown that led to a root. Both runs have them."""
@@ -390,10 +390,10 @@ class Explainer:
     def _next_step(self, judgement: Judgement) -> str:
         view = judgement.a or judgement.b
         assert view is not None
-        path_a, path_b = (_word(run.trace.name) for run in (self.run_a, self.run_b))
+        path_a, path_b = (path_word(run.trace.name) for run in (self.run_a, self.run_b))
         verdict = judgement.verdict
         if isinstance(judgement.likely, UnguardedCall):
-            return f"rsltrace audit {_word(judgement.likely.file)}"
+            return f"rsltrace audit {path_word(judgement.likely.file)}"
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
         if self._opens_viewer(judgement):
@@ -412,7 +412,7 @@ class Explainer:
         lacking = self.run_b if in_a else self.run_a
         if self._is_missing_callback(judgement, view):
             name, since = shlex.quote(view.entity.name), _time_in_run(view.stamp_ns, lacking.trace)
-            of = f"{_word(lacking.trace.name)} {shlex.quote(view.entity.node)} {name}"
+            of = f"{path_word(lacking.trace.name)} {shlex.quote(view.entity.node)} {name}"
             return f"rsltrace why {of} --at {since}"
         path = path_a if in_a else path_b
         time = _time_in_run(view.stamp_ns, (self.run_a if in_a else self.run_b).trace)
@@ -436,11 +436,6 @@ def _time_in_run(stamp_ns: int, trace: Trace) -> str:
     """Return a simulated time as an option takes it: from the start of the run, if it is later."""
     since_ns = stamp_ns - trace.start_ns
     return seconds_text(since_ns) if since_ns >= 0 else f"@{seconds_text(stamp_ns)}"
-
-
-def _word(path: str) -> str:
-    """Return a path as a word of a command, never an option."""
-    return shlex.quote(f"./{path}" if path.startswith("-") else path)
 
 
 def _told_to_differ(settings: Sequence[Setting]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -12,7 +11,7 @@ from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.trace.model.texts import format_seconds, printable
-from rsltrace.trace.words.phrases import as_sentence
+from rsltrace.trace.words.phrases import as_sentence, path_word
 
 COLUMNS = ("run", "verdict", "event", "time", "where")
 
@@ -81,7 +80,7 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
         lines += [line(), *(line((text, Style.BAD)) for text in ended)]
     first = next((diff for diff in diffs if diff.failed), None)
     if first is not None:
-        command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
+        command = f"rsltrace diff {path_word(first.a.path)} {path_word(first.b.path)}"
         lines += [line(), line(("next: ", Style.TITLE), printable(command))]
     return lines
 

@@ -63,9 +63,21 @@ class NameResolver:
         return None
 
     def is_made_by(
-        self, node: ast.expr, scope: NameScope, makers: AbstractSet[str], depth: int = 0
+        self,
+        node: ast.expr,
+        scope: NameScope,
+        makers: AbstractSet[str],
+        depth: int = 0,
+        seen: set[ast.expr] | None = None,
     ) -> bool:
-        """Return whether an expression is what one of ``makers`` returns, or one of them."""
+        """Return whether an expression is what one of ``makers`` returns, or one of them.
+
+        ``seen`` are the expressions that were asked about: names can be bound to each other.
+        """
+        seen = set() if seen is None else seen
+        if node in seen:
+            return False
+        seen.add(node)
         if isinstance(node, ast.Call):
             return self.of(node.func, scope) in makers
         if self.of(node, scope) in makers:
@@ -76,7 +88,7 @@ class NameResolver:
         elif isinstance(node, ast.Attribute) and scope.own_class and _is_self(node.value):
             bound = [(one, scope) for one in scope.own_class.attributes.get(node.attr, [])]
         return depth < _DEPTH_MAX and any(
-            self.is_made_by(one, scope.module.scope_of(one), makers, depth + 1)
+            self.is_made_by(one, scope.module.scope_of(one), makers, depth + 1, seen)
             for one, scope in bound
             if isinstance(one, ast.expr)
         )

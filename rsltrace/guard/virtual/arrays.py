@@ -36,19 +36,32 @@ def _zeroing(real: Callable[..., Any]) -> Any:
         made = real(*arguments, **options)
         guard = engaged()
         if guard is not None and not made.dtype.hasobject and _fills(guard, caller()):
-            made.fill(0)
+            _zero(made)
         return made
 
     return empty
 
 
-def filled(function: Any, *arguments: Any, **options: Any) -> Any:
+def _zero(made: Any) -> None:
+    """Fill an array with the zero of its type, which may be a record or a text."""
+    import numpy as np
+
+    np.ndarray.fill(made, np.zeros((), made.dtype)[()])
+
+
+def filled(function: Any, /, *arguments: Any, **options: Any) -> Any:
     """Call a function; fill with zeros what numpy has left as it was in the arrays it returns."""
     guard, np = engaged(), sys.modules.get("numpy")
     if guard is None or np is None or not _fills(guard, caller()):
         return function(*arguments, **options)
-    if isinstance(function, np.ufunc) and options.get("out") is None and "where" in options:
-        options["out"] = None  # else: a warning about memory that is not initialised
+    if (
+        isinstance(function, np.ufunc)
+        and options.get("out") is None
+        and "where" in options
+        and len(arguments) <= function.nin
+    ):
+        # Without "out", numpy warns of memory that is not initialised.
+        options["out"] = (None,) * function.nout
         made, left = function(*arguments, **options), np.logical_not(options["where"])
         if isinstance(made, tuple):
             return tuple(_without(np, one, left) for one in made)
@@ -66,16 +79,16 @@ def filled(function: Any, *arguments: Any, **options: Any) -> Any:
         and isinstance(made, np.ndarray)
         and not made.dtype.hasobject
     ):
-        made.fill(0)
+        _zero(made)
     return made
 
 
 def _without(np: Any, made: Any, left: Any) -> Any:
     """Return what a function of numpy has made, with zeros where it has ``left`` memory alone."""
     if isinstance(made, np.ndarray):
-        np.copyto(made, 0, casting="unsafe", where=left)
+        np.copyto(made, np.zeros((), made.dtype), where=left)
         return made
-    return type(made)(0) if left else made
+    return np.zeros((), made.dtype)[()] if left and hasattr(made, "dtype") else made
 
 
 @contextmanager

@@ -13,14 +13,13 @@ Rejected: compile user modules with a call at each loop. It misses functions in 
 from __future__ import annotations
 
 import io
-import math
 import operator
 import pickle
 import reprlib
 import sys
 import weakref
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from itertools import chain
 from types import FrameType
 from typing import Any
@@ -30,7 +29,7 @@ from rsltrace.guard.addresses import has_address_hash
 from rsltrace.guard.callers import FILE_OWNERS, OURS
 from rsltrace.guard.frames import caller, code_of, replace_member, replace_special_method
 from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.guard.redirect import redirect
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _ORDER, _ALLOW, _VIRTUAL = NondeterminismSource.ORDER, GuardMode.ALLOW, GuardMode.VIRTUAL
@@ -45,7 +44,6 @@ _PICKLED_SETS = (pickle.EMPTY_SET, b"__builtin__\nset\n", b"builtins\nset\n")
 LISTS_READ_SETS = sys.version_info >= (3, 13)
 """Whether Python makes lists of sets without asking for an iterator."""
 
-_plain_dumps = copy_of(pickle.dumps)  # type: ignore[arg-type]
 _through_set, _through_frozen = set.__iter__, frozenset.__iter__
 """Python's own iteration over a set and a frozenset."""
 
@@ -70,7 +68,9 @@ def _iterating(real: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator
 def _are_numbers(items: Iterable[Any], again: Iterable[Any]) -> bool:
     """Return whether the order of a set of ``items`` is the same in every process."""
     kinds = {*map(type, items)}
-    return _NUMBERS.issuperset(kinds) and not (float in kinds and any(map(math.isnan, again)))
+    return _NUMBERS.issuperset(kinds) and not (
+        float in kinds and any(item != item for item in again)  # NaN
+    )
 
 
 def _elements_in_order(obj: Any) -> list[Any] | None:
@@ -197,23 +197,6 @@ def _dumping_into(real: Callable[..., None]) -> Callable[..., None]:
     return dump
 
 
-def _dumping_by_object(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
-    """``Pickler.dump`` knows what the object has written before, so its order is only reported."""
-
-    def dump(self: Any, obj: Any, /) -> None:
-        real(self, obj)
-        guard = engaged()
-        if guard is None or guard.user_frame_of(caller()) is None:
-            return
-        with suppress(Exception):  # else: objects that only this pickler can write
-            if pickle.dumps(obj) != _plain_dumps(obj):
-                guard.report_user_call(
-                    _ORDER, "order of a set in pickle.Pickler.dump()", type(obj).__name__, caller()
-                )
-
-    return dump
-
-
 def in_set_order(obj: Any) -> Any:
     """Return a list in order in place of a set, for code that would not ask it for an iterator."""
     return [*iter(obj)] if type(obj) in _TYPES else obj
@@ -262,7 +245,6 @@ def ordered_sets() -> Iterator[None]:
         replace_member(stack, dict, "fromkeys", _from_keys)
         redirect(stack, pickle.dumps, _dumping)
         redirect(stack, pickle.dump, _dumping_into)
-        replace_member(stack, pickle.Pickler, "dump", _dumping_by_object)
         if LISTS_READ_SETS:
             for function in (sorted, operator.iadd):
                 redirect(stack, function, _making)

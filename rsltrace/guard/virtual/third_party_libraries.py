@@ -101,7 +101,7 @@ def _call(function: Any, text: str, *more: Any) -> Any:
     return function(text, *more)
 
 
-def _call_with(function: Any, *arguments: Any, **options: Any) -> Any:
+def _call_with(function: Any, /, *arguments: Any, **options: Any) -> Any:
     return function(*arguments, **options)
 
 

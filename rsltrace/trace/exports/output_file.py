@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rsltrace.errors import OutputError
@@ -16,12 +16,16 @@ def check_output_file(output: Path, traces: Sequence[Path], *, force: bool, exam
     """
     if output.is_dir():
         raise OutputError(f"{output} is a folder; name a file, such as {output / example}")
-    for trace in traces:
-        if output.exists() and trace.exists() and output.samefile(trace):
-            raise OutputError(f"{output} is the trace itself; choose another name")
+    check_not_input(output, traces)
     if kind := not_replaceable(output):
         raise OutputError(f"{output} is {kind}; name a file, or remove it")
     if output.exists() and not force:
         raise OutputError(f"{output} exists; use --force to replace it, or another name")
     if not output.absolute().parent.is_dir():
         raise OutputError(f"the folder {output.parent} does not exist")
+
+
+def check_not_input(output: Path, inputs: Iterable[Path]) -> None:
+    """Raise OutputError if a file that is to be written is one of those that are read."""
+    if output.exists() and any(one.exists() and output.samefile(one) for one in inputs):
+        raise OutputError(f"{output} is the trace itself; choose another name")

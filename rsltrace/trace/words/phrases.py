@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -96,3 +97,8 @@ def as_sentence(text: str) -> str:
     text = printable(text).strip()
     text = text[:1].upper() + text[1:]
     return text if text.endswith((".", "!", "?")) else f"{text}."
+
+
+def path_word(path: str) -> str:
+    """Return a path as a word of a command, never an option."""
+    return shlex.quote(f"./{path}" if path.startswith("-") else path)

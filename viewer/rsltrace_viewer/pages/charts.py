@@ -44,8 +44,8 @@ class _Chart:
         """Return where a point is drawn."""
         left, right = self._x
         low, high = self._y
-        across = (x - left) / (right - left) * (WIDTH - _LEFT - _RIGHT)
-        up = (y - low) / (high - low) * (HEIGHT - _TOP - _BOTTOM)
+        across = _share(x, left, right) * (WIDTH - _LEFT - _RIGHT)
+        up = _share(y, low, high) * (HEIGHT - _TOP - _BOTTOM)
         return round(_LEFT + across, 1), round(HEIGHT - _BOTTOM - up, 1)
 
     def axes(self, name: str, below: Sequence[tuple[float, str]] = ()) -> None:
@@ -136,10 +136,10 @@ def histogram(values: Sequence[tuple[float, bool]], name: str) -> Markup:
     low, high = _wide((min(v for v, _ in values), max(v for v, _ in values)))
     counts = [[0, 0] for _ in range(_BINS)]
     for value, failed in values:
-        counts[min(int((value - low) / (high - low) * _BINS), _BINS - 1)][failed] += 1
+        counts[min(int(_share(value, low, high) * _BINS), _BINS - 1)][failed] += 1
     most = max(map(sum, counts))
     chart = _Chart((low, high), (0, most), f"distribution of {name}")
-    width = (high - low) / _BINS
+    width = high / _BINS - low / _BINS
     for index, (good, bad) in enumerate(counts):
         if good:
             chart.bar(low + index * width, width, 0, good, "good")
@@ -192,4 +192,10 @@ def _short(text: str) -> str:
 def _wide(ends: tuple[float, float]) -> tuple[float, float]:
     """Return two numbers that differ."""
     low, high = ends
-    return (low, high) if high > low else (low - 0.5, high + 0.5)
+    half = 0.0 if high > low else max(0.5, abs(low) * 1e-6)
+    return low - half, high + half
+
+
+def _share(value: float, low: float, high: float) -> float:
+    """Return how far between two numbers one is, 0 to 1; halves do not overflow."""
+    return (value / 2 - low / 2) / (high / 2 - low / 2)

@@ -5,7 +5,6 @@ The rows are those of the viewer: the same events in the same order, with the sa
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -25,8 +24,8 @@ from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.values import setting_name
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.operation import NODE_TOPICS
-from rsltrace.trace.model.texts import contrasting_texts, format_seconds
-from rsltrace.trace.words.phrases import as_sentence
+from rsltrace.trace.model.texts import contrasting_texts, format_seconds, printable
+from rsltrace.trace.words.phrases import as_sentence, path_word
 from rsltrace_viewer.model.plots.runs import RunPlots
 from rsltrace_viewer.model.plots.series import PlotSource, difference, most_telling
 from rsltrace_viewer.model.run import Run
@@ -61,7 +60,9 @@ def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions, title: str 
     failed = [diff for diff in diffs if diff.failed]
     heading = as_sentence(diffs[0].sentence)
     if len(diffs) > 1:
-        heading = as_sentence(how_many_fail(diffs) if failed else how_all_agree(diffs))
+        golden = printable(diffs[0].a.path)
+        several = how_many_fail(diffs, golden) if failed else how_all_agree(diffs, golden)
+        heading = as_sentence(several)
     shown = diffs if len(diffs) == 1 else failed[:_IN_FULL_MAX]
     return render_page(
         "diff.html",
@@ -77,7 +78,9 @@ def diff_page(diffs: Sequence[Diff | BagDiff], options: DiffOptions, title: str 
 def part_of(diff: Diff | BagDiff, options: DiffOptions) -> dict[str, object]:
     """Return what the template needs of one comparison. Raises TraceError."""
     found = diff.shown if isinstance(diff, Diff) else None
-    words = [shlex.join(["rsltrace", word, diff.a.path, diff.b.path]) for word in ("diff", "view")]
+    is_native = isinstance(diff, Diff) and diff.native is not None
+    paths = f"{path_word(diff.a.path)} {path_word(diff.b.path)}"
+    words = [f"rsltrace {word} {paths}" for word in (("diff",) if is_native else ("diff", "view"))]
     following = found.next_step if found is not None else ""
     return {
         "diff": diff,

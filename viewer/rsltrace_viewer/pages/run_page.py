@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -18,6 +17,7 @@ from rsltrace.trace.model.texts import format_duration, shortened
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.logs import LEVEL_WARN
+from rsltrace.trace.words.phrases import path_word
 from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.logs import Logs, read_logs
 from rsltrace_viewer.model.overview import (
@@ -76,8 +76,7 @@ def run_page(
     bad = [one.first for one in troubles if one.bad]
     bad += [found.event for one in checks.violated for found in one.violations]
     first = min((one for one in bad if one is not None), default=None)
-    at = [] if first is None else ["--at", str(first)]
-    view = ["rsltrace", "view", trace.name]
+    at = "" if first is None else f" --at {first}"
     return render_page(
         "run.html",
         name=run.name,
@@ -100,7 +99,7 @@ def run_page(
         logs=[*_logs(logs)],
         log_count=len(logs.lines),
         plots=[*_plots(run)],
-        commands=[] if is_native(trace) else [shlex.join([*view, *at])],
+        commands=[] if is_native(trace) else [f"rsltrace view {path_word(trace.name)}{at}"],
     )
 
 

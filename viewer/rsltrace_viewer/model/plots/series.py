@@ -432,7 +432,8 @@ def difference(series: list[Series]) -> Series | None:
     times = a.times[inside]
     if not len(times):
         return None
-    values = a.values[inside] - np.interp(times, b.times, b.values)
+    with np.errstate(invalid="ignore", over="ignore"):  # of two infinite numbers
+        values = a.values[inside] - np.interp(times, b.times, b.values)
     finite = np.abs(values[np.isfinite(values)])
     most = float(finite.max()) if len(finite) else 0.0
     return Series(times, values, f"|a − b| ≤ {most:.4g}")
