@@ -140,6 +140,26 @@ def test_exception_that_rclpy_suppresses(tmp_path: Path) -> None:
         assert cause.startswith(f"{told}; no earlier event differs, but the runs had different")
 
 
+def test_exception_that_a_setting_provokes_and_rclpy_suppresses(tmp_path: Path) -> None:
+    asked = 'self.get_parameter("lens").value'
+    raising = CAMERA.replace("pass", f'if {asked}: raise KeyError("lens")')
+    raising = raising.replace(
+        '"camera")',
+        '"camera", allow_undeclared_parameters=True,\n'
+        "            automatically_declare_parameters_from_overrides=True)",
+    )
+    (tmp_path / "headline_camera.py").write_text(raising)
+    jobs = [
+        MANAGED.replace("Camera\n", f"Camera\n    parameters: {{lens: {lens}}}\n") + STOP
+        for lens in ("false", "true")
+    ]
+    a, b = (recorded(tmp_path, f"{n}.mcap", (STOP, job)) for n, job in zip("ab", jobs, strict=True))
+    for found, run in zip(both_ways(a, b), "ba", strict=True):
+        assert found.sentence.startswith("parameter lens ")
+        assert "; first effect: Camera.on_configure of /camera raised KeyError" in found.sentence
+        assert found.sentence.endswith(f" only in {run}; rclpy suppressed it")
+
+
 def test_call_that_no_guard_watched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With guard: false, the call in the callback is named, and the command that lists all."""
     monkeypatch.chdir(tmp_path)

@@ -25,7 +25,7 @@ from rsltrace.diff.causes.delivery import (
 )
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
-from rsltrace.diff.causes.likely_cause import likely_cause
+from rsltrace.diff.causes.likely_cause import likely_cause, suppressed_exception
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.causes.propagation import (
     BUSY,
@@ -110,6 +110,7 @@ class Explainer:
             effect,
             root=ROOT_OF.get(root.verdict, root.root),
             why=SameCause(first),
+            likely=suppressed_exception(effect, (self.run_a, self.run_b)),
             settings=root.settings,
             reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
             next_step=first.next_step,

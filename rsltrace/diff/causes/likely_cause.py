@@ -70,7 +70,7 @@ def likely_cause(
     view = judgement.one
     if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
         return None
-    if (suppressed := _suppressed_exception(judgement, runs)) is not None:
+    if (suppressed := suppressed_exception(judgement, runs)) is not None:
         return suppressed
     if calls and calls[0].differs:
         changed = judgement.changed
@@ -94,7 +94,7 @@ def likely_cause(
     return unrecorded_answer(run, view)
 
 
-def _suppressed_exception(
+def suppressed_exception(
     judgement: Judgement, runs: tuple[ComparedTrace, ComparedTrace]
 ) -> ErrorInTransition | None:
     """Return the first exception of a lifecycle callback that only one of two events has."""

@@ -689,6 +689,8 @@ def effect_text(found: Judgement) -> str:
     the sentence of a divergence that is no other output."""
     one = found.one
     sent = [m for m in found.messages if m.kind in _SENT and m.topic != PARAMETER_EVENTS]
+    if isinstance(found.likely, ErrorInTransition):
+        return sentence(found.likely)
     told = found.verdict in _OTHER_OUTPUT and not any(m.is_input for m in found.messages)
     if one is None or not told or not sent:
         return sentence_of(found)
