@@ -176,7 +176,7 @@ def test_wrong_names_and_whole_replays_of_a_part(
     recorded: Callable[..., Path], tmp_path: Path
 ) -> None:
     trace = recorded()
-    with pytest.raises(rsltrace.RsltraceError, match=r"no node /wach: did you mean '/watch'"):
+    with pytest.raises(rsltrace.RsltraceError, match=r"no node /wach; did you mean '/watch'"):
         rsltrace.replay(trace, node="wach", trust=True)
     rsltrace.replay(trace, node="watch", trust=True, output=tmp_path / "alone.mcap")
     with pytest.raises(rsltrace.RsltraceError, match="replay it with --node /watch"):

@@ -120,7 +120,7 @@ def test_what_is_wrong_with_a_bag_is_said(robot: Path) -> None:
     export_bag(robot / "run.mcap", robot / "outputs", topics=["/smooth"])
     with pytest.raises(rsltrace.RsltraceError, match=r"subscribes to \(/speed\) is in there, only"):
         rsltrace.replay("job.yaml", node="filter", bag="outputs")
-    with pytest.raises(rsltrace.RsltraceError, match="no node /fliter: did you mean"):
+    with pytest.raises(rsltrace.RsltraceError, match="no node /fliter; did you mean"):
         rsltrace.replay("job.yaml", node="fliter", bag="bag")
     with pytest.raises(rsltrace.RsltraceError, match="a bag is for one node"):
         rsltrace.replay("run.mcap", bag="bag")  # type: ignore[call-overload]
