@@ -417,10 +417,14 @@ class Trace:
     def answers(self) -> dict[int, list[Finding]]:
         """The findings, and answers from outside that the run put in order."""
         answers: dict[int, list[Finding]] = {}
-        for _, _, data in self.messages(TOPIC_FINDINGS):
-            finding = self._named(unpack_finding, data)
+        for _, finding in self.answers_in_order():
             answers.setdefault(finding.event, []).append(finding)
         return answers
+
+    def answers_in_order(self) -> Iterator[tuple[int, Finding]]:
+        """Yield each of ``answers`` after its simulated time, without keeping them."""
+        for stamp_ns, _, data in self.messages(TOPIC_FINDINGS):
+            yield stamp_ns, self._named(unpack_finding, data)
 
     @cached_property
     def code_lines(self) -> dict[int, list[CodeLine]]:

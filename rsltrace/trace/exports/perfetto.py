@@ -23,9 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import OutputError, SetupError, TraceError
-from rsltrace.trace.cdr import unpack_finding
 from rsltrace.trace.exports.output_file import check_output_file
-from rsltrace.trace.format import TOPIC_FINDINGS
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (
     EventKind,
@@ -324,8 +322,7 @@ class _Export:
 
     def _write_findings(self) -> None:
         owners = {self._words.names.name(node): node for node in self._nodes}
-        for stamp_ns, _, data in self._trace.messages(TOPIC_FINDINGS):
-            finding = unpack_finding(data)
+        for stamp_ns, finding in self._trace.answers_in_order():
             if finding.mode is not GuardMode.VIRTUAL:
                 track = self._track(owners.get(printable(finding.node), 0), "findings")
                 text = printable(f"{finding.source.value} {finding.call}")
