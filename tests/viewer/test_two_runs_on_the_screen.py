@@ -324,27 +324,6 @@ def test_samples_in_every_size_and_in_rerun(drive: Drive, name: str, tmp_path: P
     check_everywhere(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"), tmp_path)
 
 
-@pytest.mark.long
-@pytest.mark.ros
-@pytest.mark.parametrize("part", range(10))
-def test_planted_pairs_in_every_size_and_in_rerun(drive: Drive, part: int, tmp_path: Path) -> None:
-    """Fifty of the faults that ``make truth`` plants."""
-    pytest.importorskip("rclpy")
-    from campaigns.truth import faults
-    from campaigns.truth.campaign import try_case
-
-    faults.load()
-    names = [name for name in faults.FAULTS if faults.FAMILIES[name] != "recordings"]
-    step = len(names) // 50
-    for name in names[part * step : 50 * step : 10 * step]:
-        folder = tmp_path / name.replace("/", "_")
-        folder.mkdir()
-        try_case(name, 0, folder)
-        pair = folder / "a.mcap", folder / "b.mcap"
-        if read(pair[0]) and read(pair[1]):
-            check_everywhere(drive, pair, folder)
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_samples(drive: Drive, name: str) -> None:
     both, (a, b) = screens(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"))
