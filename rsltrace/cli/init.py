@@ -13,6 +13,7 @@ from rsltrace.cli.output.text_file import write_text
 from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
 from rsltrace.terminal import tell
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import format_duration, format_seconds
 
 if TYPE_CHECKING:
@@ -27,7 +28,6 @@ _HEAD = """\
 _SCHEMA = "job.schema.json"
 _PLACES = (".", "src", "scripts", "..")
 _TOPICS_MAX = 3
-_OF_EVERY_NODE = ("/rosout", "/parameter_events")
 """Topics of every node. The nodes of a run publish their own, so a bag should not play them."""
 
 
@@ -190,7 +190,7 @@ def _bag_text(source: str, folder: Path) -> str:
                 "    topics:",
             ]
             width = max(len(topic.name) for topic in bag.topics)
-            heard = [topic for topic in bag.topics if topic.name not in _OF_EVERY_NODE]
+            heard = [topic for topic in bag.topics if topic.name not in NODE_TOPICS]
             lines += [
                 f"      {'-' if topic in heard or not heard else '# -'} "
                 f"{topic.name:<{width}}  # {topic.type_name}, {topic.message_count} messages"

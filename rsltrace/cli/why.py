@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 
 import click
@@ -12,6 +11,7 @@ from rsltrace.cli.cat import RunTimeParam
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.terminal import say, tell
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.phrases import path_word
 
 
 @click.command()
@@ -49,5 +49,5 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
         else:
             say("\n  ".join((sentence(reason), *evidence(reason))))
     if reason.event is not None and not as_json:
-        tell(f"next: rsltrace view {shlex.quote(str(trace))} --at {reason.event}")
+        tell(f"next: rsltrace view {path_word(str(trace))} --at {reason.event}")
     return int(not isinstance(reason, AsExpected))

@@ -10,7 +10,7 @@ from rsltrace.job.documents.schema import job_schema
 VERDICTS = {
     "identical": "no event differs",
     "agree-until-truncated": "a file is cut, and they agree until then",
-    "different-jobs": "nothing to compare: other jobs or graphs",
+    "different-jobs": "one run has no event, and the jobs or graphs differ",
     "same-input-different-output": "a callback got the same input and did something else: hidden "
     "state, changed code or parameters, nondeterminism. Read that callback",
     "different-input": "a callback got another input: follow the cause that the report names",
@@ -22,8 +22,8 @@ VERDICTS = {
     "ran-longer": "b went on after the end of a",
     "exception": "a callback raised in one of them only",
     "draw": "a delay or loss was drawn differently: compare seeds and delay:",
-    "graph": "other nodes, topics or QoS",
-    "environment": "a call to the outside (clock, file, random) had another answer",
+    "graph": "other nodes, topics or timers: look at constructors and parameters",
+    "environment": "the runs were set up differently from the start: look at the settings",
     "same-content": "native runs: same messages, other times",
     "other-content": "native runs: messages differ or are missing",
 }

@@ -270,7 +270,7 @@ class Tools:
         """Run the trace's job again until a condition holds, forwards or backwards; show the event
         and the source of its callback."""
 
-        def go(session: DebugSession) -> tuple[list[str], RunPosition]:
+        def go(session: DebugSession) -> tuple[list[str], RunPosition | None]:
             point = session.break_at(condition)
             try:
                 place = start if start is not None else _end(session) if backwards else 0
@@ -279,11 +279,15 @@ class Tools:
                 if backwards and stopped.position.is_next and stopped.position.index >= place:
                     stopped = session.reverse_go_on()
                 source = session.inspect("source") if stopped.position.event else None
-                return [*stopped_lines(stopped), *_source_lines(source)], stopped.position
+                lines = [*stopped_lines(stopped), *_source_lines(source)]
+                return lines, stopped.position if stopped.breakpoint is not None else None
             finally:
                 session.clear(point.number)
 
         lines, position = await self._sessions.use(self._access.existing(trace), go)
+        if position is None:
+            other = f"run_until({trace!r}, {condition!r}, backwards={not backwards})"
+            return answer(f"{trace}: {condition}", page_of(lines), [other])
         at = position.index - (not position.is_next)
         on = max(at, 0) if backwards else position.index + position.is_next
         again = f"run_until({trace!r}, {condition!r}, start={on}, backwards={backwards})"

@@ -178,6 +178,8 @@ class AsExpected(Reason):
         return cls(*what, question=question, place=question.place, event=event)
 
     def words(self) -> str:
+        if not self.count:
+            return f"{self.question.name} did not run, and nothing kept it from running"
         last = "" if self.at_ns is None else f", last {at_time(self.at_ns)}"
         times = "once" if self.count == 1 else f"{self.count} times"
         return f"{self.question.name} ran as expected, {times}{last}"

@@ -54,7 +54,7 @@ class Waiting(Reason):
         for wait in decode_waits(question.history.trace.result):
             held = entity.id in wait.held or wait.text.startswith(own)
             if held and wait.since_ns <= question.until_ns:
-                one = question.occupation(wait.since_ns, question.end_ns)
+                one = next(iter(question.occupations(wait.since_ns, question.end_ns)), None)
                 places = _AT_LINE.findall(wait.text)
                 text = _AT_LINE.split(wait.text)[0].partition(_HINT)[0]
                 place, event = places[-1] if places else "", one.event if one else None
@@ -69,29 +69,41 @@ class Waiting(Reason):
 
 @dataclass(frozen=True)
 class Busy(Reason):
-    """Another callback occupied the executor or the callback group for a part of ``late_ns``."""
+    """Another callback occupied the executor or the callback group for a part of ``late_ns``, and
+    ``more`` did."""
 
     by: str
     verb: str
     from_ns: int
     to_ns: int
     late_ns: int
+    more: int
 
     @classmethod
     def between(cls, question: Question, from_ns: int, to_ns: int) -> Busy | None:
         """Return what kept the callback from running for longest in a stretch of time."""
-        one = question.occupation(from_ns, to_ns) if from_ns < to_ns else None
-        if one is None:
+        found = question.occupations(from_ns, to_ns) if from_ns < to_ns else []
+        if not found:
             return None
-        until_ns = min(one.to_ns, question.end_ns)
-        what = (question.named(one.entity), one.verb, one.from_ns, until_ns, to_ns - from_ns)
-        place = question.place_of(one.entity)
-        return cls(*what, question=question, place=place, event=one.event)
+        one, place = found[0], question.place_of(found[0].entity)
+        return cls(
+            question.named(one.entity),
+            one.verb,
+            one.from_ns,
+            min(one.to_ns, question.end_ns),
+            to_ns - from_ns,
+            len(found) - 1,
+            question=question,
+            place=place,
+            event=one.event,
+        )
 
     def clause(self) -> str:
         itself = "an earlier callback of it" if self.by == self.question.name else self.by
         times = f"from {seconds_text(self.from_ns)} s to {seconds_text(self.to_ns)} s"
-        return f"{itself} {self.verb} {times}"
+        more = f", and {self.more} more callbacks" if self.more > 1 else ""
+        more = ", and another callback" if self.more == 1 else more
+        return f"{itself} {self.verb} {times}{more}"
 
     def words(self) -> str:
         return f"{self.question.name} was {format_duration(self.late_ns)} late: {self.clause()}"

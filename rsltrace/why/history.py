@@ -201,16 +201,16 @@ class RunHistory:
         made = (one for one in mains if event in (self.made_by(one), *self.runs_of(one)))
         return next(made, 0)
 
-    def occupation(
+    def occupations_of(
         self, entity: Entity, from_ns: int, to_ns: int, shares: Callable[[Entity], bool]
-    ) -> Occupation | None:
-        """Return what kept a callback from running for longest in a stretch of time: one of its
+    ) -> list[Occupation]:
+        """Return what kept a callback from running in a stretch of time, the longest first: of its
         node (if suspended, of its group), or of a node that ``shares`` its executor."""
-        main, best = self.main_of(entity.node), None
-        longest_ns = 0
+        main = self.main_of(entity.node)
+        found: list[tuple[int, Occupation]] = []
         for one in self.occupations:
             shared_ns = min(one.to_ns, to_ns) - max(one.from_ns, from_ns)
-            if shared_ns > longest_ns:
+            if shared_ns > 0:
                 other = self.trace.entity(one.entity)
                 if other.kind is EntityKind.MAIN:
                     blocks = other.id == main
@@ -221,5 +221,5 @@ class RunHistory:
                     same = len(groups) == 1 and "reentrant" not in next(iter(groups))
                     blocks = one.verb in ("ran", "hung") or same
                 if blocks and other.kind is not EntityKind.THREAD:
-                    longest_ns, best = shared_ns, one
-        return best
+                    found.append((shared_ns, one))
+        return [one for _, one in sorted(found, key=lambda pair: -pair[0])]

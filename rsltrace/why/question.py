@@ -100,11 +100,10 @@ class Question:
     def mismatch(self, sender: Entity) -> tuple[str, str, str] | None:
         """Return the first policy that keeps a publisher from this subscription, what is offered
         and what is requested; None if they match."""
-        details = (sender.detail.get("qos") or {}, self.entity.detail.get("qos") or {})
-        try:
-            offered, requested = map(Qos.from_summary, details)
-        except (KeyError, TypeError):  # it has no QoS, or another program wrote the trace
-            return None
+        details = [one.detail.get("qos") for one in (sender, self.entity)]
+        offered, requested = (
+            Qos.from_summary(one if isinstance(one, dict) else {}) for one in details
+        )
         policies = incompatible_policies(offered, requested)
         if not policies:
             return None
@@ -121,9 +120,9 @@ class Question:
         gaps = [gap for gap in gaps if gap > 0]
         return bool(gaps) and until_ns - sent[-1].sent_ns > _PERIODS * median(gaps)
 
-    def occupation(self, from_ns: int, to_ns: int) -> Occupation | None:
-        """Return what kept the callback from running for longest in a stretch of time."""
-        return self.history.occupation(self.entity, from_ns, to_ns, self._shares_executor)
+    def occupations(self, from_ns: int, to_ns: int) -> list[Occupation]:
+        """Return what kept the callback from running in a stretch of time, the longest first."""
+        return self.history.occupations_of(self.entity, from_ns, to_ns, self._shares_executor)
 
     def _shares_executor(self, other: Entity) -> bool:
         names = [self.node.name, self.history.trace.node_of(other).name]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NoReturn
 
 from rsltrace.conditions.names import nodes_called
-from rsltrace.errors import TraceError, near_or_all
+from rsltrace.errors import TraceError, near_or_all, nearest
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.operation import is_built_in
@@ -29,8 +29,9 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     nodes = [one for one in trace.entities.values() if one.kind is EntityKind.NODE]
     called = nodes_called(node, [one.name for one in nodes])
     if not called:
-        reason = _not_begun(history, node)
-        return reason or _fail(trace, "node", node, [one.name for one in nodes])
+        known = [one.name for one in nodes]
+        reason = None if nearest(node, known) else _not_begun(history, node)
+        return reason or _fail(trace, "node", node, known)
     own = [one for one in nodes if one.name == called[0]]
     ids = {one.id for one in own}
     there = [e for e in trace.entities.values() if e.node in ids and e.kind in WITH_CALLBACK]

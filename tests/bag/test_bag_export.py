@@ -163,6 +163,7 @@ def test_force_replaces_bags_only(tmp_path: Path) -> None:
     check_bag_folder(tmp_path / "empty", force=True)
 
 
+@pytest.mark.long
 def test_the_commands(trace: Path, tmp_path: Path) -> None:
     (tmp_path / "talk.py").write_text(
         "from rclpy.node import Node\n"

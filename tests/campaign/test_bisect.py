@@ -109,6 +109,7 @@ def robot(tmp_path: Path) -> Robot:
     return Robot(tmp_path / "src" / "robot")
 
 
+@pytest.mark.long
 def test_the_commit_that_changed_the_digest_is_named_and_the_checkout_is_as_it_was(
     robot: Robot,
 ) -> None:

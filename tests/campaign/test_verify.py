@@ -77,6 +77,7 @@ def test_one_digest_is_stated_as_what_was_tried(
     assert not (tmp_path / "new.txt").exists()
 
 
+@pytest.mark.long
 def test_what_differs_and_is_not_published_is_found_in_the_run_in_which_it_begins(
     rsltrace: Command, job: WriteJob
 ) -> None:
@@ -113,6 +114,7 @@ def test_what_provokes_other_events_is_found_beside_states_that_always_differ(
     assert (found.by_itself, found.provoked_by) == (False, (perturb.TIME_ZONE,))
 
 
+@pytest.mark.long
 def test_a_hidden_difference_has_the_commands_that_repeat_it(
     rsltrace: Command, job: WriteJob
 ) -> None:

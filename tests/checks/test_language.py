@@ -282,6 +282,7 @@ def test_an_error_names_the_part_and_what_is_allowed(text: str, says: str, part:
 # -- bounds ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_steps_are_counted_so_that_an_expression_ends_alike_everywhere() -> None:
     text = "sum(1 for a in ranges for b in ranges)"
     both = [parse_expression(text, has_own=True) for _ in range(2)]

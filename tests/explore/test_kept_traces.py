@@ -83,6 +83,7 @@ def test_a_search_keeps_the_same_traces_whichever_run_ends_first(
     assert kept[0][0] == [f"{number:06d}.mcap" for number in range(7)]
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_a_run_whose_trace_is_lost_is_made_again_to_be_made_small(
     write_job: Callable[[str, str], Path], tmp_path: Path

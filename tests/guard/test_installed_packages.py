@@ -168,6 +168,7 @@ def test_who_is_a_library() -> None:
         assert not is_user_file(file), file
 
 
+@pytest.mark.long
 def test_packages_that_pip_has_installed(tmp_path: Path) -> None:
     """A wheel in a folder (``--target``), the sources in another, and an editable package."""
     pytest.importorskip("setuptools", minversion="71", reason="needs setuptools")

@@ -194,6 +194,7 @@ def test_a_folder_for_temporary_files_that_somebody_chose_stays(
     assert tempfile.tempdir == str(tmp_path)
 
 
+@pytest.mark.long
 def test_reads_of_the_environment_are_met_however_many_runs_there_were(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     from rsltrace import Job, NodeSpec, StopSpec, record

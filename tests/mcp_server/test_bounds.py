@@ -63,6 +63,7 @@ def size(text: str) -> int:
     return len(text.encode())
 
 
+@pytest.mark.long
 def test_answers_are_short_and_recorded_texts_marked(tmp_path: Path) -> None:
     write_synthetic(tmp_path / "a.mcap", 200_000)
     write_synthetic(tmp_path / "b.mcap", 200_000, 150_001)

@@ -46,6 +46,7 @@ def _here() -> list[list[dict[str, Any]]]:
     return [node.outcomes for node in nodes]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("executor", ["", pytest.param("events", marks=pytest.mark.long)])
 def test_all_pairs_go_through_the_same_in_processes(
     compiled: object,

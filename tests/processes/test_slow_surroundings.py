@@ -60,6 +60,7 @@ def _logs(path: Path) -> list[tuple[int, str]]:
     return [(stamp // 1_000_000, record.msg) for stamp, record in records]  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 @pytest.mark.ros
 @pytest.mark.skipif(not can_fix_addresses(), reason="needs setarch, and a kernel that allows it")
 def test_addresses_of_processes_are_perturbed_where_nothing_is_pinned_and_else_fixed(

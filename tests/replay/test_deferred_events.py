@@ -125,6 +125,7 @@ EDITS = st.lists(
 )
 
 
+@pytest.mark.long
 @settings(
     max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )

@@ -80,6 +80,7 @@ def test_a_process_that_has_closed_its_output_forks_too(monkeypatch: pytest.Monk
         assert sim.fork(adding(10)).value[-1] == 20
 
 
+@pytest.mark.long
 def test_each_fork_is_the_run_from_the_beginning_and_the_original_stays(tmp_path: Path) -> None:
     with Simulation(job(), tmp_path / "original.mcap", forks=True) as sim:
         sim.run_for(0.5)

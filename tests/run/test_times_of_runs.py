@@ -65,6 +65,7 @@ def command(folder: Path, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("time", ["2.5", "2500ms", f"@{START_S}.0", f"@{START_S + 2}.5s"])
 def test_record_and_replay_mean_the_same_time(folder: Path, time: str) -> None:
     expected = 25 if "@" not in time or time.endswith("s") else 0

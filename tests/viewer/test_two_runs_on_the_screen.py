@@ -324,7 +324,9 @@ def test_samples_in_every_size_and_in_rerun(drive: Drive, name: str, tmp_path: P
     check_everywhere(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"), tmp_path)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(name, marks=pytest.mark.long) for name in NAMES[:2]), *NAMES[2:]]
+)
 def test_samples(drive: Drive, name: str) -> None:
     both, (a, b) = screens(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"))
     counts = check_both(both[0], a, b)
@@ -359,6 +361,7 @@ CASES = {
 }
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("case", [*CASES, "many moves"])
 def test_constructed_pairs(drive: Drive, simulator: Any, tmp_path: Path, case: str) -> None:
     plan = simulator.NodePlan

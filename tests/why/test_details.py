@@ -55,3 +55,52 @@ def test_a_topic_with_two_callbacks_is_not_answered_for_one_of_them(
         with pytest.raises(TraceError, match=r"several /x; .*Twice\.one.*Twice\.other"):
             why(trace, "/twice", "/x")
         assert why(trace, "/twice", "one") is not None
+
+
+_BURSTS = """
+import time
+from rclpy.node import Node
+from std_msgs.msg import String
+
+class Sends(Node):
+    def __init__(self):
+        super().__init__("sends")
+        self.publishers_there = [self.create_publisher(String, name, 50) for name in ("/a", "/b")]
+        self.timer = self.create_timer(1.0, self.tick)
+
+    def tick(self):
+        self.timer.cancel()
+        for _ in range(5):
+            self.publishers_there[0].publish(String())
+        self.publishers_there[1].publish(String())
+
+class Hears(Node):
+    def __init__(self):
+        super().__init__("hears")
+        self.create_subscription(String, "/a", self.slow, 50)
+        self.create_subscription(String, "/b", self.waits, 50)
+
+    def slow(self, message): pass
+    def waits(self, message): pass
+"""
+_BURSTS_JOB = """
+nodes: [{node: bursts:Sends}, {node: bursts:Hears}]
+execution: {entities: [{node: /hears, entity: /a, constant: 30ms}]}
+stop: {duration: 3s}
+"""
+
+
+@pytest.mark.ros
+def test_a_callback_that_waited_for_several(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "bursts.py").write_text(_BURSTS)
+    (tmp_path / "job.yaml").write_text(_BURSTS_JOB)
+    monkeypatch.chdir(tmp_path)
+    run(load_job("job.yaml"), "run.mcap")
+    with Trace.open("run.mcap") as trace:
+        late = why(trace, "/hears", "waits", trace.start_ns + 10**9).words()
+        assert late.startswith("subscription /b of /hears was 150 ms late: subscription /a of")
+        assert late.endswith(" ran from 1.0 s to 1.03 s, and 4 more callbacks")
+        before = why(trace, "/sends", "tick", trace.start_ns + 5 * 10**8).words()
+        assert before == "timer Sends.tick of /sends did not run, and nothing kept it from running"

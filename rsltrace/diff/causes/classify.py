@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.propagation import NODE
 from rsltrace.diff.causes.relevance import DivergenceSite, Relevance
 from rsltrace.diff.facts.causes import (
@@ -48,6 +47,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind, is_switch
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 
 _DRAWN_FROM = ("delay", "faults", "execution", "seed", "clocks")
 """Keys of a job that decide whether something is drawn."""

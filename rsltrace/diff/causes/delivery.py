@@ -187,7 +187,7 @@ def _unmatched(
     """Whether the QoS of two endpoints does not match in a, and in b."""
     offered, requested = details if keys[0].kind == _PUBLISHER else details[::-1]
     in_a, in_b = (
-        bool(incompatible_policies(*(Qos.of_summary(_qos(detail)) for detail in ends)))
+        bool(incompatible_policies(*(Qos.from_summary(_qos(detail)) for detail in ends)))
         for ends in zip(offered, requested, strict=True)
     )
     return in_a, in_b

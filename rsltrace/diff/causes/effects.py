@@ -14,8 +14,7 @@ from rsltrace.diff.causes.propagation import (
     outputs_of_one,
 )
 from rsltrace.trace.model.event import OutputKind
-
-PARAMETER_EVENTS = "/parameter_events"
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 
 
 def is_effect(block: AlignedBlock, item: EventPair) -> bool:

@@ -23,7 +23,6 @@ from rsltrace.diff.causes.delivery import (
     still_waits,
     topics_of,
 )
-from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.likely_cause import likely_cause, suppressed_exception
 from rsltrace.diff.causes.message_differences import message_differences
@@ -65,6 +64,7 @@ from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import path_word, seconds_text
 

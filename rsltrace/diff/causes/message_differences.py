@@ -21,7 +21,6 @@ from rsltrace.diff.alignment.rows import (
     load_rows,
     outputs_of,
 )
-from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
 from rsltrace.diff.facts.evidence import (
     EventSummary,
@@ -52,7 +51,12 @@ from rsltrace.trace.model.event import (
     OutputKind,
     decision_text,
 )
-from rsltrace.trace.model.operation import TIMER_CANCEL, TIMER_PERIOD, pack_operation
+from rsltrace.trace.model.operation import (
+    PARAMETER_EVENTS,
+    TIMER_CANCEL,
+    TIMER_PERIOD,
+    pack_operation,
+)
 from rsltrace.trace.model.texts import contrasting, printable, shortened
 from rsltrace.trace.words.code import output_places, relative_place
 from rsltrace.trace.words.entities import EntityKey

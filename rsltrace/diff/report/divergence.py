@@ -26,7 +26,7 @@ from rsltrace.diff.report.line import (
 )
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
-from rsltrace.diff.sentences.pair_text import pair_text
+from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
 from rsltrace.trace.words.kinds import flag_names
@@ -249,7 +249,7 @@ def _row_cells(row: EventRow) -> list[Piece]:
         what.append(f"{'↓' if row.is_below else '↑'} {'b' if row.a else 'a'} {row.elsewhere}")
     elif row.a is None or row.b is None:
         what.append(f"only in {'a' if row.a else 'b'}")
-    what.append(printable(pair_text(row.messages)) or did)
+    what.append(printable(event_differences_text(row.messages)) or did)
     return [
         (row.sign.value, Style.FAINT),
         *((number, Style.FAINT) for number in numbers),

@@ -111,7 +111,8 @@ def _(outcome: DifferentJobs, of: object) -> str:
 
 @says(RunsDiverge)
 def _(outcome: RunsDiverge, of: RunComparison) -> str:
-    from rsltrace.diff.sentences.divergence import headline, sentence_of
+    from rsltrace.diff.sentences.divergence import sentence_of
+    from rsltrace.diff.sentences.headline import headline
 
     first = of.divergences[0]
     if outcome.foreign is None:

@@ -32,6 +32,7 @@ from rsltrace.diff.traces.tolerance import interruptions, side
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.native import DurationStatistics, duration_statistics, event_columns, is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityKey
@@ -39,7 +40,6 @@ from rsltrace.trace.words.entities import EntityKey
 TIMES = ("stamp", "*.stamp")
 """Fields that are not compared: what they hold is real time, or was simulated."""
 
-_PARAMETERS = "/parameter_events"
 """Nodes that are created at once mix there, in any order."""
 
 _CALLBACKS = tuple(
@@ -71,7 +71,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
         topic
         for topic in content.topics
         if _says_something_else(topic)
-        and not (topic.topic == _PARAMETERS and said_of_parameters(a) == said_of_parameters(b))
+        and not (topic.topic == PARAMETER_EVENTS and said_of_parameters(a) == said_of_parameters(b))
     ]
     firsts = [topic.first for topic in others if topic.first is not None]
     native = tuple(name for name, trace in (("a", a), ("b", b)) if is_native(trace))
@@ -114,8 +114,8 @@ def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
 def said_of_parameters(trace: Trace) -> Counter[str]:
     """Return what nodes have said of their parameters, in any order."""
     found: Counter[str] = Counter()
-    for _, _, data in trace.messages(_PARAMETERS):
-        message: Any = trace.decode(_PARAMETERS, data)
+    for _, _, data in trace.messages(PARAMETER_EVENTS):
+        message: Any = trace.decode(PARAMETER_EVENTS, data)
         found[repr((message.node, *(getattr(message, name) for name in _KINDS)))] += 1
     return found
 

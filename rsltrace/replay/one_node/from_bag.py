@@ -31,6 +31,7 @@ from rsltrace.run.session import RunSession
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recordings import open_bag
 from rsltrace.trace.recordings.playback import header_stamp_ns
@@ -91,7 +92,6 @@ def node_topics(job: Job, node: str) -> NodeTopics:
             probe.finish()
 
 
-_OF_ALL_NODES = ("/rosout", "/parameter_events")
 _NOT_OF_ROBOTS: dict[str, object] = {
     **dict.fromkeys(("delay", "policy", "executors", "execution")),
     **dict.fromkeys(("start_ns", "construct_time_ns", "progress")),
@@ -197,7 +197,7 @@ def _specs(bags: Sequence[Path], ends: NodeTopics) -> Iterator[BagSpec]:
 
 def _compared(ends: NodeTopics) -> list[str]:
     """Return the topics that probably only the node itself publishes."""
-    return [t for t in ends.published if t not in (*_OF_ALL_NODES, *ends.subscribed)]
+    return [t for t in ends.published if t not in (*NODE_TOPICS, *ends.subscribed)]
 
 
 def _sides(trace: Trace, ends: NodeTopics, bags: Sequence[Path]) -> tuple[NodeOutputs, BagOutputs]:
@@ -248,7 +248,7 @@ def _at(key: Key, data: bytes, headers: dict[str, bool], counts: dict[Key, int])
 
 
 def _notes(ends: NodeTopics, there: NodeOutputs) -> Iterator[str]:
-    both = [t for t in ends.published if t in ends.subscribed and t not in _OF_ALL_NODES]
+    both = [t for t in ends.published if t in ends.subscribed and t not in NODE_TOPICS]
     if both:
         yield (
             f"{ends.node} publishes and hears {', '.join(both)}: what was recorded there plays, "

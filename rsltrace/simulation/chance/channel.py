@@ -13,6 +13,7 @@ from fnmatch import fnmatchcase
 
 from rsltrace.simulation.chance.distribution import Constant, Distribution
 from rsltrace.simulation.chance.stream import RandomStream
+from rsltrace.trace.model.operation import NODE_TOPICS
 
 LOST_DROP = -1
 LOST_BURST = -2
@@ -187,7 +188,7 @@ def _merge_outages(outages: Sequence[LinkOutage]) -> tuple[LinkOutage, ...]:
     return tuple(found)
 
 
-QUIET_TOPICS = frozenset(("/rosout", "/parameter_events"))
+QUIET_TOPICS = NODE_TOPICS
 """Topics without the default delay."""
 
 

@@ -21,6 +21,7 @@ from rsltrace.errors import OutputError, TraceError
 from rsltrace.trace.exports.output_file import check_output_file
 from rsltrace.trace.format import PREFIX_OWN, TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ROSOUT
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.regular_file import replacement_of
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
@@ -50,7 +51,7 @@ _DRAWN = frozenset(
 )
 _STATE_TYPES = frozenset(("bool", "string", "int8", "uint8", "byte", "char"))
 _NOT_PLOTTED = frozenset(("sec", "nanosec", "frame_id", "child_frame_id"))
-_NODE_TOPICS = frozenset((TOPIC_ROSOUT, "/parameter_events", "/clock"))
+_UNPLOTTED = NODE_TOPICS | {"/clock"}
 _BARE_TOPIC = re.compile(r"[A-Za-z0-9_/-]+", re.ASCII)
 
 
@@ -130,7 +131,7 @@ def _arranged(trace: Trace, channels: Sequence[ChannelInfo], panels: _Panels) ->
     frames = _Frames()
     for channel in channels:
         count = trace.message_counts.get(channel.id, 0)
-        if not count or channel.topic in _NODE_TOPICS:
+        if not count or channel.topic in _UNPLOTTED:
             continue
         messages = list(_samples(trace, channel, count))
         if channel.type in _DRAWN or channel.type == _TF:

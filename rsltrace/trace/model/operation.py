@@ -9,7 +9,8 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 
 # Entities that rclpy makes for every node: most of a run's, hardly ever of interest.
 
-NODE_TOPICS = frozenset(("/rosout", "/parameter_events"))
+PARAMETER_EVENTS = "/parameter_events"
+NODE_TOPICS = frozenset(("/rosout", PARAMETER_EVENTS))
 NODE_SERVICES = frozenset(
     (
         "describe_parameters",

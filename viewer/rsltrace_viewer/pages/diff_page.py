@@ -5,6 +5,7 @@ The rows are those of the viewer: the same events in the same order, with the sa
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
@@ -80,7 +81,9 @@ def part_of(diff: Diff | BagDiff, options: DiffOptions) -> dict[str, object]:
     found = diff.shown if isinstance(diff, Diff) else None
     is_native = isinstance(diff, Diff) and diff.native is not None
     paths = f"{path_word(diff.a.path)} {path_word(diff.b.path)}"
-    words = [f"rsltrace {word} {paths}" for word in (("diff",) if is_native else ("diff", "view"))]
+    filters = filters_of(options)
+    words = [" ".join(("rsltrace diff", paths, *map(shlex.quote, filters)))]
+    words += [] if is_native else [f"rsltrace view {paths}"]
     following = found.next_step if found is not None else ""
     return {
         "diff": diff,
@@ -91,6 +94,7 @@ def part_of(diff: Diff | BagDiff, options: DiffOptions) -> dict[str, object]:
         "where": _where(found),
         "next": following,
         "commands": [one for one in words if one != following],
+        "filters": " ".join(filters),
         "evidence": evidence_of(diff) if isinstance(diff, Diff) else Evidence(),
         "fields": [*_fields(diff)],
         "state": [(one.path, one.a, one.b) for one in found.state] if found is not None else [],
@@ -101,6 +105,16 @@ def part_of(diff: Diff | BagDiff, options: DiffOptions) -> dict[str, object]:
         ],
         "report": "" if diff.identical else plain_text(report_lines(diff, options)),
     }
+
+
+def filters_of(options: DiffOptions) -> list[str]:
+    """Return what a diff leaves out or tolerates, as words of its command."""
+    words = [f"--node={glob}" for glob in options.nodes]
+    words += [f"--topic={glob}" for glob in options.topics]
+    words += [f"--ignore={glob}" for glob in options.ignore]
+    words += [f"--abs={glob}={value!r}" for glob, value in options.absolute]
+    words += [f"--rel={glob}={value!r}" for glob, value in options.relative]
+    return words
 
 
 def _runs(diff: Diff | BagDiff) -> list[tuple[str, ...]]:

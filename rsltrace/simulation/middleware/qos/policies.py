@@ -6,6 +6,7 @@ https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Quality-of-Service-Set
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import Any
@@ -135,26 +136,6 @@ class Qos:
         ]
         return "\n".join(lines)
 
-    @staticmethod
-    def of_summary(shown: dict[str, object]) -> Qos:
-        """Return the policies that decide on a connection, as ``summary`` shows them."""
-
-        def limit(name: str) -> int:
-            value = shown.get(name)
-            return value if isinstance(value, int) else 0
-
-        best_effort = shown.get("reliability") == "best_effort"
-        latched = shown.get("durability") == "transient_local"
-        manual = shown.get("liveliness") == "manual_by_topic"
-        return replace(
-            DEFAULT_QOS,
-            reliability=Reliability.BEST_EFFORT if best_effort else Reliability.RELIABLE,
-            durability=Durability.TRANSIENT_LOCAL if latched else Durability.VOLATILE,
-            liveliness=Liveliness.MANUAL_BY_TOPIC if manual else Liveliness.AUTOMATIC,
-            deadline_ns=limit("deadline_ns"),
-            lease_ns=limit("lease_ns"),
-        )
-
     def summary(self) -> dict[str, object]:
         """Return the policies to show for an entity; durations only if they are limits."""
         shown: dict[str, object] = {
@@ -171,15 +152,17 @@ class Qos:
         return shown
 
     @staticmethod
-    def from_summary(shown: Any) -> Qos:
-        """Return the profile that ``summary`` shows.
-
-        :raises KeyError, TypeError: it is none.
-        """
-        values: dict[str, Any] = {**_NO_LIMITS, **shown}
+    def from_summary(shown: Mapping[str, object]) -> Qos:
+        """Return the profile that ``summary`` shows; what it does not show is as in the default."""
+        policies: dict[str, Any] = {}
         for name, kind in _ENUMS.items():
-            values[name] = kind[str(values[name]).upper()]
-        return Qos(**values)
+            value = str(shown.get(name)).upper()
+            if value in kind.__members__:
+                policies[name] = kind[value]
+        for name in ("depth", "deadline_ns", "lifespan_ns", "lease_ns"):
+            if isinstance(shown.get(name), int):
+                policies[name] = shown[name]
+        return replace(DEFAULT_QOS, **policies)
 
 
 _ENUMS: dict[str, type[IntEnum]] = {
@@ -188,7 +171,6 @@ _ENUMS: dict[str, type[IntEnum]] = {
     "durability": Durability,
     "liveliness": Liveliness,
 }
-_NO_LIMITS = {"deadline_ns": 0, "lifespan_ns": 0, "lease_ns": 0, "liveliness": "automatic"}
 
 
 def incompatible_policies(offered: Qos, requested: Qos) -> list[PolicyKind]:

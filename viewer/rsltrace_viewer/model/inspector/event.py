@@ -23,6 +23,7 @@ from rsltrace.trace.model.event import (
     Output,
     OutputKind,
 )
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
 from rsltrace.trace.states import StateValue, state_after
 from rsltrace.trace.words.code import output_places, places_text
@@ -42,7 +43,6 @@ from rsltrace_viewer.model.timeline.events import entity_of, event_text, node_of
 
 # Parameters of a node at some time, put together from what it announced on /parameter_events.
 
-TOPIC = "/parameter_events"
 _VALUE_FIELDS = {
     1: "bool_value",
     2: "integer_value",
@@ -77,10 +77,10 @@ def parameters_at(run: Run, node: str, stamp_ns: int) -> dict[str, object]:
 def _announced(run: Run) -> tuple[tuple[int, str, tuple[tuple[str, object], ...]], ...]:
     """Return (stamp, node, changes) of all announcements; a value of None was undeclared."""
     found = []
-    for stamp_ns, sequence, data in run.trace.messages(TOPIC):
+    for stamp_ns, sequence, data in run.trace.messages(PARAMETER_EVENTS):
         if sequence >= _MESSAGES_MAX:
             break
-        message: Any = run.trace.decode(TOPIC, data)
+        message: Any = run.trace.decode(PARAMETER_EVENTS, data)
         changes: list[tuple[str, object]] = [
             (parameter.name, _value(parameter.value))
             for parameter in (*message.new_parameters, *message.changed_parameters)

@@ -15,6 +15,7 @@ from rsltrace.errors import TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import PLACEHOLDERS
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
@@ -26,7 +27,6 @@ TELLING_MAX = 16
 """Messages of a topic that are read to choose the field to plot first."""
 
 _RATE_BINS = 240
-_OF_EVERY_NODE = ("/rosout", "/parameter_events")
 _NUMBERS_MAX = 16
 """Items of an array that are offered one by one."""
 
@@ -75,7 +75,7 @@ def sources_of(run: Run) -> list[PlotSource]:
     counts = run.trace.message_counts
     sent = {c.topic for c in run.trace.channels.values() if counts.get(c.id)}
     for entity in _publishers(run):
-        if entity.name in sent and entity.name not in _OF_EVERY_NODE:
+        if entity.name in sent and entity.name not in NODE_TOPICS:
             found.append(PlotSource("rate", entity.name))
     for entity in run.entities.values():
         if entity.kind is EntityKind.SUBSCRIPTION and entity.name in {e.name for e in found}:
@@ -92,7 +92,7 @@ def topics_with_messages(run: Run) -> list[str]:
         if counts.get(channel.id) and not channel.topic.startswith("/rsltrace/")
     ]
     # What every node has comes last: one rarely looks for it.
-    return sorted(dict.fromkeys(topics), key=lambda topic: topic in _OF_EVERY_NODE)
+    return sorted(dict.fromkeys(topics), key=lambda topic: topic in NODE_TOPICS)
 
 
 def fields_of(run: Run, topic: str) -> list[PlotSource]:

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.diff.sentences.pair_text import TURNS, number
+from rsltrace.diff.sentences.event_differences import TURNS, number
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind

@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.sentences.pair_text import pair_text
+from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.texts import printable
 
@@ -46,7 +46,7 @@ class PairValues:
         except TraceError as error:
             text = printable(f"unreadable: {error}")
             return text, text
-        whole = pair_text(found)
+        whole = event_differences_text(found)
         if not whole and views[0].state_hash != views[1].state_hash:
             whole = "another state afterwards"
-        return printable(whole), printable(pair_text(found, brief=True))
+        return printable(whole), printable(event_differences_text(found, brief=True))

@@ -21,7 +21,7 @@ _AS_IT_IS = 7
 """Numbers of so many characters are not rounded."""
 
 
-def pair_text(found: Sequence[MessageDifference], *, brief: bool = False) -> str:
+def event_differences_text(found: Sequence[MessageDifference], *, brief: bool = False) -> str:
     """Return in what two events differ; ``brief``: without the topic where there is only one."""
     # As rows of one run do, with what an event did first.
     found = sorted(found, key=lambda one: one.position < 0)
