@@ -370,7 +370,9 @@ class Explainer:
         for number, (first, count, moved) in found.reached.items():
             topic = keys[number].name
             earlier, so_far, by = topics.get(topic, (first, 0, moved))
-            topics[topic] = (min(first, earlier), so_far + count, moved if first < earlier else by)
+            if (earlier, abs(by)) < (first, abs(moved)):
+                first, moved = earlier, by
+            topics[topic] = (first, so_far + count, moved)
         reaches = [
             AffectedTopic(topic, max(first - found.stamp, 0), count, moved)
             for topic, (first, count, moved) in topics.items()

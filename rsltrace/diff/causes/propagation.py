@@ -442,7 +442,8 @@ class Propagation:
 
     def _reach(self, found: FoundDivergence, number: int, stamp: int, moved_ns: int) -> None:
         first, count, moved = found.reached.get(number, (stamp, 0, moved_ns))
-        if stamp < first:
+        # Of two at one time it is the one that did not only move, whichever run is called a.
+        if (stamp, abs(moved_ns)) < (first, abs(moved)):
             first, moved = stamp, moved_ns
         found.reached[number] = (first, count + 1, moved)
 
