@@ -95,7 +95,7 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
 
     :raises DebugError: if no process can be made.
     """
-    told, tell = os.pipe()
+    read_end, write_end = os.pipe()
     try:
         is_copy = _is_copy_of_many() if other_threads() else _is_copy_of_one()
         if is_copy:
@@ -103,16 +103,16 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
                 die_with_parent(parent)
                 _reopen_files()
                 _renew(pairs)
-                os.write(tell, _PID.pack(_c.getpid()))  # for which the other one waits
+                os.write(write_end, _PID.pack(_c.getpid()))  # for which the other one waits
                 return 0
             end_process(1)
-        os.close(tell)
-        tell = -1
-        data = os.read(told, _PID.size)
+        os.close(write_end)
+        write_end = -1
+        data = os.read(read_end, _PID.size)
     finally:
-        os.close(told)
-        if tell >= 0:
-            os.close(tell)
+        os.close(read_end)
+        if write_end >= 0:
+            os.close(write_end)
     if not data:
         raise DebugError("no process can be made for a checkpoint (see ulimit -u)")
     return int(_PID.unpack(data)[0])

@@ -235,8 +235,8 @@ class _Newcomers:
 
 def _qos(entity: Entity) -> Qos:
     """Return the QoS that a trace tells of an endpoint."""
-    told = entity.detail.get("qos")
-    values: Mapping[str, Any] = told if isinstance(told, Mapping) else {}
+    qos = entity.detail.get("qos")
+    values: Mapping[str, Any] = qos if isinstance(qos, Mapping) else {}
 
     def word(kind: Any, key: str, default: Any) -> Any:
         return kind.__members__.get(str(values.get(key, "")).upper(), default)

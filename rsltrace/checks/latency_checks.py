@@ -103,7 +103,7 @@ def _late(
     last = trace.ended_after
     moments = chain.moments(spec.measure)
     durations = moments["duration"]
-    if last is not None:  # what nodes do when they are told to end
+    if last is not None:  # what nodes do at shutdown
         moments = moments[moments["output_event"] < last]
         durations = moments["duration"]
     late = [

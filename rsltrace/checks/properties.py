@@ -32,7 +32,7 @@ class Violation:
 
 @dataclass
 class RunProperty(ABC):
-    """A property of a run, told of its events in order. ``count`` is how often it is violated,
+    """A property of a run; it gets the events in order. ``count`` is how often it is violated,
     ``undecided`` how often the run ended before that could be said."""
 
     found: list[Violation] = field(default_factory=list, init=False)

@@ -80,13 +80,13 @@ def debug(
     if (job_folder is not None or trust) and not is_trace(source):
         raise click.UsageError("--job-folder and --trust are for a TRACE")
     with ExitStack() as stack:
-        names, told = None, set()
+        names, shown = None, set()
         if is_trace(source):
             plan = stack.enter_context(prepare_replay(source, job_folder))
             for line in code_lines(plan, "debugging"):
                 tell(line)
             agree(plan, trust=trust)
-            told = {f"{one.name} {one.change}" for one in plan.code}
+            shown = {f"{one.name} {one.change}" for one in plan.code}
             names = names_of(plan.trace.entities.values())
         session = stack.enter_context(
             DebugSession(
@@ -100,7 +100,7 @@ def debug(
                 on_notice=_on_notice,
             )
         )
-        for note in (note for note in session.notes if note not in told):
+        for note in (note for note in session.notes if note not in shown):
             tell(f"note: {note}")
         return DebugPrompt(session, commands, names).run()
 

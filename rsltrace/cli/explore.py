@@ -288,14 +288,14 @@ def _telling(
     if quiet:
         yield lambda result: None
         return
-    told: set[str] = set()
+    reported: set[str] = set()
     with search_line(search, budget) as update:
 
         def on_result(result: TrialResult) -> None:
             update()
             trial, failure = result.trial, result.failure
-            if failure is not None and failure.key not in told:
-                told.add(failure.key)
+            if failure is not None and failure.key not in reported:
+                reported.add(failure.key)
                 tell(f"trial {trial.number} ({trial.why}): {failure.kind}: {failure.text}")
 
         yield on_result

@@ -164,11 +164,11 @@ def record(
             policy=policy,
         )
         return
-    told: list[str] = []
+    shown_notes: list[str] = []
     result = _recorded(
         loaded,
         path,
-        told,
+        shown_notes,
         force=force,
         echo=not quiet,
         shows=not (quiet or as_json),
@@ -180,7 +180,7 @@ def record(
     try:
         checked, checks_status = _checked(loaded, result.path)
         status = status or checks_status
-        _report(result, told, checked, as_json=as_json)
+        _report(result, shown_notes, checked, as_json=as_json)
         if bag is not None:
             _export(result.path or path, bag, force=force)
     except OSError as error:
@@ -228,7 +228,7 @@ def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
 def _recorded(
     job: Job,
     path: Path,
-    told: list[str],
+    shown_notes: list[str],
     *,
     force: bool,
     echo: bool,
@@ -236,11 +236,11 @@ def _recorded(
     replay: Path | None,
     samples_states: bool,
 ) -> RunResult:
-    """Run a job; notes are shown, and added to ``told``. ``shows``: progress, too."""
+    """Run a job; notes are shown, and added to ``shown_notes``. ``shows``: progress, too."""
     from rsltrace.run import RunCallbacks, run
 
     def note(text: str) -> None:
-        told.append(text)
+        shown_notes.append(text)
         _note(text)
 
     if sys.__stderr__ is not None and not faulthandler.is_enabled():
@@ -371,12 +371,12 @@ def _checked(job: Job, path: Path | None) -> tuple[CheckReport | None, int]:
 
 
 def _report(
-    result: RunResult, told: list[str], checked: CheckReport | None, *, as_json: bool
+    result: RunResult, shown_notes: list[str], checked: CheckReport | None, *, as_json: bool
 ) -> None:
     error = result.error
     silent = _silent_topics(result)
     for note in (*result.notes, *silent):
-        if note not in told:  # when the run began
+        if note not in shown_notes:  # when the run began
             tell(f"note: {note}")
     if error is not None:
         if isinstance(error, NodeError) and error.traceback_text:

@@ -22,7 +22,7 @@ HOST = "127.0.0.1"
 _BREAKPOINT = 1_000_000_000
 _SETTINGS = {
     "PYDEVD_DISABLE_FILE_VALIDATION": "1",  # or it says a word about frozen modules
-    "PYDEVD_USE_SYS_MONITORING": "0",  # sys.settrace, which can be told what is outside
+    "PYDEVD_USE_SYS_MONITORING": "0",  # sys.settrace, which can leave out code
     "PYDEVD_USE_FRAME_EVAL": "NO",
 }
 

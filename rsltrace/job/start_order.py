@@ -66,15 +66,15 @@ def start_problems(job: JobFields) -> Iterator[JobProblem]:
 
 
 def _circles(waits_for: dict[int, dict[str, int]]) -> Iterator[JobProblem]:
-    told: set[int] = set()
+    reported: set[int] = set()
     for first, after in waits_for.items():
         for key in after:
             path, at = [first], after[key]
             while at not in path and at in waits_for:
                 path.append(at)
                 at = next(iter(waits_for[at].values()))
-            if at == first and not told & set(path):
-                told.update(path)
+            if at == first and not reported & set(path):
+                reported.update(path)
                 way = " → ".join(f"nodes[{index}]" for index in [*path, first])
                 yield JobProblem(
                     f"it waits for itself, and never starts: {way}",

@@ -137,7 +137,7 @@ class CallbackObserver:
 
     @contextmanager
     def watched(self, *, threads_are_processes: bool = True) -> Iterator[None]:
-        """Be told of all callbacks meanwhile. A thread that stands for a process has a global
+        """Observe all callbacks meanwhile. A thread that stands for a process has a global
         executor of its own."""
         import rclpy
         from rclpy.executors import Executor

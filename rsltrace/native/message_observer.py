@@ -85,7 +85,7 @@ class MessageObserver:
         self._taker = taker
         self._local = threading.local()
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
-        """What is told of the messages on a topic, and of their class."""
+        """Called with the messages on a topic, and of their class."""
         self.unreadable = 0
         """Messages that could not be written as bytes."""
 
@@ -97,7 +97,7 @@ class MessageObserver:
 
     @contextmanager
     def watched(self, extension: Any) -> Iterator[None]:
-        """Be told of all that passes meanwhile."""
+        """Observe all that passes meanwhile."""
         wraps_of: list[tuple[Any, str, Callable[..., Any]]] = [
             (extension.Publisher, "publish", self._publish),
             (extension.Publisher, "publish_raw", self._publish),
@@ -193,8 +193,8 @@ class MessageObserver:
         digest = hash64(data) if data else 0
         sent = SentMessage(kind, entity, digest, data, sequence, after_ns, before_ns)
         self._recorder.sent(span, sent, begun_ns)
-        if kind == _MESSAGE and (told := self.on_message.get(entity.name)) is not None:
-            told(data, entity.sends_type)
+        if kind == _MESSAGE and (callback := self.on_message.get(entity.name)) is not None:
+            callback(data, entity.sends_type)
 
     def _take_message(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)

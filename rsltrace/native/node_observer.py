@@ -46,7 +46,7 @@ class NodeObserver:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Be told of all nodes that are made meanwhile."""
+        """Observe all nodes that are made meanwhile."""
         from rclpy.action.client import ActionClient
         from rclpy.action.server import ActionServer
         from rclpy.lifecycle.node import LifecycleNodeMixin

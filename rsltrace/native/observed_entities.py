@@ -61,7 +61,7 @@ class ObservedEntities:
         return news
 
     def find(self, handle: Any) -> ObservedEntity | None:
-        """Return what belongs to a handle or wrapper; None if nobody has told of it."""
+        """Return what belongs to a handle or wrapper; None if it is not known."""
         return self._of.get(handle)
 
     def add(
@@ -93,7 +93,7 @@ class ObservedEntities:
         return entity
 
     def unnamed(self, wrapper: Any, kind: EntityKind) -> ObservedEntity:
-        """Return the entity of a wrapper that nobody has told of (an event handler, say)."""
+        """Return the entity of a wrapper that is not known (an event handler, say)."""
         found = self._of.get(wrapper)
         if found is not None:
             return found

@@ -19,7 +19,7 @@ from rsltrace.trace.model.event import EventKind
 class RunningEntry(threading.Thread):
     """Constructs one entry's nodes, and spins them once ``start`` is set.
 
-    ``on_end`` is told when it is over, with what it raised.
+    ``on_end`` is called when it is over, with what it raised.
     """
 
     def __init__(

@@ -92,7 +92,7 @@ class SingleProcessRun(NativeRun):
         self._cpu_ns = time.process_time_ns()
         self._start = threading.Event()
         self._running: list[RunningEntry] = []
-        self.entries = node_entries(self.job, told=self.note)
+        self.entries = node_entries(self.job, note=self.note)
         self.prepare(output)
         number = stack.enter_context(domain(self.domain_id))
         stack.enter_context(rclpy_running(echo=echo))

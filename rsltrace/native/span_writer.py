@@ -125,7 +125,7 @@ class SpanSource(Protocol):
 
 
 class SpanWriter(threading.Thread):
-    """Takes spans from a source and writes them, until it is told to finish."""
+    """Takes spans from a source and writes them, until ``finish`` is called."""
 
     def __init__(
         self, source: SpanSource, recorder: Recorder, clocks: ClockPair, base_dir: Path

@@ -133,7 +133,7 @@ class EventVerification(EventObserver):
         if self.stop is None:
             self.stop = stop
             self._session.loop.stop(stop)
-        if not go_on:  # what follows is no part of the run: its nodes are told to end
+        if not go_on:  # what follows is no part of the run: its nodes shut down
             dispatcher = self._session.world.domain.dispatcher
             dispatcher.remove_observer(self)
             dispatcher.record(None)

@@ -42,15 +42,15 @@ def in_copy(function: Callable[[int], Any], pairs: Pairs) -> Any:
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):  # who has closed one has None there
         stream.flush()  # or both would write what waits there
-    told, tell = os.pipe()
+    read_end, write_end = os.pipe()
     pid = fork_below(pairs)
     if pid == 0:
-        os.close(told)
-        _answer(function, tell)
-    os.close(tell)
+        os.close(read_end)
+        _answer(function, write_end)
+    os.close(write_end)
     status: int | None = None
     try:
-        with open(told, "rb") as answers:
+        with open(read_end, "rb") as answers:
             data = answers.read()
     except BaseException:
         os.kill(pid, signal.SIGKILL)
@@ -67,19 +67,19 @@ def in_copy(function: Callable[[int], Any], pairs: Pairs) -> Any:
     return value
 
 
-def _answer(function: Callable[[int], Any], tell: int) -> NoReturn:
-    """Call the function, write what comes of it to ``tell``, and end this process."""
+def _answer(function: Callable[[int], Any], write_end: int) -> NoReturn:
+    """Call the function, write what comes of it to ``write_end``, and end this process."""
     status = 1
     try:
         try:
-            answer = _pickled("returned", function(tell))
+            answer = _pickled("returned", function(write_end))
         except BaseException as error:
             answer = _pickled("raised", error)
         for stream in (sys.stdout, sys.stderr):
             with suppress(Exception):
                 stream.flush()
         while answer:
-            answer = answer[os.write(tell, answer) :]
+            answer = answer[os.write(write_end, answer) :]
         status = 0
     finally:
         end_process(status)
@@ -162,8 +162,8 @@ class ForkedRun:
         if why:
             raise RunError(f"this simulation cannot fork: {why}")
 
-        def within(tell: int) -> Any:
-            self._descriptors.append(tell)
+        def within(write_end: int) -> Any:
+            self._descriptors.append(write_end)
             self.session.changes_process(os.getpid(), pairs)
             return function()
 

@@ -338,7 +338,7 @@ class RunSession:
         with world.importing():
             self._entries = [
                 *hook_entries(job, "before", job.hooks.before, lambda: job),
-                *node_entries(job, told=self._observer.note or (lambda text: None)),
+                *node_entries(job, note=self._observer.note or (lambda text: None)),
                 *hook_entries(job, "after", job.hooks.after, world.all_nodes),
             ]
 

@@ -112,7 +112,7 @@ class GoldenFixture:
         return Path("golden", f"{name}{self._number()}.mcap")
 
     def _number(self) -> str:
-        """Return what tells the second and later calls of one test apart."""
+        """Return what distinguishes the second and later calls of one test."""
         return "" if self._calls == 1 else f"_{self._calls}"
 
 

@@ -40,7 +40,7 @@ def read_in_child_process(
     """Return what a launch file starts; it and what it includes may be in Python.
 
     ``folders`` are where packages and modules are looked for, before Python's own path. What the
-    launch file prints is told on standard error.
+    launch file prints goes to standard error.
 
     :raises JobError: with file and line, if something in it is wrong, missing or not known here.
     """

@@ -22,7 +22,7 @@ Template = tuple[str | Substitution, ...]
 
 
 def parse_template(text: str) -> Template:
-    """Take a text apart. ``\\`` before a character takes its meaning away.
+    """Split a text into its parts. ``\\`` before a character takes its meaning away.
 
     :raises ValueError: if a substitution is not written properly.
     """

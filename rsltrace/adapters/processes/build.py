@@ -103,8 +103,8 @@ class PreloadLibrary:
     ros: RosInstallation
 
 
-def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> PreloadLibrary:
-    """Return the library; it is built if it has not been, and ``told`` is given one line then.
+def library(note: Callable[[str], None], extra: Sequence[str] = ()) -> PreloadLibrary:
+    """Return the library; it is built if it has not been, and ``note`` is given one line then.
 
     :raises SetupError: if a compiler or headers are missing, or the compiler refuses the sources.
     """
@@ -124,7 +124,7 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> PreloadLi
     )
 
     def make(folder: Path) -> None:
-        told(
+        note(
             f"building the library that processes run with (once; 10 to 30 seconds): "
             f"{compiler[0]}, {ros.prefix}"
         )

@@ -277,7 +277,7 @@ class ProcessHandle:
         return ProcessEnd(status, "closed" if status == _LOST_LINK else "")
 
     def dismiss(self) -> None:
-        """End the process: it is told to, and killed if it does not."""
+        """End the process: by a command, and by a kill if it does not obey."""
         self.send(RECORD.pack(0, CommandKind.KILL))
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_GRACE_S)

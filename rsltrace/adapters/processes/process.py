@@ -45,7 +45,7 @@ from rsltrace.trace.model.texts import format_seconds
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 _GRACE_S = 5.0
-"""How long a process may take (in real time) to end when it is told to."""
+"""How long a process may take (in real time) to end on command."""
 _WAITER = struct.Struct("<IIqI")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")

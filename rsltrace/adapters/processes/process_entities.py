@@ -150,7 +150,7 @@ class ProcessQosEvent(QosEvent):
         self, process: HostProcess, number: int, end: Publisher | ProcessSubscription, status: str
     ) -> None:
         super().__init__(process.dispatcher, end.node)
-        self.dispatcher.entities.pending.remove(self)  # it may fire at once, and is told of then
+        self.dispatcher.entities.pending.remove(self)  # it may fire at once, and is then reported
         self.process = process
         self.number = number
         self.listen(end, status)

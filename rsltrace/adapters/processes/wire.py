@@ -65,7 +65,7 @@ class RecordKind(IntEnum):
 
 
 class CommandKind(IntEnum):
-    """What a process is told."""
+    """Commands to a process."""
 
     GO = 1
     ANSWER = 2

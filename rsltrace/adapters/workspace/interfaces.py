@@ -325,8 +325,8 @@ def _tell(text: str) -> None:
 def _failure(name: str, said: str) -> JobError | SetupError:
     last = (said.strip().splitlines() or [""])[-1]
     try:
-        told = json.loads(last)
-        return JobError(f"rosidl cannot read it: {told['error']}", where=told["place"])
+        answer = json.loads(last)
+        return JobError(f"rosidl cannot read it: {answer['error']}", where=answer["place"])
     except (ValueError, KeyError, TypeError):
         return SetupError(f"rosidl failed over {name}: {last}")
 

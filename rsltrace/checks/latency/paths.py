@@ -1,4 +1,4 @@
-"""Chains of topics: those that are wanted, each told apart by the nodes that publish on it."""
+"""Chains of topics: those that are wanted, distinguished by the nodes that publish on them."""
 
 from __future__ import annotations
 

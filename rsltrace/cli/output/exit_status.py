@@ -135,8 +135,8 @@ def status_without_output(error: OSError, status: int = 0) -> int:
 def _interrupted(end: BaseException) -> int:
     """Return the exit status that the interrupt carries (128 + the signal), else 130."""
     cause = end.__cause__ if isinstance(end, click.Abort) else end
-    told = cause.args[0] if cause is not None and cause.args else EXIT_INTERRUPTED
-    return told if isinstance(told, int) else EXIT_INTERRUPTED
+    status = cause.args[0] if cause is not None and cause.args else EXIT_INTERRUPTED
+    return status if isinstance(status, int) else EXIT_INTERRUPTED
 
 
 def _failed(message: str, status: int) -> int:

@@ -57,13 +57,14 @@ class _Box:
 
 @dataclass
 class _Edge:
-    """An arrow between boxes; ``apart`` never connects. ``back`` goes against the direction of the
-    picture: it runs below the boxes, so that no arrow seems to have a head at either end."""
+    """An arrow between boxes. ``incompatible`` names the policies for which it never connects.
+    ``back`` goes against the direction of the picture: it runs below the boxes, so that no arrow
+    seems to have a head at either end."""
 
     source: int
     target: int
     back: bool = False
-    apart: str = ""
+    incompatible: str = ""
     through: list[tuple[float, float]] = field(default_factory=list)
 
 
@@ -91,9 +92,13 @@ def _boxes_and_edges(overview: GraphOverview) -> tuple[list[_Box], list[_Edge]]:
         senders = _numbers(link.senders, number, boxes)
         receivers = _numbers(link.receivers, number, boxes)
         for sender in senders:
-            edges.append(_Edge(sender, here, apart=_apart(link, boxes[sender].label, 0)))
+            edges.append(
+                _Edge(sender, here, incompatible=_incompatible(link, boxes[sender].label, 0))
+            )
         edges += [
-            _Edge(here, receiver, receiver in senders, _apart(link, boxes[receiver].label, 1))
+            _Edge(
+                here, receiver, receiver in senders, _incompatible(link, boxes[receiver].label, 1)
+            )
             for receiver in receivers
         ]
     return boxes, edges
@@ -110,13 +115,13 @@ def _numbers(ends: tuple[GraphEnd, ...], number: dict[str, int], boxes: list[_Bo
     return list(found)
 
 
-def _apart(link: GraphLink, name: str, side: Literal[0, 1]) -> str:
+def _incompatible(link: GraphLink, name: str, side: Literal[0, 1]) -> str:
     """Return the policies by which a node connects with nobody at the other end."""
-    apart = [pair for pair in link.apart if pair[side].node == name]
+    pairs = [pair for pair in link.incompatible if pair[side].node == name]
     others = {end.node for end in (link.senders if side else link.receivers)}
-    partners = {(receiver if side == 0 else sender).node for sender, receiver, _ in apart}
+    partners = {(receiver if side == 0 else sender).node for sender, receiver, _ in pairs}
     if others and partners >= others:
-        return ", ".join(dict.fromkeys(pair[2] for pair in apart))
+        return ", ".join(dict.fromkeys(pair[2] for pair in pairs))
     return ""
 
 
@@ -231,8 +236,10 @@ def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
 def _path(source: _Box, target: _Box, edge: _Edge) -> str:
     path = _around(source, target) if edge.back else _straight(source, target, edge)
     style = "edge back" if edge.back else "edge"
-    style += " apart" if edge.apart else ""
-    title = f"<title>does not connect: {escape(edge.apart)}</title>" if edge.apart else ""
+    style += " apart" if edge.incompatible else ""
+    title = (
+        f"<title>does not connect: {escape(edge.incompatible)}</title>" if edge.incompatible else ""
+    )
     return f'<path class="{style}" d="{path}" marker-end="url(#head)">{title}</path>'
 
 

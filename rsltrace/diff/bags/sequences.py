@@ -75,7 +75,7 @@ class Pairing:
     def _walk(self, gaps: Sequence[Gap], keys_a: Keys, keys_b: Keys) -> Iterator[MessagePair]:
         """Go through all from the first gap to the last: keys that are equal by chance, among many
         that are not but within tolerance, must not decide on what belongs together."""
-        i, j, apart = gaps[0].a_start, gaps[0].b_start, 0
+        i, j, differing = gaps[0].a_start, gaps[0].b_start, 0
         end_a, end_b = gaps[-1].a_end, gaps[-1].b_end
         equal = [(gap.a_end, gap.b_end) for gap in gaps]
         while i < end_a and j < end_b:
@@ -84,11 +84,11 @@ class Pairing:
                 lead: int | None = 0
             else:
                 lead = self._lead(i, j, left, first_of_a=bool(keys_a[i] < keys_b[j]))
-            apart = apart + 1 if lead is None else 0
-            if apart > LOOKAHEAD:  # lost: on to where they are equal again
+            differing = differing + 1 if lead is None else 0
+            if differing > LOOKAHEAD:  # lost: on to where they are equal again
                 to_a, to_b = next(((x, y) for x, y in equal if x > i and y > j), (end_a, end_b))
                 yield from self._within(Gap(i, to_a, j, to_b), keys_a, keys_b)
-                i, j, apart = to_a, to_b, 0
+                i, j, differing = to_a, to_b, 0
             elif lead:
                 yield from (MessagePair(at, -1) for at in range(i, i + lead))
                 yield from (MessagePair(-1, at) for at in range(j, j - lead))

@@ -155,8 +155,8 @@ def entity_changes(
         qos_a, qos_b = (detail.get("qos") for detail in details)
         if key.name in topics and (values := _policies(qos_a, qos_b, with_depth=with_depth)):
             ends = [o for o in known if o.name == key.name and {o.kind, key.kind} == _ENDS]
-            apart = {end: _unmatched((key, end), (details, known[end])) for end in ends}
-            found.append(EntityChange(key, EntityProperty.QOS, values, *_in_one_run(apart)))
+            unmatched = {end: _unmatched((key, end), (details, known[end])) for end in ends}
+            found.append(EntityChange(key, EntityProperty.QOS, values, *_in_one_run(unmatched)))
         group_a, group_b = (detail.get("group") for detail in details)
         if key.node in nodes and group_a != group_b:
             value = ("", str(group_a or "default"), str(group_b or "default"))

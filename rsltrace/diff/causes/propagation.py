@@ -3,7 +3,7 @@
 An event that differs is a consequence if what caused it differs (the message it received, the
 event that made it) or if its node did something different before, since nobody sees into the state
 of a node. What is neither is a divergence of its own. Every consequence remembers what it follows
-from, so that the way back to the root can be told.
+from, so that the way back to the root can be shown.
 """
 
 from __future__ import annotations

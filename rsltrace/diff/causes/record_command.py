@@ -191,7 +191,7 @@ def _take(words: _Words, option: str, change: str, name: str) -> None:
 
 
 def _take_launch_file(words: _Words, spec: str, name: str) -> None:
-    """Take ``{file: …, arguments: …}`` apart, as ``--launch`` has put it together."""
+    """Split ``{file: …, arguments: …}``, as ``--launch`` has written it."""
     try:
         launch = json.loads(spec)
         arguments = [f"{key}:={value}" for key, value in launch.get("arguments", {}).items()]

@@ -103,8 +103,8 @@ def _snake(name: str) -> str:
 
 
 def _divergence(found: Divergence) -> dict[str, Any]:
-    told = {"sentence": found.sentence, "root_sentence": found.root_sentence}
-    return {**_fields(found), **told, "likely_cause": found.likely_cause}
+    sentences = {"sentence": found.sentence, "root_sentence": found.root_sentence}
+    return {**_fields(found), **sentences, "likely_cause": found.likely_cause}
 
 
 def _judgement(found: Judgement) -> dict[str, Any]:

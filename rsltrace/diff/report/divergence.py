@@ -106,9 +106,9 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
     rows += payload_lines(
         message.fields, message.more_fields, message.preview, no_fields_text(message), width
     )
-    told = message.fields or message.preview
+    shown = message.fields or message.preview
     unknown = message.no_fields is not None or message.presence is Presence.BOTH
-    if not told and unknown:
+    if not shown and unknown:
         rows.append(line((f"    hashes {hashes_text(message)}", Style.FAINT)))
     return rows
 

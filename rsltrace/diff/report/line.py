@@ -63,7 +63,7 @@ def wrapped(text: str, width: int, *, style: str = Style.PLAIN, indent: str = ""
 def in_columns(
     rows: Sequence[Sequence[Piece]], *, indent: str = "  ", widest: int = 40
 ) -> list[Line]:
-    """Return rows with aligned columns, two spaces apart; the last column has any width.
+    """Return rows with aligned columns, two spaces between them; the last column has any width.
 
     A cell wider than ``widest`` pushes the rest of its row to the right instead of all rows.
     """
@@ -212,8 +212,8 @@ def fitted(head: list[Line], sections: Sequence[Section], height: int | None) ->
     *others, last = [part for part in sections if part is not NOTHING] or [NOTHING]
 
     def fits() -> bool:
-        told = any(part.left_out for part in others)
-        lines = len(head) + sum(part.height for part in (*others, last)) + told
+        has_note = any(part.left_out for part in others)
+        lines = len(head) + sum(part.height for part in (*others, last)) + has_note
         return height is None or lines <= height
 
     for hard in (False, True):

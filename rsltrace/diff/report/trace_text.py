@@ -167,11 +167,11 @@ def _settings(diff: Diff, width: int) -> Section:
         for a, b in [_values(setting, room)]
     ]
     rows = in_columns(table, widest=max(room, 34))
-    told = 8 if diff.shown is not None and diff.shown.settings else 4
+    rank = 8 if diff.shown is not None and diff.shown.settings else 4
     if len(rows) == 1:
         alone = line(title, ": ", *rows[0][1:])
         if sum(len(text) for text, _ in alone) <= width:
-            return Section((), [alone], 1, "settings", rank=told)
+            return Section((), [alone], 1, "settings", rank=rank)
     shown: list[Line] = []
     for row, (place, a, _, b) in zip(rows, table, strict=True):
         if sum(len(text) for text, _ in row) <= width:
@@ -179,7 +179,7 @@ def _settings(diff: Diff, width: int) -> Section:
         else:  # what differs must not be cut off
             shown += [cut(line("  ", place), width)]
             shown += [line("    ", a, ("  |  ", Style.FAINT), b)]
-    return Section(line(title), shown, 2, "lines", rank=told)
+    return Section(line(title), shown, 2, "lines", rank=rank)
 
 
 def _values(setting: Setting, room: int) -> tuple[str, str]:

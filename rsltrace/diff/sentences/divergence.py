@@ -607,9 +607,9 @@ _CALLED = {
 @says(ExternalAnswers)
 def _(cause: ExternalAnswers, of: object) -> str:
     who = cause.subject or "the run"
-    told = list(dict.fromkeys(call_text(call) for call in cause.calls))
-    more = len(told) - NAMED_MAX
-    text = f"{who} {'; '.join(told[:NAMED_MAX])}"
+    texts = list(dict.fromkeys(call_text(call) for call in cause.calls))
+    more = len(texts) - NAMED_MAX
+    text = f"{who} {'; '.join(texts[:NAMED_MAX])}"
     return f"{text}; and {more} more" if more > 0 else text
 
 

@@ -66,7 +66,7 @@ def _field_text(name: str, field: FieldDifference, *, brief: bool) -> str:
 
 
 def _short(a: str, b: str, most: int) -> tuple[str, str]:
-    """Return two values as short as they can be told apart, in about so many characters each."""
+    """Return two values as short as they can be and still differ, of about ``most`` characters."""
     for digits in range(4, 18):
         rounded = _rounded(a, digits), _rounded(b, digits)
         if rounded[0] != rounded[1]:

@@ -78,8 +78,8 @@ def effect_text(found: Judgement) -> str:
     sent = [m for m in found.messages if m.kind in _SENT and m.topic != PARAMETER_EVENTS]
     if isinstance(found.likely, ErrorInTransition):
         return sentence(found.likely)
-    told = found.verdict in _OTHER_OUTPUT and not any(m.is_input for m in found.messages)
-    if one is None or not told or not sent:
+    is_output = found.verdict in _OTHER_OUTPUT and not any(m.is_input for m in found.messages)
+    if one is None or not is_output or not sent:
         return sentence_of(found)
     if found.messages[0].kind not in (*_SENT, OutputKind.LOG):
         return sentence_of(found)

@@ -287,11 +287,11 @@ def _(remark: NoRecordCommand, of: object) -> str:
         job = _shown(remark.job)
         return f"no command to reproduce this: the job {job} of {remark.trace} is not here"
     more = len(remark.options) - _OPTIONS_MAX
-    told = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
-    told += f" and {more} more" if more > 0 else ""
+    options = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
+    options += f" and {more} more" if more > 0 else ""
     return (
         f"no command to reproduce this: {remark.trace} comes from a job that could run code "
-        f"({told}); run that only if you trust the source of the trace"
+        f"({options}); run that only if you trust the source of the trace"
     )
 
 

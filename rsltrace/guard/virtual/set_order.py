@@ -103,7 +103,7 @@ def _order(guard: Guard, obj: Any, frame: FrameType | None) -> list[Any] | None:
         return None
     if mode is _VIRTUAL:
         in_order = sorted(items) if are_texts else _in_order(guard, items)
-        if in_order is not None:  # else: objects that nothing tells apart but their addresses
+        if in_order is not None:  # else: objects that differ in nothing but their addresses
             guard.count_call(_ORDER, "order of a set", frame)
             return in_order
     kinds = ", ".join(sorted(dict.fromkeys(type(_referent(one)).__qualname__ for one in items)))

@@ -159,7 +159,7 @@ def _with_others(
         return root
     own = replace(root, value=values)
     read_other = partial(_other, root, name, read, early, outer, composed)
-    # The base is read first, so that a mistake in it is told before one in what changes it.
+    # The base is read first, so that a mistake in it is reported before one in what changes it.
     lowest = None if base is None else read_other(base, "base")
     listed = include.value if include is not None and isinstance(include.value, list) else [include]
     added = [read_other(item, "include") for item in listed if item is not None]

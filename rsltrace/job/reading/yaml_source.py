@@ -1,4 +1,4 @@
-"""A YAML file as plain values, with the line and column of every key and value kept apart.
+"""A YAML file as plain values, with the line and column of every key and value beside them.
 
 ruamel.yaml composes the node tree; the values are made from it here, because a job needs what a
 constructor throws away: the text of each number, the place of each key, and keys given twice.

@@ -64,9 +64,9 @@ def _play(job: Job, bags: list[BagInput]) -> None:
     merged: _Played = heapq.merge(*streams, key=lambda message: message[0])
     if job.progress is not None:
         kind = get_message_class("std_msgs/msg/Float32")
-        told = node.create_publisher(kind, job.progress, 10)
-        publishers[job.progress, ""] = told
-        merged = with_progress(merged, told, bags)
+        progress = node.create_publisher(kind, job.progress, 10)
+        publishers[job.progress, ""] = progress
+        merged = with_progress(merged, progress, bags)
     _wait_for_listeners(list(publishers.values()))
     _publish(merged, run_start_ns(job, bags))
     node.destroy_node()

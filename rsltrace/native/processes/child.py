@@ -1,7 +1,7 @@
 """The process of one entry of a native run: ``main`` is what it runs.
 
-It gets its order, says that it could begin, begins when it is told to, and tells what it observes
-until it is told to end, or ends by itself. It never outlives the run.
+It gets its order, says that it could begin, begins on command, and sends what it observes
+until it gets the command to end, or ends by itself. It never outlives the run.
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ class _EntryProcess:
             self._raised(entry.name, "", error)
             return 1
         finally:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is to be told of
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is still to be sent
         return 0
 
     def _listen(self) -> None:

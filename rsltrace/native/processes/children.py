@@ -98,7 +98,7 @@ class ObservedProcess(threading.Thread):
                     break
                 has_ended = self._process.poll() is not None
             except Exception as error:
-                self.exit_text = f"what it told cannot be read: {error}"
+                self.exit_text = f"what it sent cannot be read: {error}"
                 self.kill()
                 break
         status = self._status()

@@ -88,7 +88,7 @@ class PublisherGids:
         rcl.rcutils_uint8_array_init.argtypes = (POINTER(_Bytes), c_size_t, POINTER(_Allocator))
 
     def of_publisher(self, handle: Any) -> bytes:
-        """Return the gid of a publisher, by its handle; empty if it cannot be told."""
+        """Return the gid of a publisher, by its handle; empty if it is not known."""
         gid = _Gid()
         inner = self._handle_of(handle.pointer)
         if not inner or self._gid_of(inner, byref(gid)) != _OK:
@@ -109,13 +109,13 @@ class PublisherGids:
             return handle.take_message(type, raw), b""
         data = string_at(room.data, room.length)
         message = data if raw else self._extension.rclpy_deserialize(data, type)
-        told = {
+        details = {
             "source_timestamp": info.source_ns,
             "received_timestamp": info.received_ns,
             "publication_sequence_number": _number(info.publication),
             "reception_sequence_number": _number(info.reception),
         }
-        return (message, told), bytes(info.gid.data)
+        return (message, details), bytes(info.gid.data)
 
     def _room(self) -> _Bytes:
         """Return where this thread takes messages to; it grows with them."""
@@ -200,7 +200,7 @@ class SpanSender(threading.Thread):
                 self._own_ns = time.thread_time_ns()
 
     def finish(self) -> None:
-        """Tell all that is left; callbacks that go on are told of as far as they have come."""
+        """Tell all that is left; of callbacks that still run, as far as they have come."""
         self._over.set()
         with suppress(OSError):
             self._tell(None)
@@ -223,5 +223,7 @@ class SpanSender(threading.Thread):
             parts = [spans[at : at + _AT_ONCE] for at in range(0, len(spans), _AT_ONCE)]
             for number, part in enumerate(parts or [[]]):
                 upto_ns = until_ns if number >= len(parts) - 1 else part[-1].start_ns
-                told = [writer.plain(span) for span in part]
-                self._link.send("spans", upto_ns, counts, definitions if number == 0 else [], told)
+                plain_spans = [writer.plain(span) for span in part]
+                self._link.send(
+                    "spans", upto_ns, counts, definitions if number == 0 else [], plain_spans
+                )

@@ -26,12 +26,12 @@ def starts_of(job: Job, like: EntryOrder) -> list[ProcessStart]:
     :raises JobError: a program, or the folder that it is to run in, is not there.
     """
     processes = ProcessPrograms(job, lambda text: None)
-    told = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
-    like = replace(like, job=told, module_path=tuple(sys.path))
+    observed = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
+    like = replace(like, job=observed, module_path=tuple(sys.path))
     starts = []
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         where = spec.origin or locate(job, ("nodes", index, spec.kind))
-        command = _command(told, index, processes, where)
+        command = _command(observed, index, processes, where)
         starts.append(
             ProcessStart(
                 spec.target,

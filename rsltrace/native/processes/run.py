@@ -38,7 +38,7 @@ from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
 # What several processes have done, in the order in which it began.
 #
-# All have one steady clock. A process says up to when it has told everything; what began before
+# All have one steady clock. A process says up to when it has sent everything; what began before
 # that in all of them is in order for good.
 
 STALLED_NS = 20 * NS_PER_S
@@ -47,7 +47,7 @@ not keep all others from the file."""
 
 
 class ProcessSpans:
-    """One process: the spans that it has told of, and up to when that is all of them."""
+    """One process: the spans that it has sent, and up to when these are all."""
 
     def __init__(self) -> None:
         self.spans: deque[CallbackSpan] = deque()
@@ -237,10 +237,10 @@ class MultiProcessRun(NativeRun):
         for span in spans:
             for output in span.outputs:
                 if isinstance(output, SentMessage) and (
-                    told := self._on_message.get(output.entity.name)
+                    callback := self._on_message.get(output.entity.name)
                 ):
                     type_name = "" if output.entity.sends is None else output.entity.sends.name
-                    told(output.data, get_message_class(type_name))
+                    callback(output.data, get_message_class(type_name))
 
     def _hear_error(self, child: ObservedProcess, kind: str, said: str) -> None:
         child.has_failed = True

@@ -30,7 +30,7 @@ from rsltrace.simulation.loop.policy import PriorityRule
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.trace.model.entity import Entity, EntityKind
 
-# What the process of an entry is told to do.
+# Commands to the process of an entry.
 
 
 @dataclass(frozen=True, slots=True)

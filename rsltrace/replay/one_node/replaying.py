@@ -392,10 +392,10 @@ def replay_node(
 
 def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
     """Return the job entry of each construction in a trace."""
-    told = trace.metadata(METADATA_RECORDED_INPUTS).get("entries") or trace.result.get(
+    entries = trace.metadata(METADATA_RECORDED_INPUTS).get("entries") or trace.result.get(
         "entries", ""
     )
-    some = [int(one) for one in told.split(",") if one.isdecimal()]
+    some = [int(one) for one in entries.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))
 
 

@@ -104,7 +104,7 @@ class RecordingColumns:
     """The events of a trace, ``events[i]`` by index, and its outputs in order.
 
     ``first_output[i]`` is where the outputs of event ``i`` begin (one more at the end).
-    ``count`` is how many events there were until the run ended, and its nodes were told.
+    ``count`` is how many events there were until the run ended and its nodes were shut down.
     """
 
     def __init__(self, trace: Trace) -> None:

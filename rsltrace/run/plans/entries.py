@@ -148,16 +148,16 @@ _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 def node_entries(
     job: Job,
     only: Container[int] | None = None,
-    told: Callable[[str], None] = lambda text: None,
+    note: Callable[[str], None] = lambda text: None,
 ) -> list[JobEntry]:
     """Import what the job names and let rcl parse the arguments; nothing is constructed.
 
-    ``only`` are the wanted places in ``nodes:`` (None: all); ``told`` is called with a line when
+    ``only`` are the wanted places in ``nodes:`` (None: all); ``note`` is called with a line when
     something takes long.
     """
     entries = []
     mains = MainFinder(job)
-    processes = ProcessPrograms(job, told)
+    processes = ProcessPrograms(job, note)
     for_all = arguments_for_all(job)
     keys = entry_keys(job.nodes)
     for index, (spec, key) in enumerate(zip(job.nodes, keys, strict=True)):

@@ -43,9 +43,9 @@ from rsltrace.trace.model.texts import printable
 class ProcessPrograms:
     """Makes the command lines of a job's processes; the first one builds the library."""
 
-    def __init__(self, job: Job, told: Callable[[str], None]) -> None:
+    def __init__(self, job: Job, note: Callable[[str], None]) -> None:
         self._job = job
-        self._told = told
+        self._note = note
         self._library: PreloadLibrary | None = None
         pinned = pinned_variables() if job.guard.pins else {}  # this process need not be
         self._surroundings = {**os.environ, **pinned}
@@ -65,7 +65,7 @@ class ProcessPrograms:
         words = [word for part in arguments for word in part.arguments]
         if self._library is None:
             try:
-                self._library = library(self._told)
+                self._library = library(self._note)
             except SetupError as error:
                 raise JobError(str(error), where=where) from error
         return program(

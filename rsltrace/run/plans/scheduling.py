@@ -201,9 +201,9 @@ def stop_with(world: World, entries: Sequence[JobEntry]) -> None:
     required = {entry.key for entry in entries if entry.required}
     loop = world.domain.loop
 
-    def told(what: str, key: str) -> None:
+    def program_changed(what: str, key: str) -> None:
         if what == "ended" and key in required and loop.stopped is None:
             loop.stop(Stop(f"{key} has ended, which the run requires"))
 
     if required:
-        world.runtime.programs.listeners.append(told)
+        world.runtime.programs.listeners.append(program_changed)

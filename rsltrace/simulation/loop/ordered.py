@@ -42,14 +42,14 @@ class ReadyItem:
     """Something that may run, as the loop sees it.
 
     ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
-    exclusive callback group, or None. ``told``: dispatching only hands it to one of the user's own
-    executors.
+    exclusive callback group, or None. ``handed_over``: dispatching only hands it to one of the
+    user's own executors.
     """
 
     candidate: Candidate
     workers: SimulatedExecutor | None
     exclusive: object | None
-    told: bool = False
+    handed_over: bool = False
 
 
 @dataclass(eq=False, slots=True)
@@ -226,7 +226,7 @@ class OrderedLoop(EventLoop):
         timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
         for place in [*self._tasks.places, *self._ready.places, *timers]:
             item: Dispatchable = place.candidate.item
-            if place.told and self.place(item).told:
+            if place.handed_over and self.place(item).handed_over:
                 self._take_out(place)
                 item.dispatch()
 

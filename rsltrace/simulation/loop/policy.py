@@ -59,9 +59,9 @@ class Candidate:
     ``node`` and ``entity`` are names (``/planner``; ``/scan``, ``Planner.on_timer``), ``kind`` is
     ``timer``, ``subscription``, ``service``, ``client``, …; ``entity_id`` is the trace's.
     ``period_ns`` is a timer's period, for others that of their node's fastest timer, or None.
-    ``group`` are the names of the entities in its callback group. ``thread`` tells apart callbacks
-    of one entity that are under way at the same time (``threads: {switch: every_line}``).
-    ``executor`` tells apart the simulated executors, where there are any.
+    ``group`` are the names of the entities in its callback group. ``thread`` distinguishes
+    callbacks of one entity that are under way at the same time (``threads: {switch: every_line}``).
+    ``executor`` distinguishes the simulated executors, where there are any.
     """
 
     node: str

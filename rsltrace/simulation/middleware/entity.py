@@ -19,8 +19,8 @@ class Runnable:
 
     ``kind`` and ``name`` are for policies. ``group`` is its mutually exclusive callback group,
     ``group_names`` the names of the group's members. ``executor``: it runs on a simulated executor.
-    ``thread`` distinguishes concurrent callbacks of one entity, and numbers tasks. ``told``: one of
-    the user's own executors runs it.
+    ``thread`` distinguishes concurrent callbacks of one entity, and numbers tasks. ``handed_over``:
+    one of the user's own executors runs it.
     """
 
     kind: str
@@ -32,13 +32,17 @@ class Runnable:
     period_ns: int | None = None
     executor: bool = True
     thread: int = 0
-    told: bool = False
+    handed_over: bool = False
 
 
-def on_no_executor(node: Any, name: str, kind: str = "thread", *, told: bool = False) -> Runnable:
+def on_no_executor(
+    node: Any, name: str, kind: str = "thread", *, handed_over: bool = False
+) -> Runnable:
     """Describe an item that runs on none of the simulated executors, such as a thread."""
     period_ns = None if node is None else node.shortest_period_ns()
-    return Runnable(kind, name, 0, node, period_ns=period_ns, executor=False, told=told)
+    return Runnable(
+        kind, name, 0, node, period_ns=period_ns, executor=False, handed_over=handed_over
+    )
 
 
 class GraphMembership(Protocol):

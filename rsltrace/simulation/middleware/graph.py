@@ -127,10 +127,10 @@ class Graph:
         return requested.resolved(publisher=False, peers=peers)
 
     def _connect(self, publisher: Publisher, subscription: Subscription) -> None:
-        apart = incompatible_policies(publisher.qos, subscription.qos)
-        if apart:
-            publisher.events.incompatible(apart[0])
-            subscription.events.incompatible(apart[0])
+        policies = incompatible_policies(publisher.qos, subscription.qos)
+        if policies:
+            publisher.events.incompatible(policies[0])
+            subscription.events.incompatible(policies[0])
             return
         publisher.connect(subscription)
         subscription.publishers.append(publisher)

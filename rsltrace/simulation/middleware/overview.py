@@ -32,15 +32,15 @@ class GraphEnd:
 @dataclass(frozen=True, slots=True)
 class GraphLink:
     """A topic, service or action with its ends in creation order. ``senders`` publish or call,
-    ``receivers`` subscribe or serve. ``apart`` has (sender, receiver, policies) of incompatible
-    pairs."""
+    ``receivers`` subscribe or serve. ``incompatible`` has (sender, receiver, policies) of pairs
+    that do not connect."""
 
     kind: str
     name: str
     type: str
     senders: tuple[GraphEnd, ...]
     receivers: tuple[GraphEnd, ...]
-    apart: tuple[tuple[GraphEnd, GraphEnd, str], ...] = ()
+    incompatible: tuple[tuple[GraphEnd, GraphEnd, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +186,7 @@ def _is_unheard_static(link: GraphLink) -> bool:
 
 
 def _problems(link: GraphLink, follows: Callable[[str], bool]) -> Iterator[str]:
-    for sender, receiver, policy in link.apart:
+    for sender, receiver, policy in link.incompatible:
         yield (
             f"topic {link.name}: {sender.node} and {receiver.node} do not connect: {policy} "
             f"({sender.node} offers {sender.qos}; {receiver.node} asks for {receiver.qos})"

@@ -144,7 +144,7 @@ class Scheduling:
             what.thread,
             "" if workers is None else workers.name,
         )
-        return ReadyItem(candidate, workers, what.group, what.told)
+        return ReadyItem(candidate, workers, what.group, what.handed_over)
 
     def _workers_of(self, what: Runnable) -> SimulatedExecutor | None:
         """Return the simulated executor of an item, or None."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def table(rows: Iterable[Sequence[str]], *, right: frozenset[int] = frozenset()) -> list[str]:
-    """Return ``rows`` as lines with aligned columns, two spaces apart.
+    """Return ``rows`` as lines with aligned columns, two spaces between them.
 
     ``right`` has the columns that are aligned to the right. No line ends in spaces.
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 # Colours: by topic in one run; by run, with shades by topic, in two; neutral for lanes, so that
 # red and green are left to what differs and what agrees.
 #
-# Blue and orange are told apart by people who do not see all colours, and on paper.
+# Blue and orange are distinguishable for people who do not see all colours, and on paper.
 
 _BY_TOPIC = (0x4FC3F7FF, 0xFFB74DFF, 0x81C784FF, 0xE57373FF, 0xBA68C8FF, 0xFFF176FF, 0xA1887FFF)
 _BY_RUN = {

@@ -93,12 +93,12 @@ def distance_chunks(
             (stamps, clock.places(events), values)
             for clock, (stamps, events, values) in zip(clocks, (a, b), strict=True)
         )
-        stamps, rows, apart = _distance(a, b)
+        stamps, rows, distances = _distance(a, b)
         if not len(stamps):
             continue
         path = found.paths[key] = join("divergence", "distance", *key)
         times = ((SIM_TIME, clocks[0].array(stamps)), (ROW, pa.array(rows)))
-        column = lists(np.ones(len(apart), dtype=np.int64), pa.array(apart))
+        column = lists(np.ones(len(distances), dtype=np.int64), pa.array(distances))
         yield from make_chunk(path, times, ((rr.Scalars.descriptor_scalars(), column),))
         name = pa.array([[f"|a-b| {key[0]} {key[1]}".strip()]])
         yield from make_chunk(path, (), ((rr.SeriesLines.descriptor_names(), name),))
@@ -129,8 +129,8 @@ def _distance(
         np.where(a[0][last_a] == stamps, a[1][last_a], b[1][last_b])
     )  # those of equal times may stand the other way round
     with np.errstate(invalid="ignore", over="ignore"):
-        apart = np.sqrt(np.sum((a[2][last_a] - b[2][last_b]) ** 2, axis=1))
-    return stamps, rows, apart
+        distances = np.sqrt(np.sum((a[2][last_a] - b[2][last_b]) ** 2, axis=1))
+    return stamps, rows, distances
 
 
 DOCUMENT = "/divergence"

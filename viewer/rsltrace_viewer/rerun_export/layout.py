@@ -208,10 +208,10 @@ def _plots(
         return None
     if more:
         views[-1] = rrb.Tabs(views[-1], *more, active_tab=0)
-    apart = [distances.paths[key] for key in ranked if key in distances.paths]
-    if apart:
+    far = [distances.paths[key] for key in ranked if key in distances.paths]
+    if far:
         title = ("Distance between the runs", "")
-        views.insert(0, _plot(title, apart[:_PLOTS_SHOWN], "LeftTop"))  # it grows to the right
+        views.insert(0, _plot(title, far[:_PLOTS_SHOWN], "LeftTop"))  # it grows to the right
     return views[0] if len(views) == 1 else rrb.Vertical(*views, name="Plots")
 
 

@@ -70,7 +70,7 @@ def command(recording: Path, ports: tuple[int, int] | None) -> list[str]:
 
 
 def address(ports: tuple[int, int]) -> str:
-    """Return what a browser opens: the page, which is told where the recording is."""
+    """Return what a browser opens: the page, with the address of the recording."""
     data, page = ports
     return (
         f"http://{LOOPBACK}:{page}/?url={quote(f'rerun+http://{LOOPBACK}:{data}/proxy', safe='')}"

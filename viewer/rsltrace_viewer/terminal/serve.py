@@ -145,13 +145,13 @@ class LocalServer(Server):  # type: ignore[misc]  # textual-serve has no types
 async def _hand_on(text: str, websocket: web.WebSocketResponse, app_service: AppService) -> None:
     """Hand a page's message on to its viewer. Raises one of ``_NO_MESSAGE`` if it is none."""
     kind, *rest = json.loads(text)
-    told: Any = rest[0] if rest else None
+    payload: Any = rest[0] if rest else None
     if kind == "stdin":
-        await app_service.send_bytes(str.encode(told, "utf-8", "replace"))
+        await app_service.send_bytes(str.encode(payload, "utf-8", "replace"))
     elif kind == "resize":
-        await app_service.set_terminal_size(_side(told["width"]), _side(told["height"]))
+        await app_service.set_terminal_size(_side(payload["width"]), _side(payload["height"]))
     elif kind == "ping":
-        await websocket.send_json(["pong", told])
+        await websocket.send_json(["pong", payload])
     elif kind == "blur":
         await app_service.blur()
     elif kind == "focus":
@@ -167,7 +167,7 @@ def _side(cells: int | str) -> int:
 
 
 def _kill(app_service: AppService) -> None:
-    """End a viewer that has been told to quit, and has not."""
+    """End a viewer that was asked to quit and still runs."""
     process = app_service._process
     if process is not None and process.returncode is None:
         process.kill()

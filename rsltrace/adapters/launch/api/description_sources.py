@@ -24,7 +24,7 @@ class LaunchDescriptionSource:
 
     @property
     def location(self) -> str:
-        """The place, as far as it can be told before the launch file is read."""
+        """The place, as far as it is known before the launch file is read."""
         place = self.place
         if isinstance(place, Substitution):
             return place.describe()

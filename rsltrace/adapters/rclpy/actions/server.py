@@ -215,8 +215,8 @@ class _Expiry:
         start_coroutine(server.runtime, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
 
     def runnable(self) -> Runnable:
-        told = self.node.mailbox is not None
-        return on_no_executor(self.node, self.describe(), "waitable", told=told)
+        handed_over = self.node.mailbox is not None
+        return on_no_executor(self.node, self.describe(), "waitable", handed_over=handed_over)
 
     def describe(self) -> str:
         return f"{self.node.fully_qualified_name}: expiry of goals of {self._server.name}"

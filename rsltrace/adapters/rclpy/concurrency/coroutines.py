@@ -134,7 +134,7 @@ class TaskRun:
             period_ns=None if node is None else node.shortest_period_ns(),
             executor=node is None or getattr(node, "mailbox", None) is None,
             thread=self.number,
-            told=self.mailbox is not None,
+            handed_over=self.mailbox is not None,
         )
 
     def execution_name(self) -> tuple[str, str]:

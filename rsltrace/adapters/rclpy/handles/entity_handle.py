@@ -152,7 +152,7 @@ class EntityHandle(Destroyable, DomainEntity):
             () if node is None or group is None else _names_in_group(node, group),
             self.period(),
             executor=node is None or node.mailbox is None,
-            told=node is not None and node.mailbox is not None,
+            handed_over=node is not None and node.mailbox is not None,
         )
 
 

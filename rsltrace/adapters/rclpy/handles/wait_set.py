@@ -278,8 +278,8 @@ class UserWaitable:
         return f"{self.node.fully_qualified_name}: waitable {type(self.wrapper).__qualname__}"
 
     def runnable(self) -> Runnable:
-        told = self.node.mailbox is not None
-        return on_no_executor(self.node, self.describe(), "waitable", told=told)
+        handed_over = self.node.mailbox is not None
+        return on_no_executor(self.node, self.describe(), "waitable", handed_over=handed_over)
 
     def close(self) -> None:
         self._closed = True

@@ -41,7 +41,7 @@ class Feedback:
         self._first = 0
         self._seen: set[int] = set()
         self._orders: list[tuple[dict[str, Any], tuple[tuple[int, int], ...]]] = []
-        """What else sets a run apart (its seed, say), and of each choice which of how many."""
+        """What else distinguishes a run (its seed, say), and of each choice which of how many."""
         self._tried: set[int] = set()
         self._runs = self._new_runs = 0
 

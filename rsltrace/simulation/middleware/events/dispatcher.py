@@ -44,7 +44,7 @@ class EntityRegistry:
     """Assigns entity ids, and keeps new entities until they can be recorded.
 
     ``pending`` were created in the current event, ``unowned`` have no owner yet (a timer that no
-    node lists). ``census`` has the run's names if needed; ``observers`` are told of each entity.
+    node lists). ``census`` has the run's names if needed; ``observers`` see each entity.
     """
 
     def __init__(self) -> None:

@@ -324,8 +324,8 @@ class Plot:
 def plot(series: list[Series], width: int, height: int, cursor_s: float | None = None) -> Plot:
     """Draw one or two series into ``width`` x ``height`` cells; ``cursor_s`` is a vertical line.
 
-    Consecutive points are joined. The second series is drawn with gaps, so that the two can be
-    told apart without colour. Values that are not finite are left out.
+    Consecutive points are joined. The second series is drawn with gaps, so that the two differ
+    without colour. Values that are not finite are left out.
     """
     width, height = max(width, 1), max(height, 1)
     low, high, start, end = _bounds(series)

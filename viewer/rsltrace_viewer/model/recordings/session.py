@@ -263,11 +263,11 @@ class RecordingSession:
             return time, None, texts
         sign = pairs.sign(row)
         if sign is RowSign.DIFFERS:
-            told = self._differing(topics, places)
-            if told == ("", ""):  # nothing but padding, which recorders do not write
+            values = self._differing(topics, places)
+            if values == ("", ""):  # nothing but padding, which recorders do not write
                 sign = RowSign.MATCH
-            elif told is not None:
-                texts = list(told)
+            elif values is not None:
+                texts = list(values)
         return time, sign, texts
 
     def _values(self, recording: Recording, topic: Topic, place: int) -> str:
@@ -308,10 +308,10 @@ class RecordingSession:
                 decoded.append(recording.decode(topic, data))
             except RsltraceError:
                 return None
-        told = differing_values(*decoded)
-        if told == ("", "") and repr(to_plain(decoded[0])) != repr(to_plain(decoded[1])):
+        values = differing_values(*decoded)
+        if values == ("", "") and repr(to_plain(decoded[0])) != repr(to_plain(decoded[1])):
             return None
-        return told
+        return values
 
     def lines(self) -> Iterator[list[Line]]:
         """Yield the lines of the selected message, the last time all of them."""

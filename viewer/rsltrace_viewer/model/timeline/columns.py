@@ -253,7 +253,7 @@ def layout(space: ListSpace, names: Mapping[str, ShortNames]) -> ColumnLayout:
 
 
 class ShortNames:
-    """Cuts the names of a set to a width so that they can still be told apart."""
+    """Cuts the names of a set to a width so that they still differ."""
 
     def __init__(self, names: Iterable[str]) -> None:
         self._names = sorted(set(names))

@@ -260,8 +260,8 @@ def _yaw(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-# What events sent and got, with values, for rows. Read apart from the rows: messages have to be
-# decoded for it, and the first of each type takes as long as a screen may.
+# What events sent and got, with values, for rows. Read separately from the rows: messages have to
+# be decoded for it, and the first of each type takes as long as a screen may.
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _OUTPUTS_MAX = 12

@@ -1,5 +1,5 @@
-"""In what the two events of a row differ, with both values: ``/cmd_vel x 0.8 → 0.0``. Read apart
-from the rows, as values of one run are."""
+"""In what the two events of a row differ, with both values: ``/cmd_vel x 0.8 → 0.0``. Read
+separately from the rows, as values of one run are."""
 
 from __future__ import annotations
 

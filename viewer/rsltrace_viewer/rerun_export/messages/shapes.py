@@ -23,7 +23,7 @@ from rsltrace_viewer.rerun_export.columns import (
     vectors,
 )
 
-# Messages as Arrow gives them, taken apart: the fields of many messages as one numpy array.
+# Messages as Arrow gives them, by field: the fields of many messages as one numpy array.
 #
 # Rerun's reader hands out every message of a type it does not draw as one Arrow struct. A
 # message's fields are found by dotted paths; sequences keep how many items each message has.
