@@ -36,7 +36,6 @@ class UniformSpec(JobPart):
     """Uniform between two bounds."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
-    TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
 
     min_ns: Annotated[int, check(parse_short_time)] = Field(
         alias="min", description="Shortest time.", examples=["1ms"]
@@ -56,7 +55,6 @@ class NormalSpec(JobPart):
     """Normal, truncated at zero: negative values are drawn again."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("mean", "sd")
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns"}
 
     mean_ns: Annotated[int, check(parse_time)] = Field(
         alias="mean", description="Mean before the truncation.", examples=["5ms"]
@@ -70,7 +68,6 @@ class LognormalSpec(JobPart):
     """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "median": "median_ns"}
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
@@ -97,7 +94,6 @@ class GammaSpec(JobPart):
     """Gamma: by mean and standard deviation, or by shape and scale."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "scale": "scale_ns"}
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
@@ -253,8 +249,6 @@ def check_series(points: tuple[tuple[int, int], ...]) -> None:
 class DistributionSpec(JobPart):
     """A time: constant, random, or changing. Exactly one of the keys."""
 
-    TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
-
     constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
         default=None, alias="constant", description="Constant.", examples=["5ms"]
     )
@@ -323,8 +317,8 @@ class DistributionSpec(JobPart):
 
 
 def _either(part: JobPart, one: tuple[str, ...], other: tuple[str, ...]) -> None:
-    values = {key: getattr(part, part.TIMES.get(key, key)) for key in (*one, *other)}
-    given = {key for key, value in values.items() if value is not None}
+    fields = type(part).model_fields.items()
+    given = {field.alias or name for name, field in fields if getattr(part, name) is not None}
     if given not in (set(one), set(other)):
         raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
 

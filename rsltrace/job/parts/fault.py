@@ -23,7 +23,6 @@ class FaultSpec(JobPart):
     ``delay`` (a topic, and which ``message``), or of ``change``, ``swap`` and ``repeat`` (a topic
     that bags play, and which ``message`` of theirs)."""
 
-    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "for": "for_ns", "by": "by_ns"}
     OF_NODES: ClassVar[tuple[str, ...]] = ("crash", "hang", "restart")
     OF_MESSAGES: ClassVar[tuple[str, ...]] = ("drop", "duplicate", "delay")
     OF_BAGS: ClassVar[tuple[str, ...]] = ("change", "swap", "repeat")
