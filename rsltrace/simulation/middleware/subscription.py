@@ -10,8 +10,7 @@ from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, callba
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.qos.policies import Qos
-from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, finite
+from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, EndpointEvents, finite
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
