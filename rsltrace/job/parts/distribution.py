@@ -64,10 +64,10 @@ class NormalSpec(JobPart):
     )
 
 
-class LognormalSpec(JobPart):
-    """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
+class _ByMeanSpec(JobPart):
+    """By mean and standard deviation, or in another way."""
 
-    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]]
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
@@ -75,6 +75,22 @@ class LognormalSpec(JobPart):
     sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
     )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> _ByMeanSpec:
+        one, other = self.ALTERNATIVES
+        fields = type(self).model_fields.items()
+        given = {field.alias or name for name, field in fields if getattr(self, name) is not None}
+        if given not in (set(one), set(other)):
+            raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
+        return self
+
+
+class LognormalSpec(_ByMeanSpec):
+    """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
+
     median_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="median", description="Median; goes with `sigma`.", examples=["5ms"]
     )
@@ -84,34 +100,18 @@ class LognormalSpec(JobPart):
         examples=[0.5],
     )
 
-    @model_validator(mode="after")
-    def _one_way(self) -> LognormalSpec:
-        _either(self, *self.ALTERNATIVES)
-        return self
 
-
-class GammaSpec(JobPart):
+class GammaSpec(_ByMeanSpec):
     """Gamma: by mean and standard deviation, or by shape and scale."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
 
-    mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
-        default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
-    )
-    sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
-        default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
-    )
     shape: Annotated[float | None, check(number(0, 1e9, open_below=True), optional=True)] = Field(
         default=None, description="Shape; goes with `scale`.", examples=[2.0]
     )
     scale_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="scale", description="Scale.", examples=["1ms"]
     )
-
-    @model_validator(mode="after")
-    def _one_way(self) -> GammaSpec:
-        _either(self, *self.ALTERNATIVES)
-        return self
 
 
 class SamplesSpec(JobPart):
@@ -314,13 +314,6 @@ class DistributionSpec(JobPart):
         """Return which of ``KINDS`` are given."""
         values = {**vars(self), "constant": self.constant_ns}
         return [kind for kind in self.KINDS if values[kind] is not None]
-
-
-def _either(part: JobPart, one: tuple[str, ...], other: tuple[str, ...]) -> None:
-    fields = type(part).model_fields.items()
-    given = {field.alias or name for name, field in fields if getattr(part, name) is not None}
-    if given not in (set(one), set(other)):
-        raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
 
 
 def files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
