@@ -66,7 +66,6 @@ class Subscription(Receiver):
         return self.type.name
 
     def dispatch(self) -> None:
-        """Take the oldest message and run the callback with it."""
         if not self.may_run():
             return
         assert self.callback is not None

@@ -119,7 +119,6 @@ class FileSource:
         return data
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def _read(self, offset: int, length: int) -> bytes:
