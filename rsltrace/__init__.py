@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     )
     from rsltrace.replay import replay_trace as replay
     from rsltrace.replay.one_node.result import NodeReplayResult
-    from rsltrace.replay.result import ReplayResult
+    from rsltrace.replay.replaying import ReplayResult
     from rsltrace.run import RunResult, Simulation, record
     from rsltrace.trace.reader import Trace
 
@@ -65,7 +65,7 @@ _HOMES = {
     "NodeReplayResult": "rsltrace.replay.one_node.result",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
-    "ReplayResult": "rsltrace.replay.result",
+    "ReplayResult": "rsltrace.replay.replaying",
     "RsltraceError": "rsltrace.errors",
     "RunResult": "rsltrace.run",
     "Simulation": "rsltrace.run",

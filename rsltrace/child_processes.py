@@ -14,7 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-END_WITH_PARENT = """
+# No module is loaded from the working directory: not even ctypes. The kernel ends the process with
+# its parent (PR_SET_PDEATHSIG), whose number is the second word; "": it does not.
+_BEGIN = """
+import sys
+sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
 import ctypes, os
 parent = sys.argv.pop(1)
 if parent:
@@ -24,14 +28,7 @@ if parent:
     if os.getppid() != int(parent):
         sys.exit(137)
 """
-"""Program text: the kernel ends the process with its parent (PR_SET_PDEATHSIG), whose number is the
-first word; "": it does not. ``sys`` is loaded, and the working directory no longer on its path."""
-
-# No module is loaded from the working directory: not even ctypes.
-_PROGRAM = f"""
-import sys
-sys.path[:] = [*filter(None, sys.path), sys.argv.pop(1)]
-{END_WITH_PARENT}
+_RUN = """
 import runpy
 module = sys.argv.pop(1)
 sys.argv[0] = 'rsltrace'
@@ -42,15 +39,21 @@ OWN_FOLDER = Path(__file__).resolve().parents[1]
 
 
 def rsltrace_command(
-    words: Sequence[str], module: str = "rsltrace", *, killed_with_parent: bool = True
+    words: Sequence[str],
+    module: str = "rsltrace",
+    *,
+    killed_with_parent: bool = True,
+    before: str = "",
 ) -> list[str]:
-    """Return a command line of this installation of rsltrace, which runs ``module`` as a program.
+    """Return a command line of this installation of rsltrace, which runs ``module`` as a program,
+    and the statements of ``before`` first.
 
     The kernel kills its process with the present one, unless it ends by itself then, because it has
     something to clear away.
     """
     parent = str(os.getpid()) if killed_with_parent else ""
-    return [sys.executable, "-c", _PROGRAM, str(OWN_FOLDER), parent, module, *words]
+    program = f"{_BEGIN}{before}{_RUN}"
+    return [sys.executable, "-c", program, str(OWN_FOLDER), parent, module, *words]
 
 
 def start_connected(

@@ -203,9 +203,11 @@ def _threads() -> Iterator[tuple[int, str]]:
 
 def own_children() -> list[int]:
     """Return the processes that this one has started."""
-    with suppress(OSError), open(f"/proc/self/task/{os.getpid()}/children") as file:
-        return [int(word) for word in file.read().split()]
-    return []
+    found = []
+    for task in os.listdir("/proc/self/task"):
+        with suppress(OSError), open(f"/proc/self/task/{task}/children") as file:
+            found += [int(word) for word in file.read().split()]
+    return found
 
 
 def _shared_memory() -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.simulation.middleware.domain import Domain
-from rsltrace.simulation.middleware.entity import DomainEntity
+from rsltrace.simulation.middleware.entity import DomainEntity, Receiver
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
@@ -74,7 +74,7 @@ class _AbsentPublisher(Publisher):
         raise AssertionError("never in a queue")
 
 
-class _AbsentSubscription(Subscription):
+class _Absent(Receiver):
     begins_active = False
 
     def __init__(self, *args: Any) -> None:
@@ -82,20 +82,16 @@ class _AbsentSubscription(Subscription):
         self.queue = deque(maxlen=0)
 
 
-class _AbsentService(Service):
-    begins_active = False
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.queue = deque(maxlen=0)
+class _AbsentSubscription(_Absent, Subscription):
+    """Takes nothing: a subscription of a node that does not run."""
 
 
-class _AbsentClient(Client):
-    begins_active = False
+class _AbsentService(_Absent, Service):
+    """Takes nothing."""
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.queue = deque(maxlen=0)
+
+class _AbsentClient(_Absent, Client):
+    """Takes nothing."""
 
 
 class StandIns:

@@ -169,7 +169,6 @@ class RateProperty(RunProperty):
         self._sent: list[tuple[int, int]] = []
 
     def see(self, event: TraceEvent) -> None:
-        """Take note of messages on the topic."""
         for sent in event.sent():
             if sent.kind == OutputKind.MESSAGE and sent.name == self.topic:
                 self._sent.append((event.stamp_ns, event.index))

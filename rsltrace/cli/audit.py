@@ -17,7 +17,7 @@ from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
-    from rsltrace.guard.audit.report import AuditFinding, AuditReport
+    from rsltrace.guard.audit.audit import AuditFinding, AuditReport
 
 _FORMATS = ("text", "json", "github")
 
@@ -60,7 +60,7 @@ def audit(
     Exit status: 0 without findings, 1 with findings, 2 for an error.
     """
     result = _look(words, launch, skip, overrides)
-    from rsltrace.guard.audit.report import SAFE_TREATMENTS
+    from rsltrace.guard.audit.audit import SAFE_TREATMENTS
 
     found = [one for one in result.found if not (unguarded and one.treatment in SAFE_TREATMENTS)]
     for trouble in result.troubles:
@@ -138,7 +138,7 @@ def _as_json(result: AuditReport, found: Sequence[AuditFinding]) -> str:
 
 def _annotation(one: AuditFinding) -> str:
     from rsltrace.diff.report.ci import command_data, command_property
-    from rsltrace.guard.audit.report import SAFE_TREATMENTS
+    from rsltrace.guard.audit.audit import SAFE_TREATMENTS
 
     level = "notice" if one.treatment in SAFE_TREATMENTS else "warning"
     place = f"file={command_property(printable(_shown(one.path)))},line={one.line},col={one.column}"

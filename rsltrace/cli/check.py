@@ -78,8 +78,7 @@ def check(
     """
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
-    from rsltrace.conditions.message_fields import loaded_fields
-    from rsltrace.conditions.names import RunNames
+    from rsltrace.conditions.names import RunNames, loaded_fields
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 

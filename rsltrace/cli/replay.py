@@ -30,7 +30,7 @@ from rsltrace.trace.model.texts import printable
 if TYPE_CHECKING:
     from rsltrace.replay.edits import Edit
     from rsltrace.replay.preparation import ReplayPlan
-    from rsltrace.replay.result import ReplayResult
+    from rsltrace.replay.replaying import ReplayResult
 
 _SHOWN_MAX = 12
 

@@ -66,7 +66,6 @@ class _ReadingStepBudget(StepBudget):
         """Take nothing away."""
 
     def make(self, size: int, *, text: bool = False) -> None:
-        """Pay."""
         self._paying.make(size, text=text)
 
 

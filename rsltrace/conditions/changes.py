@@ -43,7 +43,6 @@ class WatchCondition(ActiveCondition):
         self._hash, self._shown = self._now(moment)
 
     def after(self, view: EventView) -> str:
-        """Compare with what it was before."""
         before_hash, before = self._hash, self._shown
         self._hash, self._shown = self._now(view)
         if self._hash == before_hash:

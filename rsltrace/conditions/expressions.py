@@ -24,8 +24,7 @@ from rsltrace.conditions.evaluation import (
     value_of,
 )
 from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
-from rsltrace.conditions.message_fields import wrong_field
-from rsltrace.conditions.names import RunNames, nodes_called, short_name
+from rsltrace.conditions.names import RunNames, nodes_called, short_name, wrong_field
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
 

@@ -94,8 +94,11 @@ def _sum(budget: StepBudget, value: Any, start: Any = 0) -> Any:
     return start
 
 
-def _len(budget: StepBudget, value: Any) -> int:
-    return len(value)
+def _of_list(make: Callable[[list[Any]], Any]) -> Function:
+    def compute(budget: StepBudget, value: Any = ()) -> Any:
+        return make(_listed(budget, value))
+
+    return compute
 
 
 def _sorted(budget: StepBudget, value: Any, *, reverse: bool = False) -> list[Any]:
@@ -104,22 +107,6 @@ def _sorted(budget: StepBudget, value: Any, *, reverse: bool = False) -> list[An
 
 def _reversed(budget: StepBudget, value: Any) -> list[Any]:
     return _listed(budget, value)[::-1]
-
-
-def _list(budget: StepBudget, value: Any = ()) -> list[Any]:
-    return _listed(budget, value)
-
-
-def _tuple(budget: StepBudget, value: Any = ()) -> tuple[Any, ...]:
-    return tuple(_listed(budget, value))
-
-
-def _set(budget: StepBudget, value: Any = ()) -> frozenset[Any]:
-    return frozenset(_listed(budget, value))
-
-
-def _bytes(budget: StepBudget, value: Any = ()) -> bytes:
-    return bytes(_listed(budget, value))
 
 
 def _enumerate(budget: StepBudget, value: Any, start: int = 0) -> list[tuple[int, Any]]:
@@ -146,6 +133,15 @@ def _tolist(budget: StepBudget, value: Any) -> list[Any]:
         found: list[Any] = value.tolist()
         return found
     return _listed(budget, value)
+
+
+def _same(builtin: Callable[..., Any]) -> Function:
+    """A function of Python's that costs nothing."""
+
+    def compute(budget: StepBudget, value: Any) -> Any:
+        return builtin(value)
+
+    return compute
 
 
 # -- numbers ---------------------------------------------------------------------------------------
@@ -181,10 +177,6 @@ def _str(budget: StepBudget, value: Any = "") -> str:
     raise TypeError(f"str is for numbers here, not for {type(value).__name__}")
 
 
-def _pow(budget: StepBudget, a: Any, b: Any) -> Any:
-    return BINARY[ast.Pow](budget, a, b)
-
-
 def _divmod(budget: StepBudget, a: Any, b: Any) -> tuple[Any, Any]:
     return BINARY[ast.FloorDiv](budget, a, b), BINARY[ast.Mod](budget, a, b)
 
@@ -194,22 +186,6 @@ def _prod(budget: StepBudget, value: Any, start: Any = 1) -> Any:
     for one in items(budget, value):
         start = multiply(budget, start, one)
     return start
-
-
-def _abs(budget: StepBudget, value: Any) -> Any:
-    return abs(value)
-
-
-def _chr(budget: StepBudget, value: int) -> str:
-    return chr(value)
-
-
-def _ord(budget: StepBudget, value: Any) -> int:
-    return ord(value)
-
-
-def _hex(budget: StepBudget, value: int) -> str:
-    return hex(value)
 
 
 # -- texts -----------------------------------------------------------------------------------------
@@ -328,33 +304,33 @@ _ONLY_OF_NUMPY = {
 _OF_NUMPY = {**_OF_ARRAYS, **_ONLY_OF_NUMPY}
 
 FUNCTIONS: dict[str, Function] = {
-    "abs": _abs,
+    "abs": _same(abs),
     "all": _truth("all"),
     "any": _truth("any"),
     "bool": _bool,
-    "bytes": _bytes,
-    "chr": _chr,
+    "bytes": _of_list(bytes),
+    "chr": _same(chr),
     "divmod": _divmod,
     "enumerate": _enumerate,
     "float": _float,
-    "hex": _hex,
+    "hex": _same(hex),
     "int": _int,
-    "len": _len,
-    "list": _list,
+    "len": _same(len),
+    "list": _of_list(list),
     "max": _extreme("max"),
     "min": _extreme("min"),
     "norm": _of_numpy("linalg.norm", 2),
-    "ord": _ord,
-    "pow": _pow,
+    "ord": _same(ord),
+    "pow": BINARY[ast.Pow],
     "prod": _prod,
     "range": _range,
     "reversed": _reversed,
     "round": _round,
-    "set": _set,
+    "set": _of_list(frozenset),
     "sorted": _sorted,
     "str": _str,
     "sum": _sum,
-    "tuple": _tuple,
+    "tuple": _of_list(tuple),
     "zip": _zip,
     "diff": _diff,
     **{name: _of_either(name) for name in _OF_NUMBERS},
@@ -373,7 +349,7 @@ OF_FLOATS: Mapping[Function, Callable[[float], Any]] = {
 OF_MODULES: dict[str, dict[str, Function]] = {
     "math": {
         **{name: FUNCTIONS[name] for name in (*_OF_NUMBERS, *_ONLY_OF_MATH, *_OF_SEQUENCES)},
-        "pow": _pow,
+        "pow": BINARY[ast.Pow],
         "prod": _prod,
     },
     "np": {

@@ -28,7 +28,6 @@ class IndexCondition(ActiveCondition):
     index: int
 
     def before(self, view: EventView) -> str:
-        """Compare numbers."""
         return f"event {self.index}" if view.index == self.index else ""
 
 
@@ -39,7 +38,6 @@ class NodeCondition(ActiveCondition):
     pattern: str
 
     def before(self, view: EventView) -> str:
-        """Compare names."""
         return view.node if view.node and is_named(self.pattern, view.node) else ""
 
 
@@ -50,7 +48,6 @@ class EntityCondition(ActiveCondition):
     pattern: str
 
     def before(self, view: EventView) -> str:
-        """Compare names."""
         name = view.entity_name
         if self.pattern == f"#{view.entity}" or (name and is_named(self.pattern, name)):
             return f"{view.node}: {name}" if view.node else name or self.pattern
@@ -76,7 +73,6 @@ class TopicCondition(ActiveCondition):
         return self._why(f"{view.node} receives {found[0]}", view, found[1])
 
     def after(self, view: EventView) -> str:
-        """Look at what was sent."""
         for sent in view.sent():
             if sent.kind in _MESSAGES and is_named(self.pattern, sent.name):
                 message = None
@@ -169,7 +165,6 @@ class FindingCondition(ActiveCondition):
     source: str = ""
 
     def after(self, view: EventView) -> str:
-        """Compare what was found."""
         for source in view.findings():
             if self.source in ("", source):
                 return f"the guard found {source}"
@@ -185,11 +180,9 @@ class FilteredCondition(ActiveCondition):
     text: str
 
     def before(self, view: EventView) -> str:
-        """Ask the other first."""
         return self._if(self.inner.before(view), view)
 
     def after(self, view: EventView) -> str:
-        """Ask the other first."""
         return self._if(self.inner.after(view), view)
 
     def _if(self, why: str, view: EventView) -> str:

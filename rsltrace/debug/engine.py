@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.conditions.message_fields import loaded_fields
-from rsltrace.conditions.names import RunNames, names_of
+from rsltrace.conditions.names import RunNames, loaded_fields, names_of
 from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
 from rsltrace.debug.current_event import NO_CALL, CallbackCall, CurrentEventView, call_of

@@ -15,6 +15,7 @@ from typing import Any
 
 from rsltrace.child_processes import how_ended, rsltrace_command
 from rsltrace.errors import DebugError
+from rsltrace.forking import own_children
 from rsltrace.line_protocol import Lines
 
 _PR_SET_CHILD_SUBREAPER = 36
@@ -100,7 +101,7 @@ class Family:
         """End everything below this process, and wait until it is gone."""
         while True:
             self.reap()
-            children = _children()
+            children = own_children()
             if not children:
                 return
             for pid in children:
@@ -108,14 +109,6 @@ class Family:
                     os.kill(pid, signal.SIGKILL)
             with suppress(ChildProcessError):
                 os.waitpid(-1, 0)
-
-
-def _children() -> list[int]:
-    found = []
-    for task in os.listdir("/proc/self/task"):
-        with suppress(OSError), open(f"/proc/self/task/{task}/children") as file:
-            found += [int(word) for word in file.read().split()]
-    return found
 
 
 def memory_bytes(pid: int) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -66,12 +66,6 @@ attach(_word, schema={"type": ["string", "number"]})
 
 class JobFields(JobPart):
     """The keys of a job, each by itself; ``Job`` adds what must hold between them."""
-
-    TIMES: ClassVar[dict[str, str]] = {
-        "start": "start_ns",
-        "construct_time": "construct_time_ns",
-        "min_time_step": "min_time_step_ns",
-    }
 
     nodes: Annotated[tuple[NodeSpec, ...], parts()] = Field(
         default=(),

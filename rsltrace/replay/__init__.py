@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.job import Job
     from rsltrace.replay.one_node.result import NodeReplayResult
-    from rsltrace.replay.result import ReplayResult
+    from rsltrace.replay.replaying import ReplayResult
 
 
 @overload

@@ -6,8 +6,9 @@ import os
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.options import DiffOptions
@@ -17,14 +18,89 @@ from rsltrace.errors import ReplayError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.preparation import ReplayPlan
-from rsltrace.replay.result import ReplayResult
 from rsltrace.replay.verification import EventVerification
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
+
+if TYPE_CHECKING:
+    from rsltrace.errors import RunError
+
+# The result of a replay.
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """How far a run did, event by event, what the trace ``trace`` (a path) says.
+
+    ``verified`` is how many events, counted from 0, are the same in every hashed field; the trace
+    has ``events``. ``digest`` is the chain hash of the last of these, 16 hex digits (zeros: none),
+    ``end_ns`` its simulated time in nanoseconds, ``start_ns`` that of the start. ``ended`` says in
+    words why the replay ended there. ``is_whole`` is true if that is the end of the trace's run;
+    otherwise it diverged, ``until`` was reached, the trace was cut off or one of the runs was
+    ended from outside.
+
+    ``diff`` is None unless the run diverged; then it compares the trace (a) with the replay (b),
+    which ends with the event that differs, number ``verified``. ``path`` is the replay's own trace,
+    None if none was asked for. ``error`` is what went wrong in the run, which is no divergence if
+    it did in the recorded run, too. ``notes`` are texts for people.
+
+    With ``edits``, the run was verified up to the first of them and went on as a branch: ``digest``
+    and ``end_ns`` are the branch's, and ``diff`` compares all of it with the trace, None if the
+    edits have changed nothing.
+    """
+
+    trace: str
+    verified: int
+    events: int
+    digest: str
+    start_ns: int
+    end_ns: int
+    ended: str
+    is_whole: bool
+    path: Path | None = None
+    diff: Diff | None = None
+    error: RunError | None = field(default=None, compare=False)
+    notes: tuple[str, ...] = ()
+    interrupted: int = 0
+    """The exit status of a replay that was itself interrupted (130: Ctrl-C), else 0."""
+    edits: tuple[str, ...] = ()
+
+    @property
+    def sim_seconds(self) -> str:
+        """Simulated duration in seconds, with nine decimals."""
+        return format_seconds(self.end_ns - self.start_ns)
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the run did something else than the trace says (of a branch: because of it)."""
+        return self.diff is not None
+
+    @property
+    def exit_code(self) -> int:
+        """0 verified as far as it went, 1 diverged; of an interrupted replay 130, 143 or 129."""
+        return 1 if self.diverged else self.interrupted
+
+    @property
+    def sentence(self) -> str:
+        """The result in one sentence."""
+        if self.edits:
+            if self.diff is None:
+                return f"the edits change nothing: the branch has the digest {self.digest}, too"
+            return f"a branch from event {self.verified} on: {self.diff.sentence}"
+        if self.diff is not None:
+            how_far = f"the first {self.verified} events of {self.events} agree"
+            return f"diverged at event {self.verified} ({how_far}): {self.diff.sentence}"
+        of = "all" if self.verified == self.events else "the first"
+        count = f"{of} {self.verified} events"
+        if self.verified != self.events:
+            count += f" of {self.events}"
+        return f"verified {count}, to {self.sim_seconds} s ({self.ended})"
+
 
 THE_REPLAY = "the replay"
 THE_BRANCH = "the branch"

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.adapters.processes.adapter import ProcessAdapter
 from rsltrace.errors import BagError, DeadlockError, RunError
@@ -227,13 +226,8 @@ class RunSession:
             self._stack = stack.pop_all()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        where: TracebackType | None,
-    ) -> None:
-        self._stack.__exit__(kind, error, where)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
     def _open(self, stack: ExitStack) -> None:
         from rsltrace.adapters.rclpy.boundary.installation import check_no_simulation

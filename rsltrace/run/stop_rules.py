@@ -80,7 +80,6 @@ class _TimeRule(StopRule):
         raise NotImplementedError
 
     def condition(self) -> StopCondition:
-        """Return a condition that knows its time."""
         stop = self._stop()
         return stop_at(self._end_ns, stop.reason, stop.exit_code)
 
@@ -90,7 +89,6 @@ class DurationRule(_TimeRule):
 
     @classmethod
     def end_ns(cls, value: int, start_ns: int) -> int:
-        """Count from the start."""
         return start_ns + value
 
     def _stop(self) -> Stop:
@@ -109,7 +107,6 @@ class TimeRule(_TimeRule):
 
     @classmethod
     def end_ns(cls, value: int, start_ns: int) -> int:
-        """Return the time itself."""
         return value
 
     def _stop(self) -> Stop:
@@ -120,7 +117,6 @@ class EventsRule(StopRule):
     """``events``: after so many events."""
 
     def check(self, progress: Progress) -> Stop | None:
-        """Compare numbers."""
         return Stop(f"{self.value} events") if progress.events >= self.value else None
 
 
@@ -146,7 +142,6 @@ class SizeRule(StopRule):
         self._trace_size = run.trace_size
 
     def check(self, progress: Progress) -> Stop | None:
-        """Compare sizes."""
         if self._trace_size() < self.value:
             return None
         return Stop(f"a trace of {format_size(self.value)}")
@@ -205,7 +200,6 @@ class TopicRule(StopRule):
 
     @classmethod
     def topic(cls, value: TopicStop) -> str:
-        """Return its name."""
         return value.name
 
     def on_message(self, message: Callable[[], Any]) -> Stop | None:

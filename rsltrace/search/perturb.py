@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.workspace.cache import same_place
-from rsltrace.child_processes import END_WITH_PARENT, Done, Processes, how_ended
+from rsltrace.child_processes import Done, Processes, how_ended, rsltrace_command
 from rsltrace.guard.pin import THREAD_VARIABLES
 from rsltrace.trace.format import METADATA_STATES
 
@@ -56,27 +56,12 @@ _RESULT_MAX = 1 << 20
 """How far from the end of what a run has printed its result can begin."""
 
 # Fills the heap first, so that fresh memory is never zero and addresses differ.
-_NOISE = f"""
-import sys
-del sys.path[0]
-{END_WITH_PARENT}
-import random as r, runpy
-g = r.Random(int(sys.argv.pop(1)))
+_NOISE = """
+import random as r
+g = r.Random({seed})
 n = [bytes([g.randrange(1, 256)]) * g.randrange(8, 5000) for _ in range(g.randrange(500, 4000))]
 o = [object() for _ in range(g.randrange(20000))]
 del n[::2], o[::3], g, r
-sys.argv = ['rsltrace'] + sys.argv[1:]
-runpy.run_module('rsltrace', run_name='__main__')
-"""
-
-# Starts without the working directory on Python's path.
-_PLAIN = f"""
-import sys
-del sys.path[0]
-{END_WITH_PARENT}
-import runpy
-sys.argv[0] = 'rsltrace'
-runpy.run_module('rsltrace', run_name='__main__')
 """
 
 # Keeps a CPU busy for as long as the parent process lives.
@@ -223,10 +208,8 @@ def run_in(
     cwd = _working_folder(folder / f"{_name(around)}.cwd", values.get(FOLDER))
     home = folder / f"{_name(around)}.home"
     home.mkdir(exist_ok=True)
-    command = [sys.executable, "-c"]
-    parent = str(os.getpid())
-    command += [_NOISE, parent, values[HEAP]] if HEAP in values else [_PLAIN, parent]
-    command += words
+    noise = _NOISE.format(seed=values[HEAP]) if HEAP in values else ""
+    command = rsltrace_command(words, before=noise)
     if "nice" in values.get(LOAD, "") and shutil.which("nice"):
         command = ["nice", "-n", "5", *command]
     if ADDRESSES not in values and can_fix_addresses():

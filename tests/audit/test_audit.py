@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.errors import JobError
-from rsltrace.guard.audit.audit import audit_job, audit_path
-from rsltrace.guard.audit.report import AuditFinding
+from rsltrace.guard.audit.audit import AuditFinding, audit_job, audit_path
 from rsltrace.job import load_job
 
 ROOT = Path(__file__).parents[2]

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from rsltrace.conditions.condition import ActiveCondition, EventCondition
 from rsltrace.conditions.expressions import parse_expression
-from rsltrace.conditions.message_fields import loaded_fields
-from rsltrace.conditions.names import RunNames
+from rsltrace.conditions.names import RunNames, loaded_fields
 from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import ConditionError

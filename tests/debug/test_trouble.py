@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from rsltrace import DebugSession
-from rsltrace.debug.branches import EditBranches
+from rsltrace.debug.client import EditBranches
 from rsltrace.errors import DebugError, OutputError, RsltraceError
 
 pytestmark = pytest.mark.ros

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from rsltrace.checks.evaluate import check_latency
 from rsltrace.checks.latency.instances import HopTimes, figures
 from rsltrace.checks.latency.measure import MEASURES, ChainLatency, measure_latencies
 from rsltrace.checks.latency.paths import Hop
-from rsltrace.checks.latency_checks import check_latency
 from rsltrace.errors import TraceError
 from rsltrace.job.parts.check import LatencySpec
 from rsltrace.trace.format import (

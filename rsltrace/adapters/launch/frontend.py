@@ -61,12 +61,10 @@ class AttributeText(Substitution):
         self._attribute, self._check = attribute, check
 
     def describe(self) -> str:
-        """Return it as it is written."""
         value = self._attribute.value
         return str(value).lower() if isinstance(value, bool) else str(value)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text with its substitutions replaced."""
         try:
             text = self._text(context)
             self._check(text)
@@ -102,7 +100,6 @@ class _AttributeValue(ParameterValue):
         self._attribute, self._kind = attribute, kind
 
     def evaluate(self, context: LaunchContext) -> Any:
-        """Return the value."""
         kind = context.optional(self._kind)
         try:
             value = self._replaced(context, self._attribute.value)
@@ -181,7 +178,6 @@ class _BrokenElement(Action):
         self._error = error
 
     def execute(self, context: LaunchContext) -> None:
-        """Report the mistake."""
         raise self._error
 
 

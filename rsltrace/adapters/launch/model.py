@@ -82,7 +82,6 @@ class _LaunchYamlConstructor(SafeConstructor):
     """
 
     def construct_mapping(self, node: Any, deep: bool = False) -> Any:
-        """Return a mapping."""
         for key, _ in node.value:
             if key.tag == "tag:yaml.org,2002:bool":
                 key.tag = "tag:yaml.org,2002:str"

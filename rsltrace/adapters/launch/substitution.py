@@ -126,7 +126,6 @@ class SubstitutionCall(Substitution):
         self.name, self.arguments, self.written = name, arguments, written
 
     def describe(self) -> str:
-        """Return it as it is written."""
         return self.written
 
     def perform(self, context: LaunchContext) -> str:
@@ -159,7 +158,6 @@ class _TextFunction(Substitution):
         self._function, self._arguments = function, arguments
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text."""
         return self._function(*map(context.text, self._arguments))
 
 

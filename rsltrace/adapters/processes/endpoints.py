@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 from rsltrace.adapters.processes.wire import WakeReason, gid_of, packed_item
-from rsltrace.simulation.middleware.entity import DomainEntity
+from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant
@@ -75,7 +75,40 @@ class RosoutPublisher(Publisher):
         super().send(data, hash64(log_content(data)))
 
 
-class _CallbackEndpoint(DomainEntity):
+class _QueueEndpoint(Receiver):
+    """An endpoint with a queue of arrivals. ``number`` is what the process calls it."""
+
+    process: HostProcess
+    number: int
+    event_kind: int
+
+    def dispatch(self) -> None:
+        if not self.may_run():
+            return
+        if not self.process.wants(self):
+            self.process.hold(self)
+            return
+        arrival = self.queue.popleft()
+        self.dispatcher.execute(
+            self,
+            self.entity_id,
+            self.node,
+            self.event_kind,
+            self.process.go_on_with,
+            (self.number, WakeReason.ENTITY, self.packed(arrival)),
+            *arrival[self.origin],
+        )
+
+    def take(self) -> bytes | None:
+        """Return the oldest arrival for who asks without having waited, None if there is none."""
+        return self.packed(self.queue.popleft()) if self.queue else None
+
+    def packed(self, arrival: Any) -> bytes:
+        """Return an arrival as the process reads it."""
+        raise NotImplementedError
+
+
+class _CallbackEndpoint(_QueueEndpoint):
     """An endpoint whose callback has a name, if the process says it."""
 
     callback_name = ""
@@ -89,7 +122,9 @@ class _CallbackEndpoint(DomainEntity):
 
 
 class ProcessSubscription(_CallbackEndpoint, Subscription):
-    """A subscription of a process. ``number`` is what the process calls it."""
+    """A subscription of a process."""
+
+    event_kind = SUBSCRIPTION
 
     def __init__(
         self,
@@ -105,28 +140,7 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
         self.number = number
         self._received = 0
 
-    def dispatch(self) -> None:
-        if not self.may_run():
-            return
-        if not self.process.wants(self):
-            self.process.hold(self)
-            return
-        delivery: Delivery = self.queue.popleft()
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            SUBSCRIPTION,
-            self.process.go_on_with,
-            (self.number, WakeReason.ENTITY, self._packed(delivery)),
-            *delivery[5:8],
-        )
-
-    def take(self) -> bytes | None:
-        """Return the oldest message for who asks without having waited, None if there is none."""
-        return self._packed(self.queue.popleft()) if self.queue else None
-
-    def _packed(self, delivery: Delivery) -> bytes:
+    def packed(self, delivery: Delivery) -> bytes:
         self._received += 1
         received_ns = delivery[0] or delivery[8]
         return packed_item(
@@ -136,6 +150,8 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
 
 class ProcessService(_CallbackEndpoint, Service):
     """A server of a process."""
+
+    event_kind = SERVICE
 
     def __init__(
         self,
@@ -152,28 +168,7 @@ class ProcessService(_CallbackEndpoint, Service):
         self.number = number
         self._asked: dict[tuple[bytes, int], RequestId] = {}
 
-    def dispatch(self) -> None:
-        if not self.may_run():
-            return
-        if not self.process.wants(self):
-            self.process.hold(self)
-            return
-        exchange: Exchange = self.queue.popleft()
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            SERVICE,
-            self.process.go_on_with,
-            (self.number, WakeReason.ENTITY, self._packed(exchange)),
-            *exchange[1:4],
-        )
-
-    def take(self) -> bytes | None:
-        """Return the oldest request, None if there is none."""
-        return self._packed(self.queue.popleft()) if self.queue else None
-
-    def _packed(self, exchange: Exchange) -> bytes:
+    def packed(self, exchange: Exchange) -> bytes:
         request_id = exchange[4].request_id
         gid = gid_of(request_id.client.entity_id)
         self._asked[gid, request_id.sequence_number] = request_id
@@ -186,8 +181,10 @@ class ProcessService(_CallbackEndpoint, Service):
             self.respond(data, request_id)
 
 
-class ProcessClient(Client):
+class ProcessClient(_QueueEndpoint, Client):
     """A client of a process."""
+
+    event_kind = CLIENT
 
     def __init__(
         self,
@@ -203,28 +200,7 @@ class ProcessClient(Client):
         self.process = process
         self.number = number
 
-    def dispatch(self) -> None:
-        if not self.may_run():
-            return
-        if not self.process.wants(self):
-            self.process.hold(self)
-            return
-        exchange: Exchange = self.queue.popleft()
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            CLIENT,
-            self.process.go_on_with,
-            (self.number, WakeReason.ENTITY, self._packed(exchange)),
-            *exchange[1:4],
-        )
-
-    def take(self) -> bytes | None:
-        """Return the oldest response, None if there is none."""
-        return self._packed(self.queue.popleft()) if self.queue else None
-
-    def _packed(self, exchange: Exchange) -> bytes:
+    def packed(self, exchange: Exchange) -> bytes:
         return _packed_exchange(exchange, gid_of(self.entity_id))
 
 

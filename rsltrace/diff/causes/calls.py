@@ -15,8 +15,8 @@ from operator import itemgetter
 from typing import Any
 
 from rsltrace.diff.alignment.rows import ComparedTrace
-from rsltrace.diff.causes.environment import used_by
 from rsltrace.diff.causes.event_views import subject_of
+from rsltrace.diff.causes.relevance import used_by
 from rsltrace.diff.facts.causes import UnrecordedAnswer
 from rsltrace.diff.facts.evidence import CallDifference, EventSummary
 from rsltrace.trace.model.entity import EntityKind

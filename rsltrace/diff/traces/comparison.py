@@ -19,13 +19,13 @@ from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entiti
 from rsltrace.diff.alignment.outputs import different_outputs
 from rsltrace.diff.alignment.rows import SHUTDOWN, ComparedTrace, load_rows
 from rsltrace.diff.causes.effects import EffectSearch
-from rsltrace.diff.causes.environment import entity_settings, environment_settings
 from rsltrace.diff.causes.explain import Explainer
 from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.causes.propagation import (
     FoundDivergence,
     Propagation,
 )
+from rsltrace.diff.causes.relevance import entity_settings, environment_settings
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import (

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rsltrace.diff.alignment.entity_matching import match_entities
-from rsltrace.diff.causes.environment import entity_settings, environment_settings
 from rsltrace.diff.causes.job_settings import job_settings
+from rsltrace.diff.causes.relevance import entity_settings, environment_settings
 from rsltrace.diff.facts.causes import (
     CauseFact,
     CauseKind,

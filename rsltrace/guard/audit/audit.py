@@ -17,13 +17,45 @@ from pathlib import Path
 from rsltrace.errors import JobError
 from rsltrace.guard.audit.calls import CallSite, find_calls
 from rsltrace.guard.audit.names import NameResolver
-from rsltrace.guard.audit.report import AuditFinding, AuditReport
 from rsltrace.guard.audit.scopes import ModuleSource, NameScope, parse_scopes
 from rsltrace.guard.rules import Treatment
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.trace.model.finding import GuardPolicy
 from rsltrace.trace.model.module_search import find_module
 from rsltrace.trace.model.regular_file import read_regular
+
+# What an audit has found.
+
+
+SAFE_TREATMENTS = frozenset({Treatment.VIRTUAL, Treatment.PINNED})
+"""With these, a second run does the same."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class AuditFinding:
+    """One call in a source file; lines and columns count from 1, as in editors."""
+
+    path: Path
+    line: int
+    column: int
+    kind: str
+    call: str
+    treatment: Treatment
+    does: str
+    instead: str
+
+
+@dataclass(frozen=True, slots=True)
+class AuditReport:
+    """The result of an audit. ``troubles`` names files that are not readable as Python, ``allowed``
+    counts findings that a comment silences."""
+
+    found: tuple[AuditFinding, ...]
+    files: int
+    troubles: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    allowed: int = 0
+
 
 # Which files to read: those of a path, or those of a job's nodes and their imports.
 

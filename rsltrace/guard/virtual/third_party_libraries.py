@@ -23,6 +23,7 @@ from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.frames import caller, replace_member
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import copy_of, redirect, replace_attribute
+from rsltrace.guard.rules import C_FUNCTIONS
 from rsltrace.guard.virtual.arrays import filled
 from rsltrace.guard.virtual.clocks import clock_call, numpy_now
 from rsltrace.guard.virtual.set_order import in_set_order
@@ -391,3 +392,36 @@ def one_tbb_thread(report: Callable[[str, str], None]) -> Iterator[None]:
         redirect(stack, _imp.create_dynamic, importing)
         redirect(stack, _ctypes.dlopen, opening)
         yield
+
+
+# Functions of the C library that nodes load through cffi, reported like those through ctypes.
+
+
+CFFI_LOADER = "cffi.api"
+"""The module of cffi that opens libraries (``ffi.dlopen``)."""
+
+
+class _Library:
+    """A library of cffi that reports the functions taken from it."""
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
+
+    def load_function(self, kind: Any, name: str) -> Any:
+        """Return a function; cffi keeps it and calls this once."""
+        guard = engaged()
+        source = C_FUNCTIONS.get(name)
+        if guard is not None and source is not None:
+            guard.report_user_call(source, f"C library: {name}()", "", caller())
+        return self._real.load_function(kind, name)
+
+
+def report_cffi_functions(stack: ExitStack) -> None:
+    """Report functions of libraries that nodes open from now on, until ``stack`` ends."""
+    module = sys.modules[CFFI_LOADER]
+    real = getattr(module, "_load_backend_lib", None)
+    if real is not None:
+        replace_attribute(stack, module, "_load_backend_lib", lambda *given: _Library(real(*given)))

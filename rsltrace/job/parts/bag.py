@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -90,12 +90,6 @@ class BagSpec(JobPart):
     ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
     ``start_offset_ns`` counts from the first message of the whole bag, ``duration_ns`` from there.
     """
-
-    TIMES: ClassVar[dict[str, str]] = {
-        "start_offset": "start_offset_ns",
-        "duration": "duration_ns",
-        "at": "at_ns",
-    }
 
     path: Annotated[str, check(check_path)] = Field(
         description="The folder, `.mcap` or `.db3` file.",

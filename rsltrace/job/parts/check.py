@@ -33,8 +33,6 @@ Topic = Annotated[str | None, check(text(check_topic), optional=True)]
 class LatencySpec(JobPart):
     """A limit of an end-to-end latency. Give ``from`` and ``to``, or all topics of the chain."""
 
-    TIMES: ClassVar[dict[str, str]] = {"below": "below_ns"}
-
     start: Topic = Field(
         default=None,
         alias="from",
@@ -123,16 +121,6 @@ class MetricSpec(JobPart):
         default=None, description="Unit, for reports.", examples=["m"]
     )
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            *,
-            expression: str | None = None,
-            function: Target | None = None,
-            unit: str | None = None,
-        ) -> None: ...
-
     @model_validator(mode="after")
     def _says_one_thing(self) -> MetricSpec:
         if (self.expression is None) == (self.function is None):
@@ -173,7 +161,6 @@ class CheckSpec(JobPart):
     """One property of the run. Exactly one of ``always``, ``never``,
     ``eventually``, ``rate``, ``latency`` and ``function``."""
 
-    TIMES: ClassVar[dict[str, str]] = {"within": "within_ns", "over": "over_ns"}
     KINDS: ClassVar[tuple[str, ...]] = (
         "always",
         "never",

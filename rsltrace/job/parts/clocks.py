@@ -76,7 +76,6 @@ attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "patt
 class JumpSpec(JobPart):
     """A jump of a clock."""
 
-    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
     LISTED: ClassVar[tuple[str, ...]] = ("at", "by")
 
     at_ns: Annotated[int, check(parse_time)] = Field(
@@ -90,8 +89,6 @@ class JumpSpec(JobPart):
 class RandomJumpsSpec(JobPart):
     """Jumps at random times (a Poisson process) of random size (uniform), from the job's seed."""
 
-    TIMES: ClassVar[dict[str, str]] = {"every": "every_ns", "most": "most_ns"}
-
     every_ns: Annotated[int, check(parse_interval)] = Field(
         alias="every", description="Mean time between two jumps.", examples=["10s"]
     )
@@ -102,8 +99,6 @@ class RandomJumpsSpec(JobPart):
 
 class ClockSpec(JobPart):
     """How the clock of some nodes differs from simulated time."""
-
-    TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
 
     node: Annotated[str, check(text(check_node_glob))] = Field(
         default="*",

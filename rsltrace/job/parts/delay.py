@@ -49,7 +49,6 @@ class BurstSpec(JobPart):
 class DelaySpec(DistributionSpec):
     """Delay and loss of messages. A plain time stands for ``{constant: time}``."""
 
-    TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns", "retransmit": "retransmit_ns"}
     NEEDS_ONE: ClassVar[bool] = False
 
     drop: Probability = Field(
@@ -99,8 +98,6 @@ class LinkSpec(DelaySpec):
 
 class OutageSpec(JobPart):
     """A topic, service or node is cut off for some time."""
-
-    TIMES: ClassVar[dict[str, str]] = {"from": "from_ns", "to": "to_ns"}
 
     topic: Annotated[str | None, check(text(check_glob), optional=True)] = Field(
         default=None, description="Topic that is cut off, a glob.", examples=["/scan"]

@@ -36,7 +36,6 @@ class UniformSpec(JobPart):
     """Uniform between two bounds."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
-    TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
 
     min_ns: Annotated[int, check(parse_short_time)] = Field(
         alias="min", description="Shortest time.", examples=["1ms"]
@@ -56,7 +55,6 @@ class NormalSpec(JobPart):
     """Normal, truncated at zero: negative values are drawn again."""
 
     LISTED: ClassVar[tuple[str, ...]] = ("mean", "sd")
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns"}
 
     mean_ns: Annotated[int, check(parse_time)] = Field(
         alias="mean", description="Mean before the truncation.", examples=["5ms"]
@@ -66,11 +64,10 @@ class NormalSpec(JobPart):
     )
 
 
-class LognormalSpec(JobPart):
-    """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
+class _ByMeanSpec(JobPart):
+    """By mean and standard deviation, or in another way."""
 
-    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "median": "median_ns"}
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]]
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
@@ -78,6 +75,22 @@ class LognormalSpec(JobPart):
     sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
     )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> _ByMeanSpec:
+        one, other = self.ALTERNATIVES
+        fields = type(self).model_fields.items()
+        given = {field.alias or name for name, field in fields if getattr(self, name) is not None}
+        if given not in (set(one), set(other)):
+            raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
+        return self
+
+
+class LognormalSpec(_ByMeanSpec):
+    """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
+
     median_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="median", description="Median; goes with `sigma`.", examples=["5ms"]
     )
@@ -87,35 +100,18 @@ class LognormalSpec(JobPart):
         examples=[0.5],
     )
 
-    @model_validator(mode="after")
-    def _one_way(self) -> LognormalSpec:
-        _either(self, *self.ALTERNATIVES)
-        return self
 
-
-class GammaSpec(JobPart):
+class GammaSpec(_ByMeanSpec):
     """Gamma: by mean and standard deviation, or by shape and scale."""
 
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
-    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "scale": "scale_ns"}
 
-    mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
-        default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
-    )
-    sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
-        default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
-    )
     shape: Annotated[float | None, check(number(0, 1e9, open_below=True), optional=True)] = Field(
         default=None, description="Shape; goes with `scale`.", examples=[2.0]
     )
     scale_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None, alias="scale", description="Scale.", examples=["1ms"]
     )
-
-    @model_validator(mode="after")
-    def _one_way(self) -> GammaSpec:
-        _either(self, *self.ALTERNATIVES)
-        return self
 
 
 class SamplesSpec(JobPart):
@@ -253,8 +249,6 @@ def check_series(points: tuple[tuple[int, int], ...]) -> None:
 class DistributionSpec(JobPart):
     """A time: constant, random, or changing. Exactly one of the keys."""
 
-    TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
-
     constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
         default=None, alias="constant", description="Constant.", examples=["5ms"]
     )
@@ -320,13 +314,6 @@ class DistributionSpec(JobPart):
         """Return which of ``KINDS`` are given."""
         values = {**vars(self), "constant": self.constant_ns}
         return [kind for kind in self.KINDS if values[kind] is not None]
-
-
-def _either(part: JobPart, one: tuple[str, ...], other: tuple[str, ...]) -> None:
-    values = {key: getattr(part, part.TIMES.get(key, key)) for key in (*one, *other)}
-    given = {key for key, value in values.items() if value is not None}
-    if given not in (set(one), set(other)):
-        raise JobProblem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
 
 
 def files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:

@@ -44,7 +44,6 @@ class StartAfterSpec(JobPart):
     ``name``, by what they run, or by number."""
 
     MEANT: ClassVar[str] = "delay"
-    TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
     CONDITIONS: ClassVar[tuple[str, ...]] = ("topic", "service", "node", "started", "ended")
 
     delay_ns: Annotated[int, check(parse_time)] = Field(

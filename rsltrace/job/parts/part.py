@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Iterator
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -150,9 +151,6 @@ class JobPart(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
-    TIMES: ClassVar[dict[str, str]] = {}
-    """YAML key of each time → name of its field, which ends in ``_ns``."""
-
     OF_TIMES: ClassVar[tuple[str, ...]] = ()
     """Other fields that hold times, in tuples."""
 
@@ -173,14 +171,20 @@ class JobPart(BaseModel):
     def _accept_field_names_of_times(cls, data: object, info: ValidationInfo) -> object:
         if not isinstance(data, dict) or from_file(info):
             return data
-        for key, name in cls.TIMES.items():
+        for key, name in cls._times():
             if name in data:
                 if key in data:
                     raise JobProblem(f"give either {key} or {name}, not both", (name,))
-                value = data[name]
-                data = {k: v for k, v in data.items() if k != name}
-                data[key] = value if value is None else Nanoseconds(value)
+                data = {**data, key: _counted(data[name])}
+                del data[name]
         return data
+
+    @classmethod
+    def _times(cls) -> Iterator[tuple[str, str]]:
+        """Yield the key in a job file of each time, and the name of its field."""
+        for name, field in cls.model_fields.items():
+            if field.alias is not None and name.endswith("_ns"):
+                yield field.alias, name
 
     @classmethod
     def model_rebuild(cls, **options: Any) -> bool | None:

@@ -38,7 +38,6 @@ class InputSpec(JobPart):
     ``line``."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ("line", "keys", "file", "end")
-    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns"}
 
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
@@ -117,7 +116,6 @@ class RespawnSpec(JobPart):
     """Restart of a process that has ended. A plain time stands for ``{delay: time}``."""
 
     MEANT: ClassVar[str] = "delay"
-    TIMES: ClassVar[dict[str, str]] = {"delay": "delay_ns"}
 
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,

@@ -32,12 +32,6 @@ class HooksSpec(JobPart):
         examples=["my_robot.setup:wire"],
     )
 
-    if TYPE_CHECKING:
-
-        def __init__(
-            self, *, before: Target | None = None, after: Target | None = None
-        ) -> None: ...
-
 
 class RecordSpec(JobPart):
     """Which messages the trace keeps. Hashes are always kept."""

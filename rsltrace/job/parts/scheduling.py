@@ -88,7 +88,6 @@ class PolicySpec(JobPart):
     """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone
     is an ``order``."""
 
-    TIMES: ClassVar[dict[str, str]] = {"after": "after_ns"}
     ONE_OF: ClassVar[tuple[str, ...]] = (
         "order",
         "priority",

@@ -30,12 +30,6 @@ class StopSpec(JobPart):
     """What ends a run: the first of these conditions."""
 
     MEANT: ClassVar[str] = "duration"
-    TIMES: ClassVar[dict[str, str]] = {
-        "duration": "duration_ns",
-        "time": "time_ns",
-        "timeout": "timeout_ns",
-        "quiescence": "quiescence_ns",
-    }
 
     duration_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,

@@ -6,10 +6,11 @@ import signal
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rsltrace import errors
 from rsltrace.adapters.rclpy.boundary.installation import boundary
@@ -27,14 +28,88 @@ from rsltrace.native.native_run import (
 )
 from rsltrace.native.processes.children import ObservedProcess, ProcessStart
 from rsltrace.native.processes.plans import start_rules, starts_of
-from rsltrace.native.processes.start_queue import StartQueue
 from rsltrace.native.processes.wire import EntryOrder, Frame, SpanDecoder
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.native.support import check_loopback, domain
 from rsltrace.run.plans.entries import missed_starts
 from rsltrace.run.stop_rules import has_stop
 from rsltrace.simulation.loop.stop import Stop
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.native.processes.children import ObservedProcess
+
+# When the entries of a native run begin that do not begin with it (``start_after:``).
+
+
+StartFact = tuple[str, str]
+"""What has come true: ``topic``, ``service``, ``node``, ``started`` or ``ended``, and its name."""
+
+_MADE = {EntityKind.NODE: "node", EntityKind.SERVICE: "service"}
+
+
+class StartQueue:
+    """Takes facts from threads, and says which entries begin."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._facts: set[StartFact] = set()
+        self._waiting: list[tuple[ObservedProcess, StartRule, int]] = []
+        self._since_ns: dict[int, int] = {}
+
+    @property
+    def waiting(self) -> list[ObservedProcess]:
+        """The processes that have not begun."""
+        return [child for child, _, _ in self._waiting]
+
+    def add(self, child: ObservedProcess, rule: StartRule) -> None:
+        """Let a process begin once its rule is met."""
+        self._waiting.append((child, rule, now_ns()))
+
+    def tell(self, what: str, name: str) -> None:
+        """Say what has come true."""
+        with self._lock:
+            self._facts.add((what, name))
+
+    def look_at(self, spans: Iterable[CallbackSpan]) -> None:
+        """Find in what was observed what has come true."""
+        found: set[StartFact] = set()
+        for span in spans:
+            for output in span.outputs:
+                if isinstance(output, SentMessage) and output.kind == OutputKind.MESSAGE:
+                    found.add(("topic", output.entity.name))
+                elif isinstance(output, Entity) and output.kind in _MADE:
+                    found.add((_MADE[output.kind], output.name))
+        with self._lock:
+            self._facts |= found
+
+    def due(self) -> Iterator[ObservedProcess]:
+        """Yield the processes that are to begin now."""
+        now, left = now_ns(), []
+        for waiting in self._waiting:
+            child, rule, since_ns = waiting
+            if self.unmet(rule):
+                left.append((child, rule, now))
+            elif now - since_ns >= rule.delay_ns:
+                yield child
+            else:
+                left.append(waiting)
+        self._waiting = left
+
+    def unmet(self, rule: StartRule) -> list[str]:
+        """Return what of a rule has not come true."""
+        wanted = [
+            (what, getattr(rule, what)) for what in ("topic", "service", "node", "started", "ended")
+        ]
+        with self._lock:
+            return [what for what, name in wanted if name and (what, name) not in self._facts]
+
+    def missed(self) -> list[tuple[str, list[str]]]:
+        """Return the keys of the entries that have not begun, and what they waited for."""
+        return [(child.what.key, self.unmet(rule)) for child, rule, _ in self._waiting]
+
 
 # What several processes have done, in the order in which it began.
 #

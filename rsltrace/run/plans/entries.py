@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.entry import JobEntry, StartRule, TypedInput, ros_a
 from rsltrace.adapters.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
-from rsltrace.job.start_order import entry_meant
+from rsltrace.job.job import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import MainFinder

@@ -26,8 +26,7 @@ from rsltrace.adapters.rclpy.messages.message_spec import (
 )
 from rsltrace.errors import BagError, did_you_mean
 from rsltrace.job import Job, locate
-from rsltrace.job.parts.fault import FaultSpec
-from rsltrace.job.values.field_path import Step, field_steps, number_of
+from rsltrace.job.parts.fault import FaultSpec, Step, field_steps, number_of
 from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 
 if TYPE_CHECKING:

@@ -21,17 +21,18 @@ from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import CODE_READERS, show_original
 from rsltrace.guard.virtual.randomness import seed_shared_generator
 from rsltrace.guard.virtual.third_party_libraries import (
+    CFFI_LOADER,
     PYTEST_REWRITER,
     TORCH_COMPILER,
     TorchStreams,
     one_tbb_thread,
     plain_in_graphs,
     pygame_clock,
+    report_cffi_functions,
     rewrite_in_pytest,
     torch_streams,
 )
 from rsltrace.guard.virtual.user_modules import user_modules
-from rsltrace.guard.watched.cffi_libraries import CFFI_LOADER, report_cffi_functions
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.simulation.middleware.events.event import CurrentEvent
 from rsltrace.simulation.middleware.events.observer import EventCall, EventObserver, ObserverOrder

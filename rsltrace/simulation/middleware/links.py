@@ -23,8 +23,7 @@ from rsltrace.simulation.middleware.entity import DomainEntity, Receiver
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Qos, Reliability
-from rsltrace.simulation.middleware.qos.status import MESSAGE_LOST
-from rsltrace.simulation.middleware.qos.timing import RequestedLease, finite
+from rsltrace.simulation.middleware.qos.timing import MESSAGE_LOST, RequestedLease, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT

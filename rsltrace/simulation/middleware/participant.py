@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from rsltrace.simulation.middleware.entity import DomainEntity, callback_name
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.event import ExceptionHandler, ParticipantState
-from rsltrace.simulation.middleware.qos.status import EndpointEvents
+from rsltrace.simulation.middleware.qos.timing import EndpointEvents
 from rsltrace.simulation.middleware.timer import Timer
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT

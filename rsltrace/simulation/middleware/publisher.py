@@ -12,8 +12,7 @@ from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, TopicFaults
 from rsltrace.simulation.middleware.links import Network, PublisherLink
 from rsltrace.simulation.middleware.qos.policies import Durability, Qos, Reliability
-from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import OfferedQosTimers, finite
+from rsltrace.simulation.middleware.qos.timing import EndpointEvents, OfferedQosTimers, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64

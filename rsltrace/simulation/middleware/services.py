@@ -106,7 +106,6 @@ class Service(ServiceEndpoint):
         self.callback = callback
 
     def dispatch(self) -> None:
-        """Take the oldest request, run the callback and send what it returns."""
         if not self.may_run():
             return
         data, *cause, info = self.queue.popleft()
@@ -176,7 +175,6 @@ class Client(ServiceEndpoint):
         return info.request_id
 
     def dispatch(self) -> None:
-        """Take the oldest response and call its callback."""
         if not self.may_run():
             return
         data, *cause, info = self.queue.popleft()

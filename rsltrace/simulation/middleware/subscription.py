@@ -10,8 +10,7 @@ from rsltrace.simulation.middleware.entity import DomainEntity, Receiver, callba
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType
 from rsltrace.simulation.middleware.qos.policies import Qos
-from rsltrace.simulation.middleware.qos.status import EndpointEvents
-from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, finite
+from rsltrace.simulation.middleware.qos.timing import DeadlineTimer, EndpointEvents, finite
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 
@@ -67,7 +66,6 @@ class Subscription(Receiver):
         return self.type.name
 
     def dispatch(self) -> None:
-        """Take the oldest message and run the callback with it."""
         if not self.may_run():
             return
         assert self.callback is not None

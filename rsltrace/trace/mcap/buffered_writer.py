@@ -38,11 +38,9 @@ class BufferedWriter(McapWriter):
         return self._channels
 
     def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
-        """Buffer a metadata record."""
         self._add(McapWriter.metadata, name, mapping)
 
     def attachment(self, name: str, media_type: str, data: bytes) -> None:
-        """Buffer an attachment."""
         self._add(McapWriter.attachment, name, media_type, data)
 
     def chunk(self, body: ChunkBody) -> tuple[int, int]:

@@ -39,31 +39,16 @@ class RemoteSource:
     is_remote = True
 
     def __init__(self, name: str, size: int, fetch: Fetch) -> None:
-        self._name = name
-        self._size = size
+        self.name = name
+        self.size = size
         self._fetch = fetch
         self._blocks: OrderedDict[int, bytes] = OrderedDict()
         self._whole: bytes | None = None
         self._last_end = -1
         self._in_a_row = 0
         self._ahead = 0
-        self._bytes_read = 0
+        self.bytes_read = 0
         self.requests = 0
-
-    @property
-    def name(self) -> str:
-        """The address without secrets."""
-        return self._name
-
-    @property
-    def size(self) -> int:
-        """Length in bytes when opened."""
-        return self._size
-
-    @property
-    def bytes_read(self) -> int:
-        """The number of bytes fetched so far."""
-        return self._bytes_read
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``. Raises TraceError if that fails."""
@@ -110,11 +95,11 @@ class RemoteSource:
 
     def _fetch_blocks(self, first: int, last: int) -> list[tuple[int, bytes]]:
         begin = first * BLOCK_BYTES
-        end = min(last * BLOCK_BYTES, self._size)
+        end = min(last * BLOCK_BYTES, self.size)
         self._in_a_row = self._in_a_row + 1 if begin == self._last_end else 0
         if self._in_a_row >= _IN_A_ROW:
             self._ahead = min(max(2 * self._ahead, 2 * BLOCK_BYTES), _AHEAD_BYTES_MAX)
-            end = min(max(end, begin + self._ahead), self._size)
+            end = min(max(end, begin + self._ahead), self.size)
         else:
             self._ahead = 0
         self._last_end = end
@@ -129,20 +114,20 @@ class RemoteSource:
         try:
             data = self._fetch(begin, end)
         except Exception as error:
-            raise TraceError(f"{self._name} cannot be read at offset {begin}: {error}") from None
-        self._bytes_read += len(data)
+            raise TraceError(f"{self.name} cannot be read at offset {begin}: {error}") from None
+        self.bytes_read += len(data)
         if len(data) == end - begin:
             return data
-        if len(data) == self._size:
-            if self._size > limits.RESPONSE_BYTES_MAX:
+        if len(data) == self.size:
+            if self.size > limits.RESPONSE_BYTES_MAX:
                 raise TraceError(
-                    f"the server of {self._name} sends the whole file ({self._size} bytes) instead "
+                    f"the server of {self.name} sends the whole file ({self.size} bytes) instead "
                     "of the range asked for; download it and compare the copy"
                 )
             self._whole = data
             return data[begin:end]
         raise TraceError(
-            f"{self._name} became shorter or longer while it was read ({len(data)} bytes at offset "
+            f"{self.name} became shorter or longer while it was read ({len(data)} bytes at offset "
             f"{begin} instead of {end - begin}); try again"
         )
 

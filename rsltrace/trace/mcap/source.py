@@ -49,27 +49,14 @@ def redacted(text: str, address: str) -> str:
 
 
 class ByteSource(Protocol):
-    """Random access to unchanging bytes. ``name`` is used in error messages."""
+    """Random access to ``size`` unchanging bytes, of which ``bytes_read`` have been fetched from
+    storage so far. ``is_remote``: reading all of it takes long."""
 
-    @property
-    def name(self) -> str:
-        """A path, or an address without secrets."""
-        ...
-
-    @property
-    def size(self) -> int:
-        """Length in bytes."""
-        ...
-
-    @property
-    def bytes_read(self) -> int:
-        """The number of bytes fetched from storage so far."""
-        ...
-
-    @property
-    def is_remote(self) -> bool:
-        """Whether reading all of it takes long."""
-        ...
+    name: str
+    """A path, or an address without secrets, for error messages."""
+    size: int
+    bytes_read: int
+    is_remote: bool
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return exactly ``length`` bytes from ``offset``, or raise an error."""
@@ -97,10 +84,10 @@ class FileSource:
 
     def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
         """Open ``path``. Raises ``error``, as all methods do, if it cannot be read."""
-        self._path = path
+        self.name = str(path)
         self._error = error
         self._lock = threading.Lock()
-        self._bytes_read = 0
+        self.bytes_read = 0
         try:
             kind = not_regular(path)
             if kind == "a folder":
@@ -114,22 +101,7 @@ class FileSource:
             raise error(f"{path} does not exist") from reason
         except OSError as reason:
             raise error(f"{path} cannot be read: {reason.strerror or reason}") from reason
-        self._size = os.fstat(self._file.fileno()).st_size
-
-    @property
-    def name(self) -> str:
-        """The path as it was given."""
-        return str(self._path)
-
-    @property
-    def size(self) -> int:
-        """Length in bytes when opened."""
-        return self._size
-
-    @property
-    def bytes_read(self) -> int:
-        """The number of bytes read so far."""
-        return self._bytes_read
+        self.size = os.fstat(self._file.fileno()).st_size
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``."""
@@ -139,15 +111,14 @@ class FileSource:
             data = self._read(offset, length)
         except (OSError, ValueError) as reason:
             raise self._error(
-                f"{self._path} cannot be read at offset {offset}: {reason}"
+                f"{self.name} cannot be read at offset {offset}: {reason}"
             ) from reason
-        self._bytes_read += len(data)
+        self.bytes_read += len(data)
         if len(data) < length:
-            raise self._error(f"{self._path} became shorter while it was read; open it again")
+            raise self._error(f"{self.name} became shorter while it was read; open it again")
         return data
 
     def close(self) -> None:
-        """Close the file."""
         self._file.close()
 
     def _read(self, offset: int, length: int) -> bytes:
@@ -174,3 +145,25 @@ def _folder_hint(path: Path) -> str:
             "it holds a rosbag2 recording; a trace is one .mcap file that `rsltrace record` wrote"
         )
     return "name the .mcap file in it"
+
+
+# Opening what a trace is read from: a file, or an address.
+
+
+_ADDRESS_AS_PATH = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:/")
+"""A path has one slash where an address has two; drives of Windows have one letter."""
+
+
+def open_source(place: Path | str) -> ByteSource:
+    """Open a file, or an address such as ``https://…`` or ``s3://…``. Raises TraceError.
+
+    Raises SetupError for an address if fsspec is not installed.
+    """
+    if isinstance(place, str) and "://" in place:
+        from rsltrace.trace.mcap.remote import open_remote  # a library that local files do not need
+
+        return open_remote(place)
+    if _ADDRESS_AS_PATH.match(str(place)) and not Path(place).exists():
+        address = public_address(str(place).replace(":/", "://", 1))
+        raise TraceError(f"{address} is an address, which only `rsltrace diff` reads; download it")
+    return FileSource(Path(place))

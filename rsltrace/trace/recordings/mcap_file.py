@@ -321,7 +321,6 @@ class McapFile:
         self.cut_off = self._index.cut_off
 
     def close(self) -> None:
-        """Close the file."""
         self._closed = True
         self._source.close()
 

@@ -50,7 +50,6 @@ class SqliteFile:
             raise
 
     def close(self) -> None:
-        """Close the file."""
         self._db.close()
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:

@@ -9,8 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from rsltrace.trace.tables.rows import TableInput, entity_table, event_table, output_table
-from rsltrace.trace.tables.table import TraceTable
+from rsltrace.trace.tables.rows import (
+    TableInput,
+    TraceTable,
+    entity_table,
+    event_table,
+    output_table,
+)
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder

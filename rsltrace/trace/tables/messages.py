@@ -16,8 +16,13 @@ from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import NO_FIELD
-from rsltrace.trace.tables.rows import TableInput, TextDictionary, node_names, whole_numbers
-from rsltrace.trace.tables.table import TraceTable
+from rsltrace.trace.tables.rows import (
+    TableInput,
+    TextDictionary,
+    TraceTable,
+    node_names,
+    whole_numbers,
+)
 
 _ROWS_PER_BATCH = 4096
 _BYTES_PER_BATCH = 16 << 20

@@ -35,7 +35,6 @@ class UnlessCondition(IfCondition):
     """Holds if a text is false."""
 
     def evaluate(self, context: LaunchContext) -> bool:
-        """Return whether it is false."""
         return not super().evaluate(context)
 
 
@@ -47,7 +46,6 @@ class LaunchConfigurationEquals(Condition):
         self._name, self._expected = launch_configuration_name, expected_value
 
     def evaluate(self, context: LaunchContext) -> bool:
-        """Return whether it has."""
         value = context.launch_configurations.get(self._name)
         return value == context.optional(self._expected)
 
@@ -56,7 +54,6 @@ class LaunchConfigurationNotEquals(LaunchConfigurationEquals):
     """Holds if a launch argument has another value."""
 
     def evaluate(self, context: LaunchContext) -> bool:
-        """Return whether it has."""
         return not super().evaluate(context)
 
 
@@ -124,7 +121,6 @@ class OpaqueFunction(Action):
         self._kwargs = dict(kwargs or {})
 
     def execute(self, context: LaunchContext) -> Any:
-        """Call the function."""
         return self._function(context, *self._args, **self._kwargs)
 
 
@@ -135,7 +131,6 @@ class OpaqueCoroutine(Action):
         super().__init__(condition=options.get("condition"))
 
     def execute(self, context: LaunchContext) -> None:
-        """Note that it cannot be simulated."""
         why = "it runs beside processes, which there are none of"
         context.refuse(self.where, "OpaqueCoroutine", why)
 
@@ -150,7 +145,6 @@ class TimerAction(Action):
         self._actions = list(actions)
 
     def inside(self) -> Iterable[Any]:
-        """Give its actions."""
         return self._actions
 
     def execute(self, context: LaunchContext) -> None:

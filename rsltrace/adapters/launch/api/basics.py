@@ -47,11 +47,9 @@ class TextSubstitution(Substitution):
         self.text = text
 
     def describe(self) -> str:
-        """Return the text."""
         return self.text
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text."""
         return self.text
 
 
@@ -255,7 +253,6 @@ class LaunchDescription(LaunchDescriptionEntity):
     add_entity = add_action
 
     def inside(self) -> Iterable[Any]:
-        """Give its entities."""
         return self.entities
 
     def visit(self, context: LaunchContext) -> None:

@@ -82,7 +82,6 @@ class OnShutdown(EventHandler):
     """What is done at the end: nothing of it is part of a run."""
 
     def register(self, context: LaunchContext, where: str) -> None:
-        """Say so."""
         context.launched.ignored.append(
             f"{where}: OnShutdown: a run is over when it ends; nothing starts then"
         )
@@ -198,7 +197,6 @@ class RegisterEventHandler(Action):
         self._handler = event_handler
 
     def execute(self, context: LaunchContext) -> None:
-        """Register it."""
         if not isinstance(self._handler, EventHandler):
             raise TypeError(f"an event handler is needed, not {type(self._handler).__name__}")
         self._handler.register(context, self.where)
@@ -211,7 +209,6 @@ class UnregisterEventHandler(Action):
         super().__init__(**options)
 
     def execute(self, context: LaunchContext) -> None:
-        """Note that it cannot be simulated."""
         context.refuse(self.where, "UnregisterEventHandler", "event handlers stay as they are here")
 
 

@@ -65,7 +65,6 @@ class RewrittenYaml(_FileSubstitution):
         self._convert = convert_types
 
     def perform(self, context: LaunchContext) -> str:
-        """Write the copy and return its path."""
         tree = self._tree(context)
         texts = {old: context.text(new) for old, new in self._texts.items()}
         values = {name: context.text(value) for name, value in self._values.items()}
@@ -139,7 +138,6 @@ class HasNodeParams(_FileSubstitution):
         self._node_name = node_name
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``True`` or ``False``."""
         return str(self._node_name in self._tree(context))
 
 
@@ -150,7 +148,6 @@ class LaunchConfigAsBool(Substitution):
         self._name = name
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``True`` or ``False``."""
         value = context.launch_configurations.get(self._name, "")
         yes = value.strip().lower()
         return str(yes in ("yes", "on", "t", "y") or (yes != "" and _is_true(yes)))

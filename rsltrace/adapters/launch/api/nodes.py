@@ -90,7 +90,6 @@ class ExecuteProcess(ExecuteLocal):
         self.cmd = [as_substitutions(word) for word in cmd]
 
     def execute(self, context: LaunchContext) -> None:
-        """Note that it cannot be simulated."""
         why = "other programs do not run in a simulation"
         try:
             words = " ".join(context.text(word) for word in self.cmd)
@@ -126,7 +125,6 @@ class Node(ExecuteLocal):
         self._values: dict[str, Any] = {}
 
     def execute(self, context: LaunchContext) -> None:
-        """Note the node."""
         self._note(context)
 
     def _note(self, context: LaunchContext, *, is_container: bool = False) -> None:
@@ -166,7 +164,6 @@ class LifecycleNode(Node):
         self._autostart = autostart
 
     def execute(self, context: LaunchContext) -> None:
-        """Note the node."""
         super().execute(context)
         if self._package is not None and context.flag(self._autostart):
             context.refuse(
@@ -286,7 +283,6 @@ class ComposableNodeContainer(Node):
         self._components = list(composable_node_descriptions or ())
 
     def execute(self, context: LaunchContext) -> None:
-        """Note it and its components."""
         self._note(context, is_container=True)
         for component in self._components:
             component.note(context, self.full_name(context))
@@ -312,7 +308,6 @@ class LoadComposableNodes(Action):
         self._target = target_container
 
     def execute(self, context: LaunchContext) -> None:
-        """Note the components."""
         target = self._target
         if isinstance(target, ComposableNodeContainer):
             container = target.full_name(context)

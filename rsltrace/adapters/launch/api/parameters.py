@@ -59,7 +59,6 @@ class ParameterFile:
         self.param_file, self.allow_substs = as_substitutions(param_file), allow_substs
 
     def evaluate(self, context: LaunchContext) -> Path:
-        """Return its path."""
         return Path(context.text(self.param_file))
 
     def found(

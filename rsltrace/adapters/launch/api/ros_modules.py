@@ -166,7 +166,6 @@ class _LaunchModuleFinder(importlib.abc.MetaPathFinder, importlib.abc.Loader):
         return importlib.machinery.ModuleSpec(name, self, is_package=True)
 
     def create_module(self, spec: importlib.machinery.ModuleSpec) -> ModuleType:
-        """Return the module."""
         return _LaunchModule(spec.name, "A stand-in of rsltrace for a module of ROS's launch.")
 
     def exec_module(self, module: ModuleType) -> None:

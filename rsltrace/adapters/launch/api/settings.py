@@ -77,7 +77,6 @@ class SetLaunchConfiguration(Action):
         self._name, self._value = as_substitutions(name), as_substitutions(value)
 
     def execute(self, context: LaunchContext) -> None:
-        """Set it."""
         context.launch_configurations[context.text(self._name)] = context.text(self._value)
 
 
@@ -89,7 +88,6 @@ class UnsetLaunchConfiguration(Action):
         self._name = as_substitutions(name)
 
     def execute(self, context: LaunchContext) -> None:
-        """Take it away."""
         context.launch_configurations.pop(context.text(self._name), None)
 
 
@@ -128,7 +126,6 @@ class SetEnvironmentVariable(_EnvironmentAction):
         self.value = as_substitutions(value)
 
     def execute(self, context: LaunchContext) -> None:
-        """Set it."""
         context.environment[self._note(context)] = context.text(self.value)
 
 
@@ -148,7 +145,6 @@ class AppendEnvironmentVariable(_EnvironmentAction):
         self.value, self.prepend, self.separator = as_substitutions(value), prepend, separator
 
     def execute(self, context: LaunchContext) -> None:
-        """Append, or prepend."""
         name = self._note(context)
         parts = [context.text(self.value)]
         if name in context.environment:
@@ -162,7 +158,6 @@ class UnsetEnvironmentVariable(_EnvironmentAction):
     """Takes away an environment variable."""
 
     def execute(self, context: LaunchContext) -> None:
-        """Take it away."""
         context.environment.pop(self._note(context), None)
 
 
@@ -170,7 +165,6 @@ class ResetEnvironment(Action):
     """Restores the environment that the launch file found."""
 
     def execute(self, context: LaunchContext) -> None:
-        """Restore it."""
         context.environment.clear()
         context.environment.update(context.first_environment)
 
@@ -193,7 +187,6 @@ class GroupAction(Action):
         self._kept = dict(launch_configurations or {})
 
     def inside(self) -> Iterable[Any]:
-        """Give its actions."""
         return self._actions
 
     def execute(self, context: LaunchContext) -> Any:
@@ -219,7 +212,6 @@ class PushRosNamespace(Action):
         self._namespace = as_substitutions(namespace)
 
     def execute(self, context: LaunchContext) -> None:
-        """Go into the namespace."""
         scope = context.scope
         scope.namespace = joined_namespace(scope.namespace, context.text(self._namespace)) or "/"
 
@@ -232,7 +224,6 @@ class SetParameter(Action):
         self._name, self._value = as_substitutions(name), value
 
     def execute(self, context: LaunchContext) -> None:
-        """Give it."""
         value = plain_value(context, self._value, "SetParameter")
         context.scope.parameters += ({context.text(self._name): value},)
 
@@ -257,7 +248,6 @@ class SetParametersFromFile(Action):
         self._file = ParameterFile(filename, allow_substs=allow_substs)
 
     def execute(self, context: LaunchContext) -> None:
-        """Give them."""
         context.scope.parameters += (self._file.found(context, None),)
 
 
@@ -269,7 +259,6 @@ class SetRemap(Action):
         self._src, self._dst = as_substitutions(src), as_substitutions(dst)
 
     def execute(self, context: LaunchContext) -> None:
-        """Remap it."""
         pair = (context.text(self._src), context.text(self._dst))
         context.scope.remappings += (pair,)
 

@@ -47,11 +47,9 @@ class LaunchConfiguration(Substitution):
         self._default = None if default is None else _default(default)
 
     def describe(self) -> str:
-        """Return how XML would have it."""
         return f"$(var {''.join(part.describe() for part in self.variable_name)})"
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the value, or the default."""
         name = context.text(self.variable_name)
         value = context.launch_configurations.get(name)
         if value is not None:
@@ -81,11 +79,9 @@ class EnvironmentVariable(Substitution):
         self._default = default_value
 
     def describe(self) -> str:
-        """Return how XML would have it."""
         return f"$(env {''.join(part.describe() for part in self.name)})"
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the value, or the default."""
         name = context.text(self.name)
         value = context.environment.get(name)
         if value is not None:
@@ -104,11 +100,9 @@ class PathJoinSubstitution(Substitution):
         self.substitutions = [as_substitutions(part) for part in substitutions]
 
     def describe(self) -> str:
-        """Return the parts as they are written."""
         return "/".join("".join(p.describe() for p in part) for part in self.substitutions)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the path."""
         return os.path.join(*(context.text(part) for part in self.substitutions))
 
     def __truediv__(self, other: Any) -> PathJoinSubstitution:
@@ -130,7 +124,6 @@ class StringJoinSubstitution(Substitution):
         self.delimiter = as_substitutions(delimiter)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the joined text."""
         return context.text(self.delimiter).join(map(context.text, self.substitutions))
 
 
@@ -166,7 +159,6 @@ class Command(Substitution):
         self.on_stderr = as_substitutions(on_stderr)
 
     def perform(self, context: LaunchContext) -> str:
-        """Run the command and return its output."""
         text = context.text(self.command)
         words = shlex.split(text)
         if not words:
@@ -204,7 +196,6 @@ class FindExecutable(Substitution):
         self.name = as_substitutions(name)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the path."""
         name = context.text(self.name)
         path = find_program(name)
         if path is None:
@@ -220,7 +211,6 @@ class FileContent(Substitution):
         self.path = as_substitutions(path)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the text."""
         path = context.text(self.path)
         try:
             return read_regular(Path(path)).decode()
@@ -232,7 +222,6 @@ class ThisLaunchFile(Substitution):
     """The path of the launch file being read."""
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the path."""
         return str(context.file)
 
 
@@ -240,7 +229,6 @@ class ThisLaunchFileDir(Substitution):
     """The folder of the launch file being read."""
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the folder."""
         return str(context.file.parent)
 
     def __truediv__(self, other: Any) -> PathJoinSubstitution:
@@ -265,7 +253,6 @@ class EqualsSubstitution(Substitution):
         self.left, self.right = as_substitutions(_operand(left)), as_substitutions(_operand(right))
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``true`` or ``false``."""
         return _word(equal_texts(context.text(self.left), context.text(self.right)))
 
 
@@ -273,7 +260,6 @@ class NotEqualsSubstitution(EqualsSubstitution):
     """``true`` if two texts are not equal."""
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``true`` or ``false``."""
         return _word(not equal_texts(context.text(self.left), context.text(self.right)))
 
 
@@ -284,7 +270,6 @@ class NotSubstitution(Substitution):
         self.value = as_substitutions(value)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``true`` or ``false``."""
         return _word(not truth(context.text(self.value)))
 
 
@@ -295,7 +280,6 @@ class AllSubstitution(Substitution):
         self.values = [as_substitutions(value) for value in values]
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``true`` or ``false``."""
         return _word(all(truth(context.text(value)) for value in self.values))
 
 
@@ -303,7 +287,6 @@ class AnySubstitution(AllSubstitution):
     """``true`` if one of the values is."""
 
     def perform(self, context: LaunchContext) -> str:
-        """Return ``true`` or ``false``."""
         return _word(any(truth(context.text(value)) for value in self.values))
 
 
@@ -329,7 +312,6 @@ class IfElseSubstitution(Substitution):
         self.if_value, self.else_value = as_substitutions(if_value), as_substitutions(else_value)
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the value."""
         return context.text(
             self.if_value if truth(context.text(self.condition)) else self.else_value
         )
@@ -342,11 +324,9 @@ class FindPackagePrefix(Substitution):
         self.package = as_substitutions(package)
 
     def describe(self) -> str:
-        """Return how XML would have it."""
         return f"$(find-pkg-prefix {''.join(part.describe() for part in self.package)})"
 
     def perform(self, context: LaunchContext) -> str:
-        """Return the prefix."""
         return self.find(context.text(self.package))
 
     def find(self, package_name: str) -> str:
@@ -361,11 +341,9 @@ class FindPackageShare(FindPackagePrefix):
     """The ``share`` folder of a package."""
 
     def describe(self) -> str:
-        """Return how XML would have it."""
         return f"$(find-pkg-share {''.join(part.describe() for part in self.package)})"
 
     def find(self, package_name: str) -> str:
-        """Return the folder of any package."""
         return share_of(package_name)
 
 

@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from rsltrace.adapters.rclpy.actions.action_handle import GoalHandle
-from rsltrace.adapters.rclpy.actions.client import ActionClientHandle
+from rsltrace.adapters.rclpy.actions.action_handle import ActionClientHandle, GoalHandle
 from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
@@ -38,7 +37,7 @@ from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
-from rsltrace.simulation.middleware.qos.status import (
+from rsltrace.simulation.middleware.qos.timing import (
     CountStatus,
     IncompatibleQosStatus,
     LivelinessChangedStatus,

@@ -9,17 +9,17 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
 from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
 from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
-from rsltrace.adapters.rclpy.handles.filters import filter_detail
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import message_type
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.entity import callback_name
+from rsltrace.simulation.middleware.interface import callback_source
 from rsltrace.simulation.middleware.participant import QosEvent
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.simulation.middleware.qos.policies import Qos
-from rsltrace.simulation.middleware.qos.status import (
+from rsltrace.simulation.middleware.qos.timing import (
     DEADLINE_MISSED,
     INCOMPATIBLE,
     LIVELINESS_CHANGED,
@@ -37,6 +37,24 @@ from rsltrace.simulation.middleware.subscription import (
     Subscription,
 )
 from rsltrace.trace.model.event import EventKind
+
+# Which callback stands behind a subscription of ROS's message_filters.
+
+
+def filter_detail(callback: object) -> dict[str, object]:
+    """Return the synchronizer's callback and how far apart stamps may be, if ``callback`` is that
+    of a ``message_filters.Subscriber`` which is an input of a synchronizer."""
+    subscriber = getattr(callback, "__self__", None)
+    if type(subscriber).__module__.partition(".")[0] != "message_filters":
+        return {}
+    for add, *_ in getattr(subscriber, "callbacks", {}).values():
+        synchronizer: Any = getattr(add, "__self__", None)
+        if hasattr(synchronizer, "input_connections") and synchronizer.callbacks:
+            function = next(iter(synchronizer.callbacks.values()))[0]
+            slop_ns = getattr(getattr(synchronizer, "slop", None), "nanoseconds", 0)
+            name, source = callback_name(function), callback_source(function)
+            return {"filter": {"callback": name, "source": source, "slop_ns": slop_ns}}
+    return {}
 
 
 class PublisherHandle(EntityHandle, Publisher):

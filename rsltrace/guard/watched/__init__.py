@@ -1,1 +1,0 @@
-"""Libraries whose calls the guard can only report."""
