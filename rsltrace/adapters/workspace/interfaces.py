@@ -173,6 +173,9 @@ class InterfaceMaker:
             where = f"{path}:{line}"
             maker = self._maker_of(package or self._package.name, where)
             if maker is None:
+                share = _installed_share(package)
+                if share is not None and not any((share / "msg").glob(f"{name}.*")):
+                    raise JobError(_no_such_type(package, package, name), where=where)
                 continue
             found = next(
                 (f for f in maker._package.interfaces if (f.suffix, f.stem) == (".msg", name)), None
