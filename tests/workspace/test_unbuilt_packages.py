@@ -122,6 +122,7 @@ def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         folder = tmp_path_factory.mktemp("cache")
         patch.setenv("XDG_CACHE_HOME", str(folder))
         patch.delenv("AMENT_PREFIX_PATH", raising=False)
+        patch.setattr(interfaces, "_TOLD_EVERY_S", float("inf"))
         cache._root.cache_clear()
         yield folder
     cache._root.cache_clear()
@@ -234,7 +235,10 @@ def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("float6 x\n", r"msg/Odd\.msg: rosidl cannot read it: 'float6' is an"),
+        ("int8 y\nfloat6 x\n", r"msg/Odd\.msg:2: rosidl cannot .* 'float6' is not a type of ROS 2"),
+        ("# late\nint8\n", r"msg/Odd\.msg:2: .* 'int8' has no name: write a type and a name"),
+        ("std_msgs/msg/Bool x\n", r"msg/Odd\.msg:1: .* 'std_msgs/msg/Bool' .*: write package/Name"),
+        ("std_msgs/Time at\n", r"msg/Odd\.msg:1: there is no Time\.msg in the package 'std_msgs'"),
         ("\nmoon_msgs/Rock rock\n", r"msg/Odd\.msg:2: it uses types of .*'moon_msgs'"),
         (
             "# late\nbool x\nduration wait  # s\n",

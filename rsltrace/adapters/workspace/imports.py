@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.adapters.workspace.bundled import BUNDLED, bundled_packages
 from rsltrace.errors import SetupError
 from rsltrace.guard.guard import engage
 from rsltrace.trace.model.module_search import is_beside_package_xml
@@ -32,7 +33,8 @@ _SUPPORT = "_s__rosidl_typesupport_c"
 
 
 class UnbuiltWorkspace:
-    """The packages in and below some folders, as far as they have not been built."""
+    """The packages in and below some folders, as far as they have not been built, and those whose
+    interfaces are bundled with rsltrace."""
 
     def __init__(self, folders: Sequence[Path], *, native: bool = False) -> None:
         """``native``: their interfaces go to ROS's middleware, which needs them compiled."""
@@ -57,14 +59,16 @@ class UnbuiltWorkspace:
     def interfaces(self, name: str) -> InterfaceMaker | None:
         """Return what makes the classes of a package; None if it has none."""
         package = self.packages.get(name)
-        if package is None or not package.interfaces:
+        if name not in BUNDLED and (package is None or not package.interfaces):
             return None
         with engage(None):
             if self._makers is None:
                 from rsltrace.adapters.workspace.interfaces import interface_makers
 
-                self._makers = interface_makers(self.packages)
-            maker = self._makers[name]
+                self._makers = interface_makers({**bundled_packages(), **self.packages})
+            maker = self._makers.get(name)
+            if maker is None:
+                return None
             _ = maker.prefix  # which is laid out now
         self.made.add(name)
         return maker
@@ -90,10 +94,15 @@ class UnbuiltWorkspace:
         """Raise SetupError if the interfaces of a package have to be compiled, which is not one
         that was built."""
         if self._native and name in self.made:
+            if name in self.packages:
+                text = f"{name} in {self.packages[name].folder} has not been built"
+                what = "build"
+            else:
+                text = f"{name} is not installed: rsltrace only has its definitions"
+                what = "install"
             raise SetupError(
-                f"{name} in {self.packages[name].folder} has not been built, and its interfaces "
-                "cannot go over DDS as they are: build the package and source its workspace, or "
-                "record without --native"
+                f"{text}, and its interfaces cannot go over DDS as they are: {what} the package "
+                "and source its workspace, or record without --native"
             )
 
     def shadows(self, name: str) -> bool:

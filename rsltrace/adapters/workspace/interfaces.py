@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import redirect_stderr, suppress
 from functools import cached_property
 from importlib import metadata
@@ -22,6 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from rsltrace.adapters.workspace.bundled import BUNDLED, is_bundled
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.adapters.workspace.generate import READY
 from rsltrace.errors import JobError, SetupError
@@ -154,7 +155,8 @@ class InterfaceMaker:
             names = [stem for stem in stems if any(file.stem == stem for _, file in needed)]
             more = f" and {len(names) - _NAMED_MAX} more" if len(names) > _NAMED_MAX else ""
             name = f"{self._package.name}/{kind}/{', '.join(names[:_NAMED_MAX])}{more}"
-            _generate(name, _order(needed), uses=len(needed) - len(names))
+            bundled = {m._package.name for m in needed.values() if is_bundled(m._package)}
+            _generate(name, _order(needed), uses=len(needed) - len(names), bundled=sorted(bundled))
 
     def _collect(
         self,
@@ -171,6 +173,9 @@ class InterfaceMaker:
             where = f"{path}:{line}"
             maker = self._maker_of(package or self._package.name, where)
             if maker is None:
+                share = _installed_share(package)
+                if share is not None and not any((share / "msg").glob(f"{name}.*")):
+                    raise JobError(_no_such_type(package, package, name), where=where)
                 continue
             found = next(
                 (f for f in maker._package.interfaces if (f.suffix, f.stem) == (".msg", name)), None
@@ -275,10 +280,11 @@ def _versions() -> str:
     return " ".join(found)
 
 
-def _generate(name: str, order: dict[str, Any], *, uses: int) -> None:
+def _generate(name: str, order: dict[str, Any], *, uses: int, bundled: Sequence[str] = ()) -> None:
     """Have rosidl make what the order says, in a process of its own; what is ready is kept.
 
-    ``name`` is what somebody wants, ``uses`` how many interfaces more that takes.
+    ``name`` is what somebody wants, ``uses`` how many interfaces more that takes, ``bundled`` the
+    packages whose definitions are rsltrace's own.
     """
     missing = [module for module in _NEEDED if find_spec(module) is None]
     templates = _templates()
@@ -289,7 +295,9 @@ def _generate(name: str, order: dict[str, Any], *, uses: int) -> None:
             "pip install ros-jazzy-common-interfaces, or source a ROS 2 that has rosidl"
         )
     more = f", and of what that uses (interface files: {uses})" if uses else ""
-    _tell(f"making Python classes of {name}{more}, once")
+    own = ", ".join(f"{package} {BUNDLED[package]}" for package in bundled)
+    source = f"; from rsltrace's own definitions of ROS 2 Jazzy: {own}" if own else ""
+    _tell(f"making Python classes of {name}{more}, once{source}")
     with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as given:
         json.dump({**order, "templates": str(templates)}, given)
         given.seek(0)

@@ -105,8 +105,9 @@ def _prefixes(package: str) -> Iterator[Path]:
     # First the prefix of the class: an overlay's definition may differ.
     spec = find_spec(package)
     for location in (spec.submodule_search_locations or []) if spec is not None else []:
-        # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper
-        yield from list(Path(location).parents)[2:5]
+        # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper; of packages that
+        # are not built: <prefix>/site-packages/<package>
+        yield from list(Path(location).parents)[1:5]
     for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         if entry:
             yield Path(entry)
