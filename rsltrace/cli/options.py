@@ -48,6 +48,6 @@ history_option = click.option(
     "--history",
     metavar="PLACE",
     envvar="RSLTRACE_HISTORY",
-    help="Append a line on this run to a file, or put it as a file of its own into a folder or at an "
-    'address (s3://…). "rsltrace history" reads them. Default: $RSLTRACE_HISTORY.',
+    help="Append a line on this run to a file, or put it as a file of its own into a folder or "
+    'at an address (s3://…). "rsltrace history" reads them. Default: $RSLTRACE_HISTORY.',
 )

@@ -34,11 +34,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         action="store_true",
         help="write the golden traces of rsltrace anew instead of comparing with them",
     )
-    where = (
-        "a file, folder or address that gets a line on each comparison with a golden trace, for "
-    )
-    group.addoption("--rsltrace-history", metavar="PLACE", help=f"{where}rsltrace history")
-    parser.addini("rsltrace_history", f"{where}rsltrace history", default="")
+    what = "append a line on each comparison with a golden trace to this file, folder or address"
+    group.addoption("--rsltrace-history", metavar="PLACE", help=f"{what} (see rsltrace history)")
+    parser.addini("rsltrace_history", what, default="")
 
 
 def pytest_configure(config: pytest.Config) -> None:

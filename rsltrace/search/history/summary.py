@@ -25,7 +25,7 @@ from rsltrace.trace.mcap.open import open_source
 from rsltrace.trace.mcap.remote import filesystem_of
 from rsltrace.trace.mcap.source import ByteSource, public_address, redacted
 
-SHOWN_MAX = 200
+SHOWN_MAX = 100
 """The most jobs, and the most changes, that a summary has."""
 COMMITS_MAX = 40
 _PIECE = 1 << 20
@@ -56,8 +56,8 @@ class DigestChange:
 
 @dataclass(slots=True)
 class JobHistory:
-    """The runs of a job. ``orders`` were tried by searches; the ``last_…`` are of the last run that
-    did not pass, ``changes`` counts the changes of its digest."""
+    """The runs of a job. ``orders`` were tried by searches, ``changes`` counts the changes of its
+    digest; the ``last_…`` are of the last run that failed, ``fails_now`` if no later one passed."""
 
     job: str
     runs: int = 0
@@ -69,6 +69,8 @@ class JobHistory:
     last_time: str = ""
     last_commit: str = ""
     last_reason: str = ""
+    fails_now: bool = False
+    newest: str = ""
 
     def add(self, run: RunRecord) -> None:
         """Count a run."""
@@ -77,7 +79,10 @@ class JobHistory:
         if run.by == "explore":
             self.orders += run.runs
             self.orders_failed += run.failed
-        if run.verdict != "passed":
+        fails = run.verdict != "passed"
+        if run.time >= self.newest:
+            self.newest, self.fails_now = run.time, fails
+        if fails:
             self.failed += 1
             if run.time >= self.last_time:
                 self.last_time, self.last_commit = run.time, run.commit
@@ -103,7 +108,10 @@ class HistorySummary:
     first: str
     last: str
     skipped: int
+    failed: int
+    orders: int
     jobs_count: int
+    jobs_failing_now: int
     commits_count: int
     changes_count: int
     changes: Sequence[DigestChange]
@@ -184,7 +192,10 @@ class _Table:
             len(times),
             *((_time_text(times.min()), _time_text(times.max())) if len(times) else ("", "")),
             skipped,
+            sum(self._fails),
+            sum(one.orders for one in self._jobs.values()),
             len(self._jobs),
+            sum(one.fails_now for one in self._jobs.values()),
             len(in_time),
             len(after),
             [

@@ -74,7 +74,7 @@ def job_cells(one: JobHistory) -> tuple[str, ...]:
         shortened(printable(one.job), _TEXT_MAX),
         f"{one.failed:,} of {counted(one.runs, 'run')} ({share(one.failed, one.runs)})",
         orders,
-        f"last at {commit_text(one.last_commit)}, {one.last_time[:10]}",
+        f"last at {commit_text(one.last_commit)}, {one.last_time[:10]}{', still' * one.fails_now}",
         shortened(printable(one.last_reason), _TEXT_MAX),
     )
 
@@ -87,9 +87,8 @@ def share(part: int, whole: int) -> str:
 def commit_text(commit: str) -> str:
     """Return a commit in short."""
     oid, dash, rest = commit.partition("-")
-    return (
-        printable(shortened(f"{oid[:_COMMIT_DIGITS]}{dash}{rest}", 2 * _COMMIT_DIGITS)) or "unknown"
-    )
+    short = shortened(f"{oid[:_COMMIT_DIGITS]}{dash}{rest}", 2 * _COMMIT_DIGITS)
+    return printable(short) or "unknown"
 
 
 def bisect_command(found: HistorySummary) -> str:

@@ -16,7 +16,6 @@ from rsltrace_viewer.pages.page import render_page
 
 def history_page(found: HistorySummary) -> str:
     """Return the page."""
-    failing = [one for one in found.jobs if one.failed]
     return render_page(
         "history.html",
         heading=summary_line(found),
@@ -24,11 +23,12 @@ def history_page(found: HistorySummary) -> str:
         found=found,
         numbers=(
             (f"{found.changes_count:,}", "changes of a digest"),
-            (f"{sum(one.failed for one in found.jobs):,}", "runs failed"),
-            (f"{sum(one.orders for one in found.jobs):,}", "orders tried"),
+            (f"{found.failed:,}", "runs failed"),
+            (f"{found.jobs_failing_now:,}", "jobs whose last run failed"),
+            (f"{found.orders:,}", "orders tried"),
         ),
         changes=[change_cells(one) for one in found.changes],
-        failing=[job_cells(one) for one in failing],
+        failing=[job_cells(one) for one in found.jobs if one.failed],
         commits=[commit_text(one) for one in found.commits],
         rows=[
             (one.job, [_cell(found.results.get((one.job, commit))) for commit in found.commits])
