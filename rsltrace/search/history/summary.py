@@ -57,7 +57,8 @@ class DigestChange:
 @dataclass(slots=True)
 class JobHistory:
     """The runs of a job. ``orders`` were tried by searches, ``changes`` counts the changes of its
-    digest; the ``last_…`` are of the last run that failed, ``fails_now`` if no later one passed."""
+    digest; the ``last_…`` are of the last run that failed. ``fails_now``: the last search failed,
+    or the last of the other runs."""
 
     job: str
     runs: int = 0
@@ -70,7 +71,6 @@ class JobHistory:
     last_commit: str = ""
     last_reason: str = ""
     fails_now: bool = False
-    newest: str = ""
 
     def add(self, run: RunRecord) -> None:
         """Count a run."""
@@ -79,10 +79,7 @@ class JobHistory:
         if run.by == "explore":
             self.orders += run.runs
             self.orders_failed += run.failed
-        fails = run.verdict != "passed"
-        if run.time >= self.newest:
-            self.newest, self.fails_now = run.time, fails
-        if fails:
+        if run.verdict != "passed":
             self.failed += 1
             if run.time >= self.last_time:
                 self.last_time, self.last_commit = run.time, run.commit
@@ -153,6 +150,7 @@ class _Table:
 
     def __init__(self) -> None:
         self._jobs: dict[str, JobHistory] = {}
+        self._newest: dict[tuple[str, bool], tuple[str, bool]] = {}
         self._series: dict[tuple[str, str], int] = {}
         self._commits: dict[str, int] = {}
         self._times, self._digest_of = array("q"), array("Q")
@@ -164,6 +162,8 @@ class _Table:
         if job is None:
             job = self._jobs[run.job] = JobHistory(run.job)
         job.add(run)
+        kind, last = (run.job, run.by == "explore"), (run.time, run.verdict != "passed")
+        self._newest[kind] = max(self._newest.get(kind, last), last)
         self._times.append(int(run.time.encode().translate(None, b"-:T.Z")))
         self._series_of.append(self._series.setdefault((run.job, run.branch), len(self._series)))
         self._commit_of.append(self._commits.setdefault(run.commit, len(self._commits)))
@@ -178,6 +178,8 @@ class _Table:
         changed = Counter((series[self._series_of[row]][0], self._commit_of[row]) for row in after)
         for (job, _), count in changed.items():
             self._jobs[job].changes += count
+        for (job, _), (_, fails) in self._newest.items():
+            self._jobs[job].fails_now |= fails
         seen, first = np.unique(commits[np.argsort(times, kind="stable")], return_index=True)
         in_time = [one for one in seen[np.argsort(first)].tolist() if names[one]]
         newest = in_time[-COMMITS_MAX:]

@@ -24,7 +24,7 @@ def history_page(found: HistorySummary) -> str:
         numbers=(
             (f"{found.changes_count:,}", "changes of a digest"),
             (f"{found.failed:,}", "runs failed"),
-            (f"{found.jobs_failing_now:,}", "jobs whose last run failed"),
+            (f"{found.jobs_failing_now:,}", "jobs that fail now"),
             (f"{found.orders:,}", "orders tried"),
         ),
         changes=[change_cells(one) for one in found.changes],
