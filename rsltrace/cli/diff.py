@@ -137,6 +137,12 @@ class Tolerance(_Type):
     help="Show whether a third trace FILE follows A, B or neither where they diverge.",
 )
 @click.option(
+    "--history",
+    metavar="PLACE",
+    help="Append a line on each B, as a run of the test with the golden trace A, to this history: "
+    'see "rsltrace history".',
+)
+@click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -158,6 +164,7 @@ def diff(
     check: bool,
     allow_truncated: bool,
     again: str | None,
+    history: str | None,
     output: Path | None,
 ) -> int:
     """Compare two traces and show where they first diverge, and why.
@@ -185,7 +192,7 @@ def diff(
         by=by,
         allow_truncated=allow_truncated,
     )
-    return _diff(golden, others, form, options, output, check=check)
+    return _diff(golden, others, form, options, output, history, check=check)
 
 
 def _diff(
@@ -194,6 +201,7 @@ def _diff(
     form: str,
     options: DiffOptions,
     output: Path | None,
+    history: str | None,
     *,
     check: bool,
 ) -> int:
@@ -204,7 +212,18 @@ def _diff(
     for other in others:
         try:
             # The golden trace is not checked again for each of the others.
-            done.append(_compare(golden, other, options, check=check, check_a=check and not done))
+            check_a = check and not done
+            if history is None:
+                done.append(_compare(golden, other, options, check=check, check_a=check_a))
+                continue
+            from rsltrace.search.history.run_record import recorded
+
+            file = Path() if "://" in golden else Path(golden)
+            with recorded(history, "diff", file, lambda path: [str(path(golden))]) as run:
+                done.append(_compare(golden, other, options, check=check, check_a=check_a))
+                run.digest = getattr(done[-1].b, "digest", "")
+                if done[-1].failed:
+                    run.fails(done[-1].sentence)
         except RsltraceError as error:
             if len(others) == 1:
                 raise

@@ -16,9 +16,11 @@ from rsltrace.cli.job_source import (
     all_overrides,
     job_options,
     job_words,
+    ros_arguments_given,
 )
+from rsltrace.cli.options import history_option
 from rsltrace.cli.record import default_output
-from rsltrace.cli.verify import handling_signals
+from rsltrace.cli.verify import JobArguments, handling_signals
 from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.regular_file import replacement_of
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
     from rsltrace.search.explore.search import Explorer, SearchBudget, TrialPool
     from rsltrace.search.explore.small.causes import ReducedFailure
     from rsltrace.search.explore.trial import JobSource, TrialResult
+    from rsltrace.search.history.run_record import RunRecord
 
 STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 _FORMAT = 1
@@ -154,6 +157,7 @@ def _fork_after(
     help="Reduce the first failing run of each cause to the fewest faults and deviations, and "
     "write a folder that reproduces it. Can be done later with --resume.",
 )
+@history_option
 @click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
 def explore(
     words: tuple[str, ...],
@@ -175,6 +179,7 @@ def explore(
     cluster: str | None,
     form: str,
     minimize: bool,
+    history: str | None,
     quiet: bool,
 ) -> int:
     """Run JOB in many callback orders and find the runs that fail.
@@ -201,45 +206,60 @@ def explore(
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
     source = JobSource(str(named), labelled, text, str(named.parent))
-    job = source.job()
-    check_texts(job)
-    check_metrics(job)
-    if strategy == "vary":
-        check_vary(source, job)
-    folder = output or default_output(named).with_suffix(".explore")
-    about = _about(source, job, strategy, seed, depth)
-    if fork_after is not None:
-        about["fork after"] = fork_after[1]
-    with handling_signals(), ResultsFolder(folder, about, resume=resume, force=force) as table:
-        chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
-        search = Explorer(
-            job,
-            chosen,
-            table,
-            budget=budget,
-            stop_at_first=stop_at_first,
-            timeout_s=timeout,
-            fork_ns=-1 if fork_after is None else fork_after[1],
-        )
-        end = _SearchReport(search, source, folder, strategy, form)
-        interrupted = False
-        with search, _pool(source, job, jobs, cluster) as pool:
-            try:
-                with _telling(search, budget, quiet=quiet) as on_result:
-                    search.run(pool, on_result)
-            except KeyboardInterrupt:
-                interrupted = True
-            except ExploreError:
-                if search.tally.runs:
-                    end.report(job)
-                raise
-    if minimize and not interrupted:
-        end.make_small(job, timeout, quiet=quiet)
-    end.report(job)
-    if interrupted:
-        tell(f"interrupted: continue with --resume; the results are in {folder}")
-        return _INTERRUPTED
-    return 1 if search.tally.failures else 0
+    given = JobArguments(words, launch, skip, overrides, None, until, False, ros_arguments_given())
+    with given.recorded(history, "explore") as record:
+        job = source.job()
+        check_texts(job)
+        check_metrics(job)
+        if strategy == "vary":
+            check_vary(source, job)
+        folder = output or default_output(named).with_suffix(".explore")
+        about = _about(source, job, strategy, seed, depth)
+        if fork_after is not None:
+            about["fork after"] = fork_after[1]
+        with handling_signals(), ResultsFolder(folder, about, resume=resume, force=force) as table:
+            chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
+            search = Explorer(
+                job,
+                chosen,
+                table,
+                budget=budget,
+                stop_at_first=stop_at_first,
+                timeout_s=timeout,
+                fork_ns=-1 if fork_after is None else fork_after[1],
+            )
+            end = _SearchReport(search, source, folder, strategy, form)
+            interrupted = False
+            with search, _pool(source, job, jobs, cluster) as pool:
+                try:
+                    with _telling(search, budget, quiet=quiet) as on_result:
+                        search.run(pool, on_result)
+                except KeyboardInterrupt:
+                    interrupted = True
+                except ExploreError:
+                    if search.tally.runs:
+                        end.report(job)
+                    raise
+        if minimize and not interrupted:
+            end.make_small(job, timeout, quiet=quiet)
+        end.report(job)
+        if interrupted:
+            record.verdict, record.reason = "error", "interrupted"
+            tell(f"interrupted: continue with --resume; the results are in {folder}")
+            return _INTERRUPTED
+        _set_result(record, search)
+        return 1 if search.tally.failures else 0
+
+
+def _set_result(record: RunRecord, search: Explorer) -> None:
+    """Set what this search found, without the runs of one that it resumed."""
+    tally = search.tally
+    record.runs = search.runs_here
+    record.failed = search.failed_here
+    record.digest = tally.plain.digest if tally.plain is not None else ""
+    if tally.failures:
+        ((cause, _),) = tally.failures.most_common(1)
+        record.fails(cause)
 
 
 def _pool(

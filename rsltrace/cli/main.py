@@ -26,6 +26,7 @@ _COMMANDS = {
     "verify": "Run a job many times under perturbed environments and compare.",
     "explore": "Search the callback orders of a job for runs that fail.",
     "bisect": "Find the commit that changed a job's behaviour.",
+    "history": "Say which jobs of a suite changed at which commit, and which fail.",
     "audit": "Scan the sources of nodes for nondeterminism.",
     "check": "Check a job and show its node graph without running callbacks.",
     "schema": "Print the JSON Schema of job files, for editors.",

@@ -44,3 +44,10 @@ trust_option = click.option(
     "--trust", is_flag=True, help="Run the code that TRACE names without asking."
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+history_option = click.option(
+    "--history",
+    metavar="PLACE",
+    envvar="RSLTRACE_HISTORY",
+    help="Append a line on this run to a file, or put it as a file of its own into a folder or "
+    'at an address (s3://…). "rsltrace history" reads them. Default: $RSLTRACE_HISTORY.',
+)

@@ -9,7 +9,7 @@ import signal
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,12 +17,19 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
-from rsltrace.cli.options import json_option, seed_option, timeout_option, until_option
+from rsltrace.cli.options import (
+    history_option,
+    json_option,
+    seed_option,
+    timeout_option,
+    until_option,
+)
 from rsltrace.errors import EXIT_USAGE, RsltraceError
 from rsltrace.search.perturb import KINDS
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
+    from rsltrace.search.history.run_record import RunRecord
     from rsltrace.search.perturb import Perturbation, PerturbedRun
     from rsltrace.search.verify import VerifyResult
 
@@ -60,6 +67,13 @@ class JobArguments:
                     ros[index + 1] = str(path(ros[index + 1]))
             found += ["--ros-args", *ros, "--"]
         return found
+
+    def recorded(self, history: str | None, by: str) -> AbstractContextManager[RunRecord]:
+        """Give the record of this run, which goes to a history."""
+        from rsltrace.search.history.run_record import recorded
+
+        files = [Path(word) for word in self.words if ":=" not in word]
+        return recorded(history, by, (*files, self.launch or Path())[0], self.arguments)
 
 
 @click.command(cls=RosArgsCommand)
@@ -109,6 +123,7 @@ class JobArguments:
     type=click.Path(path_type=Path, dir_okay=False),
     help="With --run: write the trace to this file (default: run-N.mcap).",
 )
+@history_option
 @json_option
 def verify(
     words: tuple[str, ...],
@@ -126,6 +141,7 @@ def verify(
     number: int | None,
     only: str | None,
     output: Path | None,
+    history: str | None,
     as_json: bool,
 ) -> int:
     """Run JOB several times under perturbed environments and compare the digests.
@@ -141,17 +157,25 @@ def verify(
     if (only or output) and number is None:
         raise click.UsageError("--only and --output need --run N")
     given = JobArguments(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
-    job_of(words, launch, skip, overrides)  # report a broken job once, before the runs
-    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, handling_signals():
+    history = history if number is None else None
+    with (
+        given.recorded(history, "verify") as record,
+        tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name,
+        handling_signals(),
+    ):
+        job_of(words, launch, skip, overrides)  # report a broken job once, before the runs
         folder = Path(name)
         if number is not None:
             return _one_run(given, folder, number, perturbations, only, output)
-        return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
+        return _verify(
+            given, folder, record, runs, jobs, perturbations, timeout, keep, as_json=as_json
+        )
 
 
 def _verify(
     given: JobArguments,
     folder: Path,
+    record: RunRecord,
     runs: int,
     jobs: int,
     perturbations: int,
@@ -193,8 +217,14 @@ def _verify(
         (tell if result.trouble else say)(as_text(result, place, again, kept=keep is not None))
     if keep is not None:
         (keep / PAGE).unlink(missing_ok=True)  # of an earlier time
+    record.digest, record.runs = result.first.digest, result.runs
     if result.trouble is not None:
+        record.verdict, record.reason = "error", result.trouble.failure
         return EXIT_USAGE
+    if result.other is not None:
+        from rsltrace.diff import diff_files
+
+        record.fails(diff_files(*(place / one.path.name for one in _two(result))).sentence)
     if keep is not None:
         write_text(keep / PAGE, as_page(result, keep, again))
     return 0 if result.agrees else 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import AbstractContextManager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.job import Job
     from rsltrace.run import RunResult
+    from rsltrace.search.history.run_record import RunRecord
 
 UPDATE_HINT = "pytest --rsltrace-update accepts what it does now"
 
@@ -23,6 +25,7 @@ class GoldenSession:
     """What pytest was asked for, and what was done; the plugin sets and reads it."""
 
     update: bool = False
+    history: str = ""
     written: ClassVar[list[Path]] = []
 
 
@@ -65,22 +68,48 @@ def assert_matches_golden(
         cannot be written.
     """
     __tracebackhide__ = True
-    target = Path(golden)
+    with golden_run(golden, update=update) as run:
+        return check_golden(job_or_result, Path(golden), run, update, options)
+
+
+def golden_run(
+    golden: str | os.PathLike[str], *, update: bool | None = None
+) -> AbstractContextManager[RunRecord]:
+    """Give the record of a run, which goes to the session's history unless the trace is updated."""
+    from rsltrace.search.history.run_record import recorded
+
+    place = "" if _is_update(update) else GoldenSession.history
+    return recorded(place, "golden", Path(golden), lambda path: [str(path(os.fspath(golden)))])
+
+
+def check_golden(
+    job_or_result: Job | RunResult | str | os.PathLike[str],
+    target: Path,
+    run: RunRecord,
+    update: bool | None,
+    options: DiffOptions | None,
+) -> bool:
+    """Do what ``assert_matches_golden`` does, and set the result in the record of the run."""
+    __tracebackhide__ = True
     path = _trace_of(job_or_result)
     if path is None:
         with TemporaryDirectory(prefix="rsltrace-golden-") as folder:
             result = run_job(job_or_result, folder)  # type: ignore[arg-type]
-            return assert_matches_golden(result, golden, update=update, options=options)
-    if GoldenSession.update if update is None else update:
+            return check_golden(result, target, run, update, options)
+    if _is_update(update):
         written = _write(path, target)
         GoldenSession.written += [target] if written and update is None else []
         return written
     if not target.exists():
         raise TraceError(f"there is no golden trace {target}: pytest --rsltrace-update writes it")
-    report = _report(target, path, options)
+    report = _report(target, path, run, options)
     if report is not None:
         raise GoldenMismatch(f"{report}\n{UPDATE_HINT}")
     return False
+
+
+def _is_update(update: bool | None) -> bool:
+    return GoldenSession.update if update is None else update
 
 
 def _trace_of(given: Job | RunResult | str | os.PathLike[str]) -> Path | None:
@@ -97,7 +126,7 @@ def _trace_of(given: Job | RunResult | str | os.PathLike[str]) -> Path | None:
     return given.path
 
 
-def _report(golden: Path, run: Path, options: DiffOptions | None) -> str | None:
+def _report(golden: Path, path: Path, run: RunRecord, options: DiffOptions | None) -> str | None:
     """Return what differs, or None if nothing does."""
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.report import render
@@ -105,9 +134,13 @@ def _report(golden: Path, run: Path, options: DiffOptions | None) -> str | None:
     from rsltrace.trace.reader import Trace
 
     options = options or DiffOptions()
-    with Trace.open(golden) as expected, Trace.open(run) as actual:
+    with Trace.open(golden) as expected, Trace.open(path) as actual:
         diff = diff_traces(expected, actual, options)
-    return None if diff.identical else render(diff, "text", options)
+    run.digest = diff.b.digest
+    if diff.identical:
+        return None
+    run.fails(diff.sentence)
+    return render(diff, "text", options)
 
 
 def _write(run: Path, golden: Path) -> bool:

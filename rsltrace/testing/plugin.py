@@ -1,4 +1,5 @@
-"""The pytest plugin: fixtures ``rsltrace_golden`` and ``rsltrace_node``, ``--rsltrace-update``.
+"""The pytest plugin: fixtures ``rsltrace_golden`` and ``rsltrace_node``, ``--rsltrace-update``,
+``--rsltrace-history``.
 
 Loaded in every pytest run of every environment with rsltrace in it, so it imports nothing heavy.
 """
@@ -26,17 +27,26 @@ _NOT_IN_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--rsltrace-update``."""
-    parser.getgroup("rsltrace").addoption(
+    """Add ``--rsltrace-update`` and ``--rsltrace-history``."""
+    group = parser.getgroup("rsltrace")
+    group.addoption(
         "--rsltrace-update",
         action="store_true",
         help="write the golden traces of rsltrace anew instead of comparing with them",
     )
+    what = "append a line on each comparison with a golden trace to this file, folder or address"
+    group.addoption("--rsltrace-history", metavar="PLACE", help=f"{what} (see rsltrace history)")
+    parser.addini("rsltrace_history", what, default="")
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let tests without the fixture know of ``--rsltrace-update``, too."""
+    """Let tests without the fixture know of the options, too."""
     GoldenSession.update = bool(config.getoption("--rsltrace-update"))
+    given = config.getoption("--rsltrace-history") or os.environ.get("RSLTRACE_HISTORY")
+    place = given or str(config.getini("rsltrace_history"))
+    if place and "://" not in place:  # tests may change the working directory
+        place = os.path.join(Path.cwd() if given else config.rootpath, place)
+    GoldenSession.history = place
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -89,7 +99,7 @@ class GoldenFixture:
         options: DiffOptions | None,
     ) -> RunResult | None:
         __tracebackhide__ = True
-        from rsltrace.testing.golden import assert_matches_golden, run_job
+        from rsltrace.testing.golden import check_golden, golden_run, run_job
 
         folder = Path(self._node.path).parent
         golden = folder / (self._default() if path is None else Path(path))
@@ -102,9 +112,10 @@ class GoldenFixture:
             is_job = given.suffix in (".yaml", ".yml")
         else:
             is_job = not hasattr(given, "digest")
-        if is_job:
-            given = result = run_job(given, self._tmp_path, name=f"run{self._number()}.mcap")
-        assert_matches_golden(given, golden, options=options)
+        with golden_run(golden) as run:
+            if is_job:
+                given = result = run_job(given, self._tmp_path, name=f"run{self._number()}.mcap")
+            check_golden(given, golden, run, None, options)
         return result
 
     def _default(self) -> Path:

@@ -106,6 +106,8 @@ class Explorer:
         self.began_s = time.monotonic()
         self.runs_here = 0
         """How many runs have ended since ``began_s``, without those of a resumed search."""
+        self.failed_here = 0
+        """How many of them failed."""
         self.is_exhausted = False
         """Whether the strategy has nothing left to try."""
         self._table = table
@@ -245,6 +247,7 @@ class Explorer:
         """Count a run and write it down."""
         self._under_way.discard(result.trial.number)
         self.runs_here += 1
+        self.failed_here += result.failure is not None
         result = self._count(replace(result, behaviours=(), order=(), steps=()))
         self._table.add(result, learned)
         on_result(result)

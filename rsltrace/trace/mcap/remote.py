@@ -138,6 +138,37 @@ def open_remote(address: str) -> RemoteSource:
     Raises SetupError if fsspec, or a package for this kind of address, is not installed.
     """
     name = public_address(address)
+    filesystem, path = filesystem_of(address)
+    clock = _RequestTimer(address)
+    try:
+        size = clock.within(lambda: filesystem.info(path)["size"])
+    except FileNotFoundError:
+        raise TraceError(f"{name} does not exist, or cannot be reached") from None
+    except Exception as error:  # whatever the storage's library raises: there are many
+        raise TraceError(f"{name} cannot be opened: {clock.reason(error)}") from None
+    if size is None:
+        raise TraceError(f"{name} does not say how large it is; download it first")
+    is_http = address.partition("://")[0] in ("http", "https")
+    fetch = _http_fetch(filesystem, address) if is_http else None
+
+    def fetch_range(begin: int, end: int) -> bytes:
+        try:
+            if fetch is not None:
+                return clock.within(lambda: fetch(begin, end))
+            return clock.within(lambda: bytes(filesystem.cat_file(path, start=begin, end=end)))
+        except Exception as error:  # as above
+            raise _FetchError(clock.reason(error)) from None
+
+    return RemoteSource(name, int(size), fetch_range)
+
+
+def filesystem_of(address: str) -> tuple[Any, str]:
+    """Return fsspec's file system of an address, and the path there.
+
+    :raises SetupError: fsspec, or a package for this kind of address, is not installed.
+    :raises TraceError: it is no address.
+    """
+    name = public_address(address)
     scheme = address.partition("://")[0]
     try:
         import fsspec
@@ -155,26 +186,7 @@ def open_remote(address: str) -> RemoteSource:
     except ValueError as error:
         reason = redacted(str(error), address)
         raise TraceError(f"{name} is no address that can be read: {reason}") from None
-    clock = _RequestTimer(address)
-    try:
-        size = clock.within(lambda: filesystem.info(path)["size"])
-    except FileNotFoundError:
-        raise TraceError(f"{name} does not exist, or cannot be reached") from None
-    except Exception as error:  # whatever the storage's library raises: there are many
-        raise TraceError(f"{name} cannot be opened: {clock.reason(error)}") from None
-    if size is None:
-        raise TraceError(f"{name} does not say how large it is; download it first")
-    fetch = _http_fetch(filesystem, address) if scheme in ("http", "https") else None
-
-    def fetch_range(begin: int, end: int) -> bytes:
-        try:
-            if fetch is not None:
-                return clock.within(lambda: fetch(begin, end))
-            return clock.within(lambda: bytes(filesystem.cat_file(path, start=begin, end=end)))
-        except Exception as error:  # as above
-            raise _FetchError(clock.reason(error)) from None
-
-    return RemoteSource(name, int(size), fetch_range)
+    return filesystem, path
 
 
 def _http_fetch(filesystem: Any, address: str) -> Fetch:
