@@ -599,7 +599,7 @@ class Session:
         found = []
         for name, run in self.shown.items():
             if run.count:
-                stamp_ns = time.stamp_ns(run.trace.start_ns)
+                stamp_ns = time.stamp_ns(run.trace.start_ns, run.end_ns)
                 place = self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B)
                 found.append((run.end_ns < stamp_ns, place))
         over, place = min(found)
