@@ -53,7 +53,8 @@ class EventLines:
         self._words = EventWords(trace)
         names = self._words.names
         self._index_width = max(len(str(trace.event_count)), 5)
-        self._time_width = len(format_seconds(trace.end_ns))
+        self._start_ns = trace.start_ns
+        self._time_width = len(format_seconds(trace.stamp(trace.end_ns)))
         self._node_width = min(max(names.longest_node, 1), _COLUMN_MAX)
         self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
 
@@ -63,7 +64,7 @@ class EventLines:
         name = self._words.names.name(event.entity) or "-"
         columns = (
             f"{event.index:>{self._index_width}}  "
-            f"{format_seconds(event.stamp_ns):>{self._time_width}}  "
+            f"{format_seconds(event.stamp_ns - self._start_ns):>{self._time_width}}  "
             f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}  "
             f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
         )
@@ -183,10 +184,10 @@ def cat(
 ) -> None:
     """Print the events of TRACE, one per line, in the order they happened.
 
-    The columns are: index, simulated time in seconds, node, kind, entity, hash of the input, hash
-    of the outputs, outputs (/topic, call /service, reply /service, log LEVEL text and so on), and
-    [flags]. A line that starts with "!" is a finding of the guard in the event above it. Built-in
-    entities of rclpy (such as /rosout) are shown only as a count; --json lists them.
+    The columns are: index, seconds since the start of the run, node, kind, entity, hash of the
+    input, hash of the outputs, outputs (/topic, call /service, reply /service, log LEVEL text and
+    so on), and [flags]. A line that starts with "!" is a finding of the guard in the event above
+    it. Built-in entities of rclpy (such as /rosout) are shown only as a count; --json lists them.
 
     All filter options are repeatable, except times. An event is printed if it matches at least one
     value of every option given. Globs match whole names: --topic '/robot1/*'.
@@ -246,8 +247,8 @@ def _choice(
         entities=None if wanted is None else np.array(sorted(wanted), dtype=np.uint32),
         touching=touching,
         kinds=np.array(labels, dtype=np.uint8) if kinds else None,
-        from_ns=0 if first is None else first.stamp_ns(trace.start_ns),
-        to_ns=2**64 - 1 if last is None else last.stamp_ns(trace.start_ns),
+        from_ns=0 if first is None else first.stamp_ns(trace.start_ns, trace.end_ns),
+        to_ns=2**64 - 1 if last is None else last.stamp_ns(trace.start_ns, trace.end_ns),
     )
 
 

@@ -194,8 +194,9 @@ def info(trace: Path, form: str, show_all: bool, check: bool, output: Path | Non
 
 def _facts(trace: Trace, counts: TraceCounts) -> list[tuple[str, str]]:
     """Return what the run is, as names with values."""
-    start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
-    time = ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})")
+    start, end = (format_seconds(trace.stamp(at)) for at in (trace.start_ns, trace.end_ns))
+    since = f", from simulated time {format_seconds(trace.start_ns)} s" if trace.start_ns else ""
+    time = ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))}){since}")
     native = is_native(trace)
     if native:
         time = ("recorded", real_time(trace))
@@ -249,7 +250,10 @@ def _state(trace: Trace) -> str:
 
 def _waits(trace: Trace) -> list[str]:
     """Return the calls that were still waiting at the end."""
-    return [f"since {format_seconds(w.since_ns)} s: {w.text}" for w in decode_waits(trace.result)]
+    return [
+        f"since {format_seconds(trace.stamp(w.since_ns))} s: {w.text}"
+        for w in decode_waits(trace.result)
+    ]
 
 
 def _node_lines(trace: Trace, counts: TraceCounts) -> list[str]:

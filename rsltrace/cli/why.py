@@ -42,7 +42,7 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
     from rsltrace.why.answer import why as find_reason
 
     with Trace.open(trace) as opened:
-        at_ns = None if at is None else at.stamp_ns(opened.start_ns)
+        at_ns = None if at is None else at.stamp_ns(opened.start_ns, opened.end_ns)
         reason = find_reason(opened, node, what, at_ns)
         if as_json:
             say(json.dumps(reason_json(reason), indent=2))

@@ -26,7 +26,7 @@ class TimeCondition(ActiveCondition):
         if self._is_past or view.stamp_ns < self._time_ns or view.kind == EventKind.CONSTRUCT:
             return ""
         self._is_past = True
-        return f"{format_seconds(view.stamp_ns)} s"
+        return f"{format_seconds(view.stamp_ns - view.start_ns)} s"
 
 
 class WatchCondition(ActiveCondition):

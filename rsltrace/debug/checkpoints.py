@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rsltrace.debug.processes import SimProcess
-from rsltrace.trace.model.texts import format_seconds
+from rsltrace.trace.model.texts import Stamp, format_seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class RunPosition:
 
     @property
     def seconds(self) -> str:
-        """Simulated time in seconds, with nine decimals."""
+        """Seconds since the start of the run, with nine decimals."""
         return format_seconds(self.stamp_ns)
 
 
@@ -57,21 +57,25 @@ class StopReport:
     text: str = ""
 
 
-def position_of(values: dict[str, Any]) -> RunPosition:
+def position_of(values: dict[str, Any], start_ns: int) -> RunPosition:
+    """Return the position of an answer in a run that starts at ``start_ns``."""
+    event = values.get("event")
+    if event is not None:
+        event = {**event, "stamp_ns": Stamp(event["stamp_ns"], start_ns)}
     return RunPosition(
         index=int(values["index"]),
-        stamp_ns=int(values["stamp_ns"]),
-        event=values.get("event"),
+        stamp_ns=Stamp(values["stamp_ns"], start_ns),
+        event=event,
         is_next=bool(values.get("is_next", False)),
         next=values.get("next"),
     )
 
 
-def stopped_of(values: dict[str, Any]) -> StopReport:
+def stopped_of(values: dict[str, Any], start_ns: int) -> StopReport:
     found = values.get("breakpoint")
     return StopReport(
         reason=str(values["reason"]),
-        position=position_of(values["position"]),
+        position=position_of(values["position"], start_ns),
         breakpoint=None if found is None else Breakpoint(found["number"], found["text"]),
         text=str(values.get("text", "")),
     )

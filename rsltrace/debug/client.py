@@ -28,6 +28,7 @@ from rsltrace.errors import DebugError, EditError, OutputError, RsltraceError
 from rsltrace.line_protocol import Lines, Message
 from rsltrace.replay.edits import parse_edit
 from rsltrace.trace.model.regular_file import not_replaceable
+from rsltrace.trace.model.texts import Stamp
 
 # Branches of a debugging session: its run, repeated with edits.
 #
@@ -243,29 +244,29 @@ class DebugSession:
 
     @property
     def position(self) -> RunPosition:
-        return position_of(self._ask("position"))
+        return self._place("position")
 
     # -- forward -----------------------------------------------------------------------------------
 
     def step(self, count: int = 1) -> StopReport:
         """Run ``count`` events."""
-        return stopped_of(self._ask("step", count=count))
+        return self._stop("step", count=count)
 
     def next(self, node: str | None = None) -> StopReport:
         """Run to the end of the next event of a node (default: the node of the last event)."""
-        return stopped_of(self._ask("next", node=node))
+        return self._stop("next", node=node)
 
     def finish(self) -> StopReport:
         """Run to the end of the current time step."""
-        return stopped_of(self._ask("finish"))
+        return self._stop("finish")
 
     def run_to(self, place: int | str) -> StopReport:
         """Run to an index, or to the end of a simulated time (``"2.5s"``), or to a breakpoint."""
-        return stopped_of(self._ask("run_to", to=place))
+        return self._stop("run_to", to=place)
 
     def go_on(self) -> StopReport:
         """Run to the next breakpoint, or to the end."""
-        return stopped_of(self._ask("go_on"))
+        return self._stop("go_on")
 
     def pause(self) -> None:
         """Stop a run that another thread waits for, after its current event; Ctrl-C does the same.
@@ -277,19 +278,19 @@ class DebugSession:
 
     def reverse_step(self, count: int = 1) -> StopReport:
         """Go back ``count`` events."""
-        return stopped_of(self._ask("reverse_step", count=count))
+        return self._stop("reverse_step", count=count)
 
     def reverse_next(self, node: str | None = None) -> StopReport:
         """Go back to the end of a node's previous event."""
-        return stopped_of(self._ask("reverse_next", node=node))
+        return self._stop("reverse_next", node=node)
 
     def reverse_go_on(self) -> StopReport:
         """Go back to the previous place where a breakpoint stops, or to the beginning."""
-        return stopped_of(self._ask("reverse_go_on"))
+        return self._stop("reverse_go_on")
 
     def go_to(self, place: int | str) -> StopReport:
         """Go to an index, or to the end of a simulated time, ahead or back. No breakpoint stops."""
-        return stopped_of(self._ask("go_to", to=place))
+        return self._stop("go_to", to=place)
 
     # -- breakpoints -------------------------------------------------------------------------------
 
@@ -352,7 +353,12 @@ class DebugSession:
     def inspect(self, what: str) -> Any:
         """Return ``nodes``, ``queues``, ``timers``, ``stacks``, ``graph``, the ``message`` of the
         present event, or the ``source`` of its callback."""
-        return self._ask("inspect", what=what)
+        found = self._ask("inspect", what=what)
+        if what == "timers":
+            for one in found:
+                due_ns = one["due_ns"]
+                one["due_ns"] = None if due_ns is None else Stamp(due_ns, self.start_ns)
+        return found
 
     def event(self, index: int) -> dict[str, Any]:
         """Return an event of the trace, or one that has already run."""
@@ -360,15 +366,15 @@ class DebugSession:
 
     def last_changed(self, node: str, attribute: str) -> RunPosition:
         """Return where a node's attribute (``P[0][0]``) last changed, up to here."""
-        return position_of(self._ask("last_changed", node=node, attribute=attribute))
+        return self._place("last_changed", node=node, attribute=attribute)
 
     def sent_by(self, index: int) -> RunPosition:
         """Return the position after the event that sent the input of event ``index``."""
-        return position_of(self._ask("sent_by", index=index))
+        return self._place("sent_by", index=index)
 
     def first_true(self, condition: str) -> RunPosition:
         """Return the first position, up to here, at which a condition is true."""
-        return position_of(self._ask("first_true", condition=condition))
+        return self._place("first_true", condition=condition)
 
     def checkpoints(self) -> dict[str, Any]:
         """Return ``indices`` of the checkpoints, their memory in ``bytes`` (PSS), and ``why_not``:
@@ -410,6 +416,12 @@ class DebugSession:
         return self._branches.keep(output, force=force)
 
     # -- talking -----------------------------------------------------------------------------------
+
+    def _stop(self, do: str, **values: Any) -> StopReport:
+        return stopped_of(self._ask(do, **values), self.start_ns)
+
+    def _place(self, do: str, **values: Any) -> RunPosition:
+        return position_of(self._ask(do, **values), self.start_ns)
 
     def _ask(self, do: str, **values: Any) -> Any:
         with self._lock:

@@ -219,7 +219,7 @@ class CurrentEventView:
             return "nothing has run yet"
         node, kind = self.node and f"{self.node}: ", EventKind(self.kind).label
         what = f"{node}{kind} {self.entity_name}".rstrip()
-        return f"event {self.index}  {format_seconds(self.stamp_ns)}  {what}"
+        return f"event {self.index}  {format_seconds(self.stamp_ns - self.start_ns)}  {what}"
 
 
 def call_of(callback: Any, args: tuple[Any, ...]) -> CallbackCall:

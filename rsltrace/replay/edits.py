@@ -144,7 +144,10 @@ def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
         if edit.index is not None and edit.index >= trace.event_count:
             last = trace.event_count - 1
             raise EditError(f"{edit.text!r}: the last event of {trace.name} is {last}")
-        if edit.time is not None and edit.time.stamp_ns(trace.start_ns) > trace.end_ns:
+        if (
+            edit.time is not None
+            and edit.time.stamp_ns(trace.start_ns, trace.end_ns) > trace.end_ns
+        ):
             end_s = (trace.end_ns - trace.start_ns) / 1e9
             raise EditError(f"{edit.text!r}: {trace.name} ends at {end_s:g} s")
         node = getattr(edit.action, "node", None)

@@ -327,7 +327,7 @@ def event_count_to(trace: Trace, position: Position) -> int:
     if text.isascii() and text.isdigit():
         return int(text) + 1
     try:
-        time_ns = parse_time_in_run(text).stamp_ns(trace.start_ns)
+        time_ns = parse_time_in_run(text).stamp_ns(trace.start_ns, trace.end_ns)
     except ValueError as error:
         raise ReplayError(
             f"{text!r} is neither the index of an event (812) nor a time (60s, 2.5): {error}"

@@ -281,6 +281,7 @@ class RunSession:
                 lambda: self.world.domain.dispatcher, self._observer, self.end_ns
             ),
         )
+        loop.origin_ns = self.start_ns
         loop.min_step_ns = job.min_time_step_ns
         self.world = world = stack.enter_context(
             kind(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)

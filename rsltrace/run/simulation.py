@@ -305,9 +305,10 @@ class Simulation:
 
     def _run_to(self, time_ns: int) -> None:
         if time_ns < self.now_ns:
+            start_ns = self._session.start_ns
             raise RunError(
-                f"simulated time is {format_seconds(self.now_ns)} s already, past "
-                f"{format_seconds(time_ns)} s"
+                f"simulated time is {format_seconds(self.now_ns - start_ns)} s already, past "
+                f"{format_seconds(time_ns - start_ns)} s"
             )
         self._driver.go(until_ns=time_ns)
 

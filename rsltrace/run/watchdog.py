@@ -112,7 +112,7 @@ class Watchdog:
             who, where = f"{process}, in {who},", ""
         tell(
             f"rsltrace: note: {who} has not returned for {for_s} s of real time; simulated time "
-            f"stands still at {format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
+            f"stands still at {format_seconds(domain.loop.stamp)} s{where}. Ctrl-C ends the run"
         )
         return True
 

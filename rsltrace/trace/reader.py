@@ -63,7 +63,7 @@ from rsltrace.trace.mcap.source import ByteSource, open_source
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, EventRecord, Output, OutputKind
 from rsltrace.trace.model.finding import Finding, GuardCount, GuardMode, parse_counts
-from rsltrace.trace.model.texts import format_seconds
+from rsltrace.trace.model.texts import Stamp, format_seconds
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
@@ -286,6 +286,10 @@ class Trace:
         """The number of events before the nodes were shut down; None if unknown."""
         text = self.result.get("ended_after", "")
         return int(text) if text.isascii() and text.isdigit() else None
+
+    def stamp(self, stamp_ns: int) -> Stamp:
+        """Return a simulated time of this run as what texts count from its start."""
+        return Stamp(stamp_ns, self.start_ns)
 
     @cached_property
     def result(self) -> dict[str, str]:
@@ -574,7 +578,7 @@ class Trace:
             sheet.line("cut off: the run was killed or crashed, or is still going on")
         try:
             native = bool(self.metadata(METADATA_NATIVE))
-            start, end = format_seconds(self.start_ns), format_seconds(self.end_ns)
+            start, end = (format_seconds(self.stamp(at)) for at in (self.start_ns, self.end_ns))
             sheet.facts(
                 (
                     ("ended", self.result.get("stop_reason", "")),

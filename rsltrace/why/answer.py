@@ -16,7 +16,7 @@ from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.events import EventWords
-from rsltrace.trace.words.phrases import as_sentence, at_time, seconds_text
+from rsltrace.trace.words.phrases import as_sentence
 from rsltrace.why.delivery import Late, LostByLink, PushedOut, RunEnded, Unfinished, Waiting
 from rsltrace.why.filters import NoTransform, UnmatchedStamps
 from rsltrace.why.graph import (
@@ -227,9 +227,9 @@ class Silent(Reason):
 
     def words(self) -> str:
         when = (
-            "" if self.question.at_ns is None else f" until {seconds_text(self.question.at_ns)} s"
+            "" if self.question.at_ns is None else f" until {self.seconds(self.question.at_ns)} s"
         )
-        when = when if self.last_ns is None else f" since {seconds_text(self.last_ns)} s"
+        when = when if self.last_ns is None else f" since {self.seconds(self.last_ns)} s"
         why = f", because {self.cause.clause()}" if self.cause else ""
         return f"{self.question.name} got nothing: {self.sender} has sent nothing{when}{why}"
 
@@ -263,7 +263,7 @@ class AsExpected(Reason):
     def words(self) -> str:
         if not self.count:
             return f"{self.question.name} did not run, and nothing kept it from running"
-        last = "" if self.at_ns is None else f", last {at_time(self.at_ns)}"
+        last = "" if self.at_ns is None else f", last {self.when(self.at_ns)}"
         times = "once" if self.count == 1 else f"{self.count} times"
         return f"{self.question.name} ran as expected, {times}{last}"
 
@@ -325,7 +325,7 @@ def _evidence(reason: Reason) -> Iterator[str]:
             kind = EventKind(int(history.events["kind"][event])).label
             what = question.named(entity) if entity else kind
             place = f" at {printable(question.place_of(entity))}" if entity else ""
-            yield f"event {event}, {seconds_text(history.stamp(event))} s: {what}{place}"
+            yield f"event {event}, {reason.seconds(history.stamp(event))} s: {what}{place}"
 
 
 def as_json(reason: Reason) -> dict[str, Any]:

@@ -9,7 +9,6 @@ from fnmatch import fnmatchcase
 from rsltrace.trace.model.event import decision_text, encode_decision
 from rsltrace.trace.model.finding import decode_drops, decode_waits
 from rsltrace.trace.model.texts import format_duration, printable
-from rsltrace.trace.words.phrases import at_time, seconds_text
 from rsltrace.why.history import Message
 from rsltrace.why.question import Question
 from rsltrace.why.reason import Reason
@@ -34,7 +33,7 @@ class LostByLink(Reason):
         return cls(*what, question=question, place=place, event=message.event)
 
     def words(self) -> str:
-        sent = f"the message that {self.sender} sent {at_time(self.sent_ns)}"
+        sent = f"the message that {self.sender} sent {self.when(self.sent_ns)}"
         return f"{sent} was {self.how} on the way to {self.question.name}"
 
 
@@ -63,7 +62,7 @@ class Waiting(Reason):
 
     def words(self) -> str:
         return (
-            f"{self.question.name} is held back since {seconds_text(self.since_ns)} s: {self.text}"
+            f"{self.question.name} is held back since {self.seconds(self.since_ns)} s: {self.text}"
         )
 
 
@@ -100,7 +99,7 @@ class Busy(Reason):
 
     def clause(self) -> str:
         itself = "an earlier callback of it" if self.by == self.question.name else self.by
-        times = f"from {seconds_text(self.from_ns)} s to {seconds_text(self.to_ns)} s"
+        times = f"from {self.seconds(self.from_ns)} s to {self.seconds(self.to_ns)} s"
         more = f", and {self.more} more callbacks" if self.more > 1 else ""
         more = ", and another callback" if self.more == 1 else more
         return f"{itself} {self.verb} {times}{more}"
@@ -131,8 +130,8 @@ class Unfinished(Reason):
         return cls(since_ns, question=question, place=question.place, event=event)
 
     def words(self) -> str:
-        ended = f"had not ended {at_time(self.question.time_ns)}"
-        return f"{self.question.name} began {at_time(self.since_ns)} and {ended}"
+        ended = f"had not ended {self.when(self.question.time_ns)}"
+        return f"{self.question.name} began {self.when(self.since_ns)} and {ended}"
 
 
 @dataclass(frozen=True)
@@ -161,8 +160,8 @@ class PushedOut(Reason):
         whose = "its queue" if self.holder == self.question.name else f"the queue of {self.holder}"
         why = f", because {self.busy.clause()}" if self.busy else ""
         return (
-            f"{self.question.name} lost the message of {seconds_text(self.sent_ns)} s: {whose} "
-            f"(depth {self.size}) was full, and the message of {seconds_text(self.by_ns)} s pushed "
+            f"{self.question.name} lost the message of {self.seconds(self.sent_ns)} s: {whose} "
+            f"(depth {self.size}) was full, and the message of {self.seconds(self.by_ns)} s pushed "
             f"it out{why}"
         )
 
@@ -228,8 +227,8 @@ class RunEnded(Reason):
 
     def words(self) -> str:
         return (
-            f"{self.question.name} was due {at_time(self.due_ns)}, and the run ended "
-            f"{at_time(self.question.end_ns)}: {self.stop_reason}"
+            f"{self.question.name} was due {self.when(self.due_ns)}, and the run ended "
+            f"{self.when(self.question.end_ns)}: {self.stop_reason}"
         )
 
 
@@ -263,7 +262,7 @@ class Late(Reason):
         spent = [f"the link took {format_duration(self.delay_ns)}"] if self.delay_ns else []
         spent += [f"its callback took {format_duration(self.took_ns)}"] if self.took_ns else []
         return (
-            f"the message that {self.sender} sent {at_time(self.sent_ns)} reached "
+            f"the message that {self.sender} sent {self.when(self.sent_ns)} reached "
             f"{self.question.name} {format_duration(self.took_ns + self.delay_ns)} later: "
             f"{' and '.join(spent)}"
         )

@@ -157,7 +157,8 @@ def _sent(question: Question, frame: str, event: int) -> Iterator[str]:
                 continue
             for one in transforms:
                 if frame in (one.child_frame_id, one.header.frame_id):
-                    times = map(seconds_text, (message.sent_ns, _stamp_ns(one.header)))
+                    sent_ns = question.history.trace.stamp(message.sent_ns)
+                    times = map(seconds_text, (sent_ns, _stamp_ns(one.header)))
                     last = "last at {} s, with stamp {} s".format(*times)
         if last:
             yield f"{question.named(sender.id)} sent {frame} {last}"

@@ -10,7 +10,6 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind, RandomDecision, decision_kind, decision_text
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable, shortened
-from rsltrace.trace.words.phrases import at_time
 from rsltrace.why.question import SENDERS, Question
 from rsltrace.why.reason import Reason
 
@@ -89,7 +88,7 @@ class NodeEnded(Reason):
 
     def words(self) -> str:
         what = f"{self.by} {shortened(self.raised, _TEXT_MAX)}"
-        return f"{self.node} ended {at_time(self.at_ns)}: {what}"
+        return f"{self.node} ended {self.when(self.at_ns)}: {what}"
 
 
 @dataclass(frozen=True)
@@ -189,6 +188,6 @@ class CreatedLate(Reason):
         verb = "is" if " and " not in self.volatile else "are"
         kept = f", and the {self.volatile} {verb} volatile" if self.volatile else ""
         return (
-            f"{self.question.name} was created {at_time(self.created_ns)}, after {self.sender} had "
-            f"sent {at_time(self.sent_ns)}{kept}"
+            f"{self.question.name} was created {self.when(self.created_ns)}, after {self.sender} "
+            f"had sent {self.when(self.sent_ns)}{kept}"
         )

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
+from rsltrace.trace.words.phrases import seconds_text
 from rsltrace.why.question import Question
 
 
@@ -28,6 +29,14 @@ class Reason:
     def find(cls, question: Question) -> Reason | None:
         """Return the reason, None if it does not hold."""
         raise NotImplementedError
+
+    def seconds(self, stamp_ns: int) -> str:
+        """Return a time in seconds since the start of the run: ``1.5``."""
+        return seconds_text(self.question.history.trace.stamp(stamp_ns))
+
+    def when(self, stamp_ns: int) -> str:
+        """Return a time as part of a sentence: ``at 1.5 s``."""
+        return f"at {self.seconds(stamp_ns)} s"
 
     def words(self) -> str:
         """Return a sentence without its full stop."""

@@ -10,7 +10,6 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.operation import TIMER_CANCEL, pack_operation
-from rsltrace.trace.words.phrases import at_time
 from rsltrace.why.delivery import Busy, RunEnded
 from rsltrace.why.question import Question
 from rsltrace.why.reason import Reason
@@ -47,7 +46,7 @@ class TimerCancelled(Reason):
     def words(self) -> str:
         if not self.by:
             return f"{self.question.name} was created with autostart=False, and never reset"
-        at = at_time(self.at_ns)
+        at = self.when(self.at_ns)
         return f"{self.question.name} was cancelled {at} by {self.by}, and not reset"
 
 

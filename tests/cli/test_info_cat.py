@@ -343,7 +343,7 @@ def test_every_command_says_which_name_was_meant(name: str) -> None:
     ("options", "message"),
     [
         (["--from", "soon"], "expected a time"),
-        (["--from", "-3"], "expected a time|must not be negative|requires"),
+        (["--from", "-30"], "must not be negative"),
         (["--to", "1 parsec"], "unknown unit 'parsec'"),
         (["--to", "0.1234567891"], "finer than a nanosecond"),
         (["--kind", "time"], "'time' is not one of"),

@@ -64,6 +64,7 @@ from rsltrace.diff.result import BagDiff, ComparedRun, Diff, Divergence, EntityC
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.errors import TraceError
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.texts import Stamp
 from rsltrace.trace.words.entities import EntityKey
 from rsltrace.trace.words.phrases import as_sentence
 from tests.golden_files import check_golden
@@ -114,7 +115,7 @@ def event(
 ) -> EventSummary:
     made = EventSummary(
         index=index,
-        stamp_ns=ms * MS,
+        stamp_ns=Stamp(ms * MS),
         entity=entity,
         kind=kind,
         flags=EventFlag.NONE,

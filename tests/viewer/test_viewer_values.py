@@ -242,7 +242,8 @@ def test_times_since_1970_count_from_the_start(tmp_path: Path, drive: Callable[.
         await viewer.press("t")
         await viewer.type("1.5")
         assert viewer.place == 15
-        assert "1.5 s after the start, 1700000001.500000000 s" in viewer.text
+        assert "1.500000000 s" in viewer.text
+        assert "1700000001" not in viewer.text
         await viewer.press("t")
         await viewer.type("@1700000002")
         assert viewer.place == 20

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.row_sign import RowSign
@@ -15,7 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.job.values.times import TimeInRun
 from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.texts import NS_PER_S, format_duration
+from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.native import is_native, refuse_native
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
@@ -92,10 +91,8 @@ class Session:
         self.marks = Bookmarks()
         self.openness = Openness()
         self.effects: Effects | None = None
-        self.base_ns = a.start_ns if a.since_epoch else 0
-        """What times count from: the start of the run, where they would be those since 1970."""
         runs = self.runs
-        self._texts = {name: EventTexts(run, self.base_ns) for name, run in runs.items()}
+        self._texts = {name: EventTexts(run) for name, run in runs.items()}
         self.values = {name: RowValues(run) for name, run in runs.items()}
         self._pair_values = PairValues(self.comparison.runs) if self.comparison else None
         self._names = self._short_names()
@@ -140,7 +137,7 @@ class Session:
     def replace_run(self, run: Run) -> None:
         """Show a newer state of the same recording. The old file is closed."""
         old, self.a = self.a, run
-        self._texts["a"] = EventTexts(run, self.base_ns)
+        self._texts["a"] = EventTexts(run)
         self.values["a"] = RowValues(run)
         self._names = self._short_names()
         self.view = OneRun(run.count)
@@ -238,7 +235,7 @@ class Session:
             signs=self.b is not None,
             two=two,
             deltas=two and self.comparison is not None and self.comparison.rows.shifted,
-            relative=bool(self.base_ns),
+            relative=any(run.base_ns for run in self.shown.values()),
         )
         return layout(space, self._names)
 
@@ -599,7 +596,7 @@ class Session:
         found = []
         for name, run in self.shown.items():
             if run.count:
-                stamp_ns = time.stamp_ns(run.trace.start_ns)
+                stamp_ns = time.stamp_ns(run.trace.start_ns, run.end_ns)
                 place = self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B)
                 found.append((run.end_ns < stamp_ns, place))
         over, place = min(found)
@@ -617,7 +614,6 @@ class Session:
             " ↔ ".join(run.name for run in self.shown.values()),
             topic=found[1] if found is not None else "",
             stamp_ns=None if self.empty else self.stamp(),
-            base_ns=self.base_ns,
             diff=self.comparison.diff
             if self.comparison is not None and self.side == BOTH
             else None,
@@ -653,9 +649,8 @@ class Session:
             parts.append(f"exit code {reason}")
         how = "of real time" if is_native(trace) else "simulated"
         parts.append(f"{format_duration(run.end_ns - run.start_ns)} {how}")
-        if self.base_ns:
-            began = datetime.fromtimestamp(self.base_ns // NS_PER_S, tz=timezone.utc)
-            parts.append(f"from {began:%Y-%m-%d %H:%M:%S} UTC")
+        if run.base_ns:
+            parts.append(f"from {run.start_text()}")
         nodes = sum(1 for e in run.entities.values() if e.kind is EntityKind.NODE)
         parts.append(f"{nodes} node{'' if nodes == 1 else 's'}")
         if len(runs) == 1:

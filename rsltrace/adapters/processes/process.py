@@ -324,7 +324,7 @@ class Process:
         self.adapter.has_ended(self)
         if not self.ended.failed or self._is_stopping:
             return
-        at = format_seconds(self.dispatcher.loop.now_ns)
+        at = format_seconds(self.dispatcher.loop.now_ns)  # of ROS: the text is hashed
         last = "its start" if self._last is None else self._last.describe()
         happened = f"process {self.name} {self.ended.said} at {at} s"
         text = f"{happened}; the last that it ran was {last}"

@@ -208,7 +208,7 @@ class _ScheduledFault:
             return
         node = self._node()
         if node is None:
-            at = format_seconds(self._world.domain.loop.now_ns)
+            at = format_seconds(self._world.domain.loop.stamp)
             self.missed = f"there was no node {self.fault.node} at {at} s"
             return
         self.missed = ""

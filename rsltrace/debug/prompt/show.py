@@ -73,7 +73,7 @@ def _ended(event: Mapping[str, Any]) -> str:
     did = list(event.get("did", ()))
     outputs = f"  -> {shortened(', '.join(map(str, did)), _DID_MAX)}" if did else ""
     flags = "".join(f"  [{flag}]" for flag in flag_names(int(event.get("flags", 0))))
-    stamp = format_seconds(int(event["stamp_ns"]))
+    stamp = format_seconds(event["stamp_ns"])
     return printable(f"   event {event['index']}  {stamp}  {_event(event)}{outputs}{flags}")
 
 

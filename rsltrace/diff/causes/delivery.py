@@ -219,7 +219,7 @@ def still_waits(
     for wait in _waits(lacking):
         is_held = any(0 <= one < len(table) and table[one] == number for one in wait.held)
         if wait.since_ns <= view.stamp_ns and (is_held or wait.text not in elsewhere):
-            return UnfinishedCall(wait.text, wait.since_ns, name)
+            return UnfinishedCall(wait.text, lacking.trace.stamp(wait.since_ns), name)
     return None
 
 

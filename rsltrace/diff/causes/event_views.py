@@ -38,7 +38,7 @@ class EventViews:
         number = self._number(event.entity, event.kind, outputs)
         return EventSummary(
             index=index,
-            stamp_ns=event.stamp_ns,
+            stamp_ns=run.trace.stamp(event.stamp_ns),
             entity=run.matching.keys[number],
             kind=event.kind,
             flags=event.flags,

@@ -65,7 +65,6 @@ from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
-from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import path_word, seconds_text
 
 ANCESTORS_MAX = 5
@@ -408,17 +407,18 @@ class Explainer:
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
                 last = max(v.stamp_ns for v in (judgement.a, judgement.b) if v is not None)
-                until = _time_in_run(last, self.run_a.trace)
+                until = seconds_text(self.run_a.trace.stamp(last))
                 again = f"{record.command} --until {until} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
         in_a = judgement.a is not None
         lacking = self.run_b if in_a else self.run_a
         if self._is_missing_callback(judgement, view):
-            name, since = shlex.quote(view.entity.name), _time_in_run(view.stamp_ns, lacking.trace)
+            name = shlex.quote(view.entity.name)
+            since = seconds_text(lacking.trace.stamp(view.stamp_ns))
             of = f"{path_word(lacking.trace.name)} {shlex.quote(view.entity.node)} {name}"
             return f"rsltrace why {of} --at {since}"
         path = path_a if in_a else path_b
-        time = _time_in_run(view.stamp_ns, (self.run_a if in_a else self.run_b).trace)
+        time = seconds_text(view.stamp_ns)
         node = view.entity.node
         choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""
         if view.kind is EventKind.BAG:
@@ -433,12 +433,6 @@ class Explainer:
         alone = matching.by_key[view.entity] in {*matching.only_a, *matching.only_b}
         in_one = judgement.a is None or judgement.b is None
         return in_one and not alone and not view.entity.ordinal and view.entity.kind in _EXPLAINED
-
-
-def _time_in_run(stamp_ns: int, trace: Trace) -> str:
-    """Return a simulated time as an option takes it: from the start of the run, if it is later."""
-    since_ns = stamp_ns - trace.start_ns
-    return seconds_text(since_ns) if since_ns >= 0 else f"@{seconds_text(stamp_ns)}"
 
 
 def _told_to_differ(settings: Sequence[Setting]) -> bool:

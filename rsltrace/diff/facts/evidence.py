@@ -11,6 +11,7 @@ from enum import Enum
 from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.trace.model.texts import Stamp
 from rsltrace.trace.words.entities import EntityKey
 
 
@@ -88,7 +89,7 @@ class EventSummary:
     """
 
     index: int
-    stamp_ns: int
+    stamp_ns: Stamp
     entity: EntityKey
     kind: EventKind
     flags: EventFlag

@@ -26,6 +26,14 @@ class TruncatedRecording(Fact):
 
 
 @dataclass(frozen=True, slots=True)
+class DifferentStarts(Fact):
+    """The runs start at different simulated times."""
+
+    a_ns: int
+    b_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class EndedByException(Fact):
     """An exception ended ``run``, and not the other one."""
 
@@ -131,6 +139,7 @@ class UndecodedMessages(Fact):
 Remark = (
     ReaderNote
     | TruncatedRecording
+    | DifferentStarts
     | EndedByException
     | DifferentEnd
     | RenamedProgram

@@ -140,7 +140,7 @@ def _step(step: CauseStep) -> dict[str, Any]:
 def _event(event: EventSummary) -> dict[str, Any]:
     result = _fields(event)
     result["entity"] = _entity(event.entity)
-    result["time"] = format_seconds(event.stamp_ns)
+    result["time"] = format_seconds(int(event.stamp_ns))
     if event.cause_event == NO_EVENT:
         result["cause_event"] = result["cause_output"] = None
     return result

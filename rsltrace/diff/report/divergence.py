@@ -58,7 +58,8 @@ def _event(found: Divergence, width: int) -> Section:
     assert some is not None or not found.messages
     if a is not None and b is not None and a.entity == b.entity and a.kind is b.kind:
         title = event_text(a)
-        at_once = (a.index, a.stamp_ns) == (b.index, b.stamp_ns)
+        whens = [(one.index, one.stamp_ns, one.stamp_ns.start_ns) for one in (a, b)]
+        at_once = whens[0] == whens[1]
         if at_once:
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         if min(a.position, b.position) >= 0:

@@ -205,6 +205,7 @@ def _(what: DifferentTime, of: Judgement) -> str:
 def _times(a: EventSummary, b: EventSummary) -> str:
     late_ns = b.stamp_ns - a.stamp_ns
     late = "later" if late_ns > 0 else "earlier"
+    late += " in simulated time" if a.stamp_ns.start_ns != b.stamp_ns.start_ns else ""
     times = f"{at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b"
     return f"{times}, {format_duration(abs(late_ns))} {late}"
 

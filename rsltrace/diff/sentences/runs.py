@@ -18,6 +18,7 @@ from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.facts.remarks import (
     DifferentEnd,
     DifferentJobs,
+    DifferentStarts,
     DifferentType,
     EndedByException,
     EqualUntilTruncated,
@@ -244,6 +245,12 @@ def _(remark: TruncatedRecording, of: object) -> str:
     compared = f"{remark.events} events up to {format_seconds(remark.end_ns)} s"
     cut = f"the recording of {remark.run} ({remark.path}) is truncated"
     return f"{cut}: only its {compared} are compared"
+
+
+@says(DifferentStarts)
+def _(remark: DifferentStarts, of: object) -> str:
+    a, b = map(seconds_text, (remark.a_ns, remark.b_ns))
+    return f"times count from the start of each run: simulated time {a} s in a, {b} s in b"
 
 
 @says(EndedByException)

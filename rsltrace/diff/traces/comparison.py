@@ -29,6 +29,7 @@ from rsltrace.diff.causes.relevance import entity_settings, environment_settings
 from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import (
+    DifferentStarts,
     Identical,
     MoreDivergences,
     RenamedProgram,
@@ -112,6 +113,8 @@ class _TraceComparison:
         self._run_b = ComparedTrace(b, self._matching, of_b=True, without_zero_delays=delays)
         self._environment = environment_settings(a, b)
         self._remarks = list(interruptions(a, b))
+        if a.start_ns != b.start_ns:
+            self._remarks.append(DifferentStarts(a.start_ns, b.start_ns))
         self._only_names = False
         """Whether the runs are the same except for program names."""
         if self._matching.renamed:

@@ -140,7 +140,7 @@ def failures(a: Trace, b: Trace) -> list[Remark]:
     if stop_reason(a) == stop_reason(b):
         return []
     return [
-        EndedByException(name, stop_reason(trace), event.index, event.stamp_ns)
+        EndedByException(name, stop_reason(trace), event.index, trace.stamp(event.stamp_ns))
         for name, trace in (("a", a), ("b", b))
         if (event := _failed(trace)) is not None
     ]
@@ -157,7 +157,7 @@ def failure(a: Trace, b: Trace) -> RunEnd | None:
 def _end_of(name: str, trace: Trace) -> RunEnd:
     return RunEnd(
         name,
-        trace.end_ns,
+        trace.stamp(trace.end_ns),
         stop_reason(trace),
         has_events=bool(trace.event_count),
         exit_code=exit_code(trace),

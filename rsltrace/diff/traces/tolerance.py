@@ -38,7 +38,7 @@ def side(trace: Trace) -> ComparedRun:
         path=trace.name,
         digest="" if is_native(trace) else trace.digest,
         events=trace.event_count,
-        end_ns=trace.end_ns,
+        end_ns=trace.stamp(trace.end_ns),
         complete=trace.complete,
         stop_reason=stop_reason(trace),
     )

@@ -12,6 +12,7 @@ from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from typing import NamedTuple
 
+from rsltrace.errors import TraceError
 from rsltrace.job.values.problem import JobProblem, describe
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
@@ -272,24 +273,50 @@ def _kind(value: object) -> str:
 _ENDS_OF_NUMBERS = tuple("0123456789.")
 
 
+_RUN_NS_MAX = 1_000_000 * NS_PER_S
+"""As long as a run may be whose end is unknown."""
+
+
+class TimeError(TraceError, ValueError):
+    """A time that a run cannot have."""
+
+
 class TimeInRun(NamedTuple):
     """A time in a run: counted from its start, or (``is_absolute``) the simulated time itself."""
 
     time_ns: int
     is_absolute: bool = False
 
-    def stamp_ns(self, start_ns: int) -> int:
-        """Return the simulated time in a run that starts at ``start_ns``."""
-        return self.time_ns if self.is_absolute else start_ns + self.time_ns
+    def stamp_ns(self, start_ns: int, end_ns: int | None = None) -> int:
+        """Return the simulated time in a run from ``start_ns`` to ``end_ns`` (None: unknown).
+
+        Raises TimeError for a time before simulated time 0, and for what must be a simulated time
+        without its @.
+        """
+        if self.is_absolute:
+            return self.time_ns
+        stamp_ns = start_ns + self.time_ns
+        if stamp_ns < 0:
+            raise TimeError(f"a time must not be negative, got {format_time(self.time_ns)}")
+        end_ns = start_ns + _RUN_NS_MAX if end_ns is None else end_ns
+        if 0 < start_ns <= self.time_ns <= end_ns < stamp_ns:
+            shown = format_time(self.time_ns)
+            raise TimeError(
+                f"times count from the start of the run, which is simulated time "
+                f"{format_time(start_ns)}: write @{shown} for simulated time {shown}"
+            )
+        return stamp_ns
 
 
 START = TimeInRun(0)
 
 
 def parse_time_in_run(text: str) -> TimeInRun:
-    """Return a time in a run: ``2.5``, ``2.5s`` and ``20ms`` count from its start, ``@2.5`` is the
-    simulated time that events have. Raises ValueError."""
+    """Return a time in a run: ``2.5``, ``2.5s`` and ``20ms`` count from its start, ``-0.5`` is
+    before it (nodes are constructed there), ``@2.5`` is a simulated time. Raises ValueError."""
     text = text.strip()
+    if text.startswith("-"):
+        return TimeInRun(-parse_stamp(text[1:]))
     return TimeInRun(parse_stamp(text.removeprefix("@")), text.startswith("@"))
 
 

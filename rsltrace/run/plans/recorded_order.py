@@ -39,6 +39,7 @@ from rsltrace.simulation.loop.recorded_order import (
 )
 from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.texts import Stamp
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
@@ -183,7 +184,7 @@ class _EventCursor:
 
 
 def _events(trace: Trace) -> Iterator[RecordedEvent]:
-    names = {}
+    names, start_ns = {}, trace.start_ns
     for entity in trace.entities.values():
         node = trace.node_of(entity).name if entity.node else ""
         names[entity.id] = entity_text(entity, node)
@@ -195,4 +196,6 @@ def _events(trace: Trace) -> Iterator[RecordedEvent]:
             if left == 0 or kind == EventKind.SHUTDOWN:
                 return
             left -= 1
-            yield RecordedEvent(stamp, kind, entity_id, names.get(entity_id, THE_RUN))
+            yield RecordedEvent(
+                Stamp(stamp, start_ns), kind, entity_id, names.get(entity_id, THE_RUN)
+            )

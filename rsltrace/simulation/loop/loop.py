@@ -23,7 +23,7 @@ from typing import Any, Protocol
 from rsltrace.errors import LivelockError
 from rsltrace.simulation.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerQueue, TimerState
-from rsltrace.trace.model.texts import format_seconds
+from rsltrace.trace.model.texts import Stamp, format_seconds
 
 
 class Dispatchable(Protocol):
@@ -81,6 +81,7 @@ class EventLoop:
     ) -> None:
         self.now_ns = start_ns
         self.start_ns = start_ns
+        self.origin_ns = start_ns
         self.events = 0
         self.activity_ns = start_ns
         self.ready: deque[Dispatchable] = deque()
@@ -100,6 +101,11 @@ class EventLoop:
         self._quiet_ns = -1
         self.scheduled: list[Release] = []
         self.next_place = itertools.count().__next__
+
+    @property
+    def stamp(self) -> Stamp:
+        """Simulated time for texts, which count from ``origin_ns``, the start of the run."""
+        return Stamp(self.now_ns, self.origin_ns)
 
     def schedule(
         self, time_ns: int, action: Callable[[], None], *, order: int = ORDER_RELEASE
@@ -133,7 +139,7 @@ class EventLoop:
     def jump(self, time_ns: int) -> None:
         """Set the clock without running what lies between (from construct time to start)."""
         self.now_ns = time_ns
-        self.start_ns = time_ns
+        self.start_ns = self.origin_ns = time_ns
         self.activity_ns = max(self.activity_ns, time_ns)
 
     def run(self) -> Stop:
@@ -304,7 +310,7 @@ class EventLoop:
         busiest = sorted(seen.items(), key=lambda pair: -pair[1])[:8]
         cycle = "; ".join(name for name, _ in busiest) or "unknown"
         raise LivelockError(
-            f"simulated time stands still at {format_seconds(now_ns)} s after "
+            f"simulated time stands still at {format_seconds(self.stamp)} s after "
             f"{self._livelock_limit} events: these keep each other going: {cycle}. Give one of "
             "them a timer or a delay, or raise livelock_limit in the job if this is meant to end"
         )

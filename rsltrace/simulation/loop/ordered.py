@@ -192,7 +192,7 @@ class OrderedLoop(EventLoop):
     def _must_wait(self, ready: list[Candidate]) -> bool:
         """Whether what is ready has to wait; if so, look again when that is over."""
         assert self.hold_until is not None
-        until_ns = self.hold_until(ready, ChoicePoint(self.now_ns, self.events))
+        until_ns = self.hold_until(ready, ChoicePoint(self.now_ns, self.events, self.origin_ns))
         self._held_until_ns = -1 if until_ns is None else until_ns
         if until_ns is None:
             return False
@@ -241,7 +241,7 @@ class OrderedLoop(EventLoop):
 
         :raises RunError: the policy fails.
         """
-        moment = ChoicePoint(self.now_ns, self.events)
+        moment = ChoicePoint(self.now_ns, self.events, self.origin_ns)
         choice = self._chosen(ready, moment)
         if self.on_choice is not None:
             self.on_choice(ready, choice, moment)

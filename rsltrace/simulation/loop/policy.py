@@ -76,10 +76,16 @@ class Candidate:
 
 
 class ChoicePoint(NamedTuple):
-    """When a policy is asked: simulated time, and how many events have run."""
+    """When a policy is asked: simulated time, how many events have run, the start of the run."""
 
     now_ns: int
     events: int
+    start_ns: int = 0
+
+    @property
+    def seconds(self) -> str:
+        """The time since the start of the run."""
+        return format_seconds(self.now_ns - self.start_ns)
 
 
 class ExecutionPolicy(Protocol):
@@ -215,7 +221,7 @@ def _cannot_depart(
     more = ", …" if len(ready) > _SHOWN else ""
     return RunError(
         f"policy: departures: choice {departure.choice} cannot be {what}: at "
-        f"{format_seconds(moment.now_ns)} s (event {moment.events}) ready are {names}{more}. "
+        f"{moment.seconds} s (event {moment.events}) ready are {names}{more}. "
         "Nodes, job or input differ from those that the departures were made for"
     )
 

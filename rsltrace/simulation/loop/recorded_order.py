@@ -110,7 +110,7 @@ class RecordedOrder:
     ) -> RunError:
         names = ", ".join(f"{c.node}: {c.kind} {c.entity}" for c in ready[:_SHOWN])
         more = ", …" if len(ready) > _SHOWN else ""
-        here = f"here at {format_seconds(moment.now_ns)} s ready are {names}{more}"
+        here = f"here at {moment.seconds} s ready are {names}{more}"
         return self.cannot_follow(moment.events, expected, here)
 
     def cannot_follow(self, index: int, expected: RecordedEvent, here: str) -> RunError:

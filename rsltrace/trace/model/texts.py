@@ -14,8 +14,22 @@ _DIGITS = 6
 _DIGITS_MAX = 17
 
 
+class Stamp(int):
+    """A simulated time (ns) of a run that starts at ``start_ns``: as text it counts from there."""
+
+    start_ns: int
+
+    def __new__(cls, stamp_ns: int, start_ns: int = 0) -> Stamp:
+        self = super().__new__(cls, stamp_ns)
+        self.start_ns = start_ns
+        return self
+
+
 def format_seconds(stamp_ns: int) -> str:
-    """Return ``stamp_ns`` as exact seconds with nine decimals: ``1.500000000``."""
+    """Return a time as exact seconds with nine decimals: ``1.500000000``, and a ``Stamp`` as what
+    commands take: the time since the start of its run."""
+    if isinstance(stamp_ns, Stamp):
+        stamp_ns = stamp_ns - stamp_ns.start_ns
     sign = "-" if stamp_ns < 0 else ""
     whole, fraction = divmod(abs(stamp_ns), NS_PER_S)
     return f"{sign}{whole}.{fraction:09d}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.events import EventWords
+from rsltrace.trace.words.phrases import seconds_text
 
 _EPOCH_NS = 1_000_000 * NS_PER_S
 _SEGMENTS_KEPT = 24
@@ -189,9 +191,16 @@ class Run:
         return int(self.segments["end_stamp"].max()) if len(self.segments) else 0
 
     @cached_property
-    def since_epoch(self) -> bool:
-        """Whether times are those since 1970, as from bags: too long to be read."""
-        return self.start_ns >= _EPOCH_NS
+    def base_ns(self) -> int:
+        """The start of the run, from which times count."""
+        return self.trace.start_ns
+
+    def start_text(self) -> str:
+        """Return the start in simulated time: a date, if times are those since 1970, as of bags."""
+        if self.base_ns < _EPOCH_NS:
+            return f"{seconds_text(self.base_ns)} s"
+        date = datetime.fromtimestamp(self.base_ns // NS_PER_S, tz=timezone.utc)
+        return f"{date:%Y-%m-%d %H:%M:%S} UTC"
 
     def input_of(self, event: EventRecord) -> Output | None:
         """Return the output that was the input of ``event``, or None if no event caused it.

@@ -96,7 +96,7 @@ def run_page(
             for one in session.chains.get("a", ())[:_ROWS_MAX]
             if (of := one.latency) is not None
         ],
-        logs=[*_logs(logs)],
+        logs=[*_logs(run, logs)],
         log_count=len(logs.lines),
         plots=[*_plots(run)],
         commands=[] if is_native(trace) else [f"rsltrace view {path_word(trace.name)}{at}"],
@@ -119,12 +119,13 @@ def _sections(found: Sequence[OverviewSection]) -> Iterator[tuple[str, ...]]:
         yield (one.name, one.kind, one.node, f"{one.count:,}", rate, f"{one.share:.1%}", *times)
 
 
-def _logs(logs: Logs) -> Iterator[tuple[str, ...]]:
+def _logs(run: Run, logs: Logs) -> Iterator[tuple[str, ...]]:
     """Yield warnings and worse; without any, the last records."""
     worse = [line for line in logs.lines if line.record.level >= LEVEL_WARN]
     for line in (worse or logs.lines[-_LOGS_MAX:])[:_LOGS_MAX]:
         record = line.record
-        yield f"{line.stamp_ns / 1e9:.6f}", record.level_name, record.name, line.text, record.place
+        time = f"{(line.stamp_ns - run.base_ns) / 1e9:.6f}"
+        yield time, record.level_name, record.name, line.text, record.place
 
 
 def _graph(trace: Trace, draw: Callable[[GraphOverview], str]) -> Markup | None:

@@ -246,13 +246,13 @@ def _chain(first: Divergence, aligned: AlignedRows, clock: Clock) -> Iterator[Ch
 
     steps = [(view, step) for step in first.chain if (view := _either(step.a, step.b))]
     rows = [
-        (place(s.a, s.b), view.stamp_ns, f"{i + 1}. {printable(_step(s))}")
+        (place(s.a, s.b), int(view.stamp_ns), f"{i + 1}. {printable(_step(s))}")
         for i, (view, s) in enumerate(steps)
     ]
     here = _either(first.a, first.b)
     at = place(first.a, first.b)
     if here is not None and (not rows or rows[-1][0] != at):
-        rows.append((at, here.stamp_ns, f"divergence: {_event(here)}"))
+        rows.append((at, int(here.stamp_ns), f"divergence: {_event(here)}"))
     if not rows:
         return
     rows.sort()

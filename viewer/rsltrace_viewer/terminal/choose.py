@@ -6,7 +6,7 @@ import os
 import shlex
 import shutil
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar
@@ -59,11 +59,21 @@ def question_of(kind: str, session: Session) -> Question:
             "go to time",
             "seconds after the start, or 20ms, 3us; @ and a simulated time",
             "",
-            parse_time_in_run,
+            _check_time(session),
         ),
         "index": Question("index", "go to event", _numbers(session), "", parse_index),
     }
     return questions[kind]
+
+
+def _check_time(session: Session) -> Callable[[str], object]:
+    """Return a function that raises ValueError for what is no time of the runs."""
+
+    def check(text: str) -> None:
+        for run in session.shown.values():
+            parse_time_in_run(text).stamp_ns(run.base_ns, run.end_ns)
+
+    return check
 
 
 def _numbers(session: Session) -> str:

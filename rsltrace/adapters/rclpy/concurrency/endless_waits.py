@@ -81,7 +81,8 @@ def _note_busy_groups(runtime: Runtime, outcome: RunOutcome) -> list[BlockedCall
         for handle, since, _ in waiting:
             name = handle.describe()
             first[name] = min(since, first.get(name, since))
-        named = [f"{name} (since {format_seconds(at)} s)" for name, at in first.items()]
+        origin_ns = runtime.loop.origin_ns
+        named = [f"{n} (since {format_seconds(at - origin_ns)} s)" for n, at in first.items()]
         holders.append(holder)
         outcome.notes.append(
             f"held back for {format_duration(runtime.loop.now_ns - since_ns)} until the end, by a "

@@ -125,7 +125,7 @@ def end_program(runtime: Runtime, program: SimulatedProgram, error: BaseExceptio
     _stop_threads(runtime, program)
     failed = _note_main_end(runtime, program, error)
     idle = [node.fully_qualified_name for node in _nodes(runtime, program) if node.wrapper is None]
-    at = format_seconds(runtime.loop.now_ns)
+    at = format_seconds(runtime.loop.stamp)
     ending = runtime.ending
     if not (ending.unwinding or ending.closing or failed or program.exit_code):
         if not program.spun:
@@ -158,7 +158,7 @@ def crash_program(runtime: Runtime, program: SimulatedProgram) -> None:
     for context in program.contexts:
         context.end()
     program.ended = True
-    at = format_seconds(runtime.loop.now_ns)
+    at = format_seconds(runtime.loop.stamp)
     runtime.domain.outcome.notes.append(f"{program.label} crashed at {at} s, as the job says")
     _has_ended(runtime, program)
 
@@ -208,7 +208,7 @@ def _note_main_end(
         if program.exit_code:
             said = exception_text(error) if not isinstance(getattr(error, "code", 0), int) else ""
             said = f": {said}" if said else ""
-            at = format_seconds(runtime.loop.now_ns)
+            at = format_seconds(runtime.loop.stamp)
             notes.append(f"{program.label} exited with {program.exit_code} at {at} s{said}")
         return False
     if over:

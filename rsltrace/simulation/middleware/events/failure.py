@@ -69,7 +69,7 @@ def describe_exception(
         error,
         handle.describe(),
         node.fully_qualified_name if node is not None else "",
-        dispatcher.loop.now_ns,
+        dispatcher.loop.stamp,
         user_traceback(error),
         exception_text(error),
     )

@@ -38,7 +38,7 @@ class NativeOrderObserver(EventObserver):
         dispatcher = self._dispatcher
         if dispatcher.outcome.ended_after is None:
             event = dispatcher.event
-            self.policy.happened(event.kind, event.entity, dispatcher.loop.now_ns)
+            self.policy.happened(event.kind, event.entity, dispatcher.loop.stamp)
 
     def notes(self) -> Iterator[str]:
         yield from self.policy.notes()
@@ -72,7 +72,7 @@ class RecordedOrderObserver(EventObserver):
             self._is_beyond = True
             return
         self._last = index, expected
-        now_ns = loop.now_ns
+        now_ns = loop.stamp
         name = order.name_of(entity)
         if kind != expected.kind or name not in (None, expected.name):
             if handle is not None and (name is None or not entity):

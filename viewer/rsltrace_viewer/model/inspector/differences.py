@@ -22,7 +22,7 @@ from rsltrace.diff.row_sign import RowSign
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
-from rsltrace.trace.model.texts import format_duration, format_seconds, printable, shortened
+from rsltrace.trace.model.texts import Stamp, format_duration, format_seconds, printable, shortened
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.kinds import SHORT_KINDS
 from rsltrace_viewer.model.comparison import Comparison
@@ -164,7 +164,7 @@ def _title(comparison: Comparison, place: int, row: AlignedRow) -> Iterator[Line
             1, mark, words, Role.LINK, "event.elsewhere", link=row.elsewhere, other_run=other
         )
     stamps = [
-        run.stamp(index)
+        Stamp(run.stamp(index), run.base_ns)
         for run, index in ((comparison.run_a, a), (comparison.run_b, b))
         if index is not None
     ]

@@ -168,9 +168,7 @@ def _title_lines(run: Run, event: EventRecord, outputs: list[Output]) -> Iterato
     entity = entity_of(run, event) or event.kind.label
     title = f"{node_of(run, event)}  {event.kind.label} {entity}"
     yield Line(0, f"event {event.index}", title, Role.SECTION, "event")
-    at = f"{format_seconds(event.stamp_ns)} s"
-    if run.since_epoch:
-        at = f"{format_duration(event.stamp_ns - run.start_ns)} after the start, {at}"
+    at = f"{format_seconds(event.stamp_ns - run.base_ns)} s"
     yield Line(1, "at", at, Role.FIELD, "event.at")
     if EventFlag.RAISED in event.flags:
         raised = next((o for o in outputs if o.kind is OutputKind.EXCEPTION), None)
@@ -374,7 +372,9 @@ def _detail_lines(run: Run, event: EventRecord, openness: Openness) -> Iterator[
 
 
 def _details(run: Run, event: EventRecord) -> Sequence[tuple[str, str]]:
-    rows = [("since start", format_duration(event.stamp_ns - run.start_ns))]
+    rows = [("since start", format_duration(event.stamp_ns - run.base_ns))]
+    if run.base_ns:
+        rows.append(("simulated time", f"{format_seconds(event.stamp_ns)} s"))
     if event.index:
         before = event.stamp_ns - run.stamp(event.index - 1)
         rows.append(("since the event before", format_duration(before)))
@@ -390,15 +390,15 @@ def _details(run: Run, event: EventRecord) -> Sequence[tuple[str, str]]:
         rows.append(("state hash", f"{event.state_hash:016x}"))
     entity = run.entities.get(event.entity)
     if entity is not None and entity.id:
-        rows += _entity_details(entity)
+        rows += _entity_details(run, entity)
     return rows
 
 
-def _entity_details(entity: Entity) -> list[tuple[str, str]]:
+def _entity_details(run: Run, entity: Entity) -> list[tuple[str, str]]:
     rows = [("entity", f"#{entity.id} {entity.kind.label} {entity.name}")]
     if entity.type:
         rows.append(("type", entity.type))
-    rows.append(("created", f"{format_seconds(entity.created_ns)} s"))
+    rows.append(("created", f"{format_seconds(entity.created_ns - run.base_ns)} s"))
     for key, value in entity.detail.items():
         if key == "period_ns" and isinstance(value, int):
             rows.append(("period", format_duration(value)))

@@ -37,7 +37,6 @@ class RunPlots:
         *,
         topic: str,
         stamp_ns: int | None,
-        base_ns: int = 0,
         diff: Diff | None = None,
         chains: Sequence[str] = (),
     ) -> None:
@@ -45,7 +44,6 @@ class RunPlots:
         self._title = title
         self._topic = topic
         self._stamp_ns = stamp_ns
-        self._base_ns = base_ns
         self._diff = diff
         self._chains = list(dict.fromkeys(chains))
 
@@ -105,7 +103,7 @@ class RunPlots:
 
     def cursor_s(self) -> float | None:
         """Return the time of the selected event."""
-        return None if self._stamp_ns is None else (self._stamp_ns - self._base_ns) / 1e9
+        return None if self._stamp_ns is None else (self._stamp_ns - self._runs[0].base_ns) / 1e9
 
     def series(self, source: PlotSource) -> Iterator[list[Series]]:
         """Yield the series of each run. Raises TraceError."""
@@ -113,11 +111,12 @@ class RunPlots:
         for run in self._runs:
             latest = None
             for latest in series_of(run, source):
-                yield [*done, self._since_base(latest)]
-            done.append(self._since_base(latest) if latest is not None else _NOTHING)
+                yield [*done, _since_start(run, latest)]
+            done.append(_since_start(run, latest) if latest is not None else _NOTHING)
         yield done
 
-    def _since_base(self, one: Series) -> Series:
-        if not self._base_ns:
-            return one
-        return Series(np.asarray(one.times - self._base_ns / 1e9), one.values, one.note)
+
+def _since_start(run: Run, one: Series) -> Series:
+    if not run.base_ns:
+        return one
+    return Series(np.asarray(one.times - run.base_ns / 1e9), one.values, one.note)

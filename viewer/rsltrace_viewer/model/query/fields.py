@@ -269,10 +269,10 @@ def whole_number(text: str) -> int:
 
 
 def _read_time(run: Run, token: Token) -> EventFilter:
-    start_ns = run.trace.start_ns
+    start_ns, end_ns = run.trace.start_ns, run.end_ns
 
     def stamp_ns(text: str) -> int:
-        return parse_time_in_run(text).stamp_ns(start_ns)
+        return parse_time_in_run(text).stamp_ns(start_ns, end_ns)
 
     return conditions.Between("stamp", *number_range(token, stamp_ns, "a time"))
 

@@ -354,7 +354,9 @@ class RecordingSession:
         topic, pairs = self.topics(self.keys[self.place])[0] if self.keys else None, self.pairs
         if topic is None or not pairs.count:
             return
-        place = bisect_left(topic.stamps, time.stamp_ns(self.recordings[0].start_ns))
+        place = bisect_left(
+            topic.stamps, time.stamp_ns(self.recordings[0].start_ns, self.recordings[0].end_ns)
+        )
         later = np.flatnonzero(pairs.a >= place)
         self.row = int(later[0]) if len(later) else pairs.count - 1
 
@@ -368,7 +370,9 @@ class RecordingSession:
             return
         order = np.argsort(every, kind="stable")
         if number is None:
-            number = int(np.searchsorted(every[order], time.stamp_ns(recording.start_ns)))
+            number = int(
+                np.searchsorted(every[order], time.stamp_ns(recording.start_ns, recording.end_ns))
+            )
         found = int(order[min(number, len(every) - 1)])
         ends = np.cumsum([len(one) for one in stamps])
         which = int(np.searchsorted(ends, found, side="right"))

@@ -51,14 +51,13 @@ class EventText:
 
 
 class EventTexts:
-    """Events of a run in words; what was shown last is kept. Times count from ``base_ns`` on."""
+    """Events of a run in words; what was shown last is kept."""
 
-    def __init__(self, run: Run, base_ns: int = 0) -> None:
+    def __init__(self, run: Run) -> None:
         self._run = run
-        self._base_ns = base_ns
         self.of = lru_cache(maxsize=_ROWS_KEPT)(self._of)
         self.index_width = max(len(str(max(run.count - 1, 0))), 5)
-        self.time_width = len(format_seconds(run.end_ns - base_ns))
+        self.time_width = len(format_seconds(run.end_ns - run.base_ns))
         names = [run.node_name(e.id) for e in run.entities.values()]
         self.node_width = min(max(map(len, names), default=5), _NODE_WIDTH_MAX)
         entities = (_short(run.entity_name(e.id)) for e in run.entities.values())
@@ -82,7 +81,7 @@ class EventTexts:
         ]
         return EventText(
             index=index,
-            time=format_seconds(event.stamp_ns - self._base_ns),
+            time=format_seconds(event.stamp_ns - run.base_ns),
             node=node_of(run, event),
             kind=SHORT_KINDS[event.kind],
             entity=entity_of(run, event),

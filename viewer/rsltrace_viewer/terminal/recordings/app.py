@@ -9,7 +9,7 @@ from textual import events
 from textual.binding import Binding
 from textual.widget import Widget
 
-from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+from rsltrace.job.values.times import TimeError, TimeInRun, parse_time_in_run
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.query.parser import complete
@@ -174,8 +174,12 @@ class RecordingApp(RecordingShell):
                 if event.text.strip():
                     self.action_next_match(1)
             elif event.text.strip():
-                self.session.go_to_time(parse_time_in_run(event.text))
-                self._show_messages()
+                try:
+                    self.session.go_to_time(parse_time_in_run(event.text))
+                except TimeError as error:
+                    self._say(str(error))
+                else:
+                    self._show_messages()
 
     def first_read(self) -> None:
         """Go where one wants to be, and filter."""

@@ -87,7 +87,7 @@ class LogScreen(Screen[Event | None]):
         run, line = self._lines[number]
         record = line.record
         style = "error" if record.level >= 40 else "warning" if record.level >= 30 else "plain"
-        time = format_seconds(line.stamp_ns - self._session.base_ns)[:-3]
+        time = format_seconds(line.stamp_ns - self._session.runs[run].base_ns)[:-3]
         return (
             (f"{run} " if self._session.b is not None else "", "link"),
             (f"{time:>12} ", "muted"),
