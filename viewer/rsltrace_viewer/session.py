@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.row_sign import RowSign
@@ -16,6 +17,7 @@ from rsltrace.trace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import format_duration
 from rsltrace.trace.native import is_native, refuse_native
+from rsltrace.trace.words.node_colours import node_colours
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.folder import Bookmarks, Event, VisitedEvents
@@ -140,6 +142,7 @@ class Session:
         self._texts["a"] = EventTexts(run)
         self.values["a"] = RowValues(run)
         self._names = self._short_names()
+        self.__dict__.pop("node_colours", None)
         self.view = OneRun(run.count)
         self.rows = AllRows(run.count)
         self.lane_window.replace_run(run)
@@ -237,13 +240,18 @@ class Session:
             deltas=two and self.comparison is not None and self.comparison.rows.shifted,
             relative=any(run.base_ns for run in self.shown.values()),
         )
-        return layout(space, self._names)
+        return replace(layout(space, self._names), colours=self.node_colours)
 
     def _short_names(self) -> dict[str, ShortNames]:
         return {
             column: ShortNames(set[str]().union(*(t.names[column] for t in self._texts.values())))
             for column in ("node", "entity")
         }
+
+    @cached_property
+    def node_colours(self) -> dict[str, int]:
+        """The colour of each node of the runs, by its name."""
+        return node_colours(node.name for run in self.runs.values() for node in run.nodes)
 
     def row(self, row: int) -> EventRow:
         """Return a row of the event list."""

@@ -16,6 +16,7 @@ from xml.sax.saxutils import escape
 from rsltrace.errors import SetupError
 from rsltrace.simulation.middleware.overview import GraphEnd, GraphLink, GraphOverview
 from rsltrace.trace.model.texts import printable
+from rsltrace.trace.words.node_colours import NODE_COLOURS, node_colours
 
 _CHARACTER = 7.3
 _ROW = 54.0
@@ -47,6 +48,8 @@ class _Box:
     kind: str
     title: str
     lonely: bool = False
+    colour: int | None = None
+    """Of a node, its place in ``NODE_COLOURS``."""
     x: float = 0.0
     y: float = 0.0
 
@@ -78,6 +81,9 @@ def graph_svg(overview: GraphOverview, *, in_page: bool = False) -> str:
     if edges:
         _lay_out(boxes, edges)
     _place_alone(boxes, edges)
+    colours = node_colours(box.label for box in boxes if box.kind == "node")
+    for box in boxes:
+        box.colour = colours[box.label] if box.kind == "node" else None
     return "\n".join(_svg(boxes, edges, in_page)) + "\n"
 
 
@@ -229,7 +235,7 @@ def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
     for edge in edges:
         yield _path(boxes[edge.source], boxes[edge.target], edge)
     for box in boxes:
-        yield _drawn(box)
+        yield _drawn(box, in_page)
     yield "</svg>"
 
 
@@ -263,14 +269,19 @@ def _straight(source: _Box, target: _Box, edge: _Edge) -> str:
     return path
 
 
-def _drawn(box: _Box) -> str:
+def _drawn(box: _Box, in_page: bool) -> str:
     width, x, y = box.width, box.x - box.width / 2, box.y - _BOX_HEIGHT / 2
     radius = 6 if box.kind == "node" else _BOX_HEIGHT / 2
     lonely = " lonely" if box.lonely else ""
+    stroke = ""
+    if box.colour is not None:
+        dark, light = NODE_COLOURS[box.colour]
+        colour = f"light-dark({light}, {dark})" if in_page else light
+        stroke = f' style="stroke: {colour}; stroke-width: 2"'
     label, title = escape(printable(box.label)), escape(printable(box.title))
     return (
         f'<g class="{box.kind}{lonely}"><title>{title}</title>'
         f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{_BOX_HEIGHT:.0f}" '
-        f'rx="{radius:.0f}"/><text x="{box.x:.1f}" y="{box.y + 4:.1f}" '
+        f'rx="{radius:.0f}"{stroke}/><text x="{box.x:.1f}" y="{box.y + 4:.1f}" '
         f'text-anchor="middle">{label}</text></g>'
     )

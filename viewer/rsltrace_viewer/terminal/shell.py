@@ -54,19 +54,16 @@ class Shell(App[None]):
     #body { height: 1fr; layout: vertical; }
     #timeline { height: 5fr; width: 1fr; }
     #detail { height: 4fr; width: 1fr; layout: horizontal; }
-    #inspector { height: 1fr; width: 1fr; border-top: solid $panel; }
+    #inspector { height: 1fr; width: 1fr; }
     #source { height: 1fr; width: 1fr; display: none; }
     .with-source #source { display: block; }
     .wide #body { layout: horizontal; }
     .wide #timeline { height: 1fr; width: 5fr; }
     .wide #detail { layout: vertical; width: 3fr; height: 1fr; border-left: solid $panel; }
-    .wide #inspector { height: 5fr; border-top: none; }
+    .wide #inspector { height: 5fr; }
     .wide #source { height: 4fr; }
     .low #lanes { display: none; }
     .lowest #detail { display: none; }
-    #inspector:focus { border-top: solid $accent; }
-    .wide #inspector:focus { border-top: none; }
-    .wide #detail:focus-within { border-left: solid $accent; }
     .only-timeline #lanes, .only-timeline #detail { display: none; }
     .only-inspector #lanes, .only-inspector #timeline, .only-inspector #source { display: none; }
     .only-source #timeline, .only-source #inspector, .only-source #lanes { display: none; }
@@ -219,7 +216,8 @@ class Shell(App[None]):
         screen.set_class(height < 16, "low")
         screen.set_class(height < 11 or (width < WIDE and height < 14), "lowest")
         labels = self.session.lane_window.labels(self.session.view)
-        self.lanes.fit_labels(labels, width, two=self.session.b is not None)
+        two, colours = self.session.b is not None, self.session.node_colours
+        self.lanes.fit_labels(labels, width, colours, two=two)
         rows = min(len(labels), max(4, height // 5))
         self._more_lanes = max(1 - rows, min(self._more_lanes, len(labels) - rows))
         self.lanes.styles.height = rows + self._more_lanes + 1

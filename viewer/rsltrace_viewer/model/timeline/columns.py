@@ -205,6 +205,8 @@ class ColumnLayout:
     columns: tuple[tuple[EventColumn, int], ...] = ()
     names: Mapping[str, ShortNames] = field(default_factory=dict, compare=False)
     """By column, the names that may stand there: they are cut so that they stay distinct."""
+    colours: Mapping[str, int] = field(default_factory=dict, compare=False)
+    """By node, its place in ``NODE_COLOURS``."""
 
     def header(self) -> str:
         """Return the line of titles."""

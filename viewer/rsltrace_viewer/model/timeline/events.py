@@ -16,6 +16,7 @@ from rsltrace.trace.model.event import (
     RandomDecision,
     decision_duration,
 )
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 from rsltrace.trace.model.texts import format_seconds, printable, shortened
 from rsltrace.trace.words.entities import RUN_NAME
 from rsltrace.trace.words.kinds import SHORT_KINDS
@@ -117,9 +118,13 @@ def event_text(run: Run, event: EventRecord) -> str:
     return f"{event.index}  {node_of(run, event)} {kind} {entity_of(run, event)}".rstrip()
 
 
-def _is_execution_time(output: Output) -> bool:
-    is_draw = output.kind is OutputKind.DRAW
-    return is_draw and decision_duration(output.hash, RandomDecision.EXECUTION) is not None
+def _lateness(run: Run, output: Output) -> int:
+    """Return how late an output is said: how long a callback took says least of what it did, and
+    each constructor announces its parameters."""
+    if output.kind is OutputKind.DRAW:
+        return 2 * (decision_duration(output.hash, RandomDecision.EXECUTION) is not None)
+    of = run.entities.get(output.entity)
+    return int(of is not None and of.name == PARAMETER_EVENTS)
 
 
 def outputs_text(
@@ -131,8 +136,7 @@ def outputs_text(
     """Return what an event did as one line; ``more`` gives what else to say of an output."""
     parts: list[str] = []
     length = 0
-    # How long a callback took says least of what it did.
-    ordered = sorted(outputs, key=_is_execution_time)
+    ordered = sorted(outputs, key=lambda output: _lateness(run, output))
     for text in run.words.outputs(ordered, more):
         parts.append(text)
         length += len(text)

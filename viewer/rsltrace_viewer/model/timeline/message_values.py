@@ -5,10 +5,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -113,6 +114,35 @@ def _transform(one: Any) -> str:
     return f"{frames} {_values(one.transform)}"
 
 
+def _odometry(message: Any) -> str:
+    velocity = message.twist.twist
+    moves = [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
+    return " ".join([_values(message.pose.pose), *moves])
+
+
+def _imu(message: Any) -> str:
+    turns = [*_named("", message.angular_velocity, TURNS)]
+    texts = [*turns, *_named("a", message.linear_acceleration)]
+    return " ".join(texts) or "ω=0 a=0"
+
+
+def _named(before: str, vector: Any, names: Mapping[str, str] = MappingProxyType({})) -> list[str]:
+    """Return the parts of a vector that are not zero, each with its name."""
+    found = ((axis, number(float(getattr(vector, axis)))) for axis in "xyz")
+    return [f"{before}{names.get(axis, axis)}={text}" for axis, text in found if text != "0"]
+
+
+def _fix(message: Any) -> str:
+    if message.status.status < 0:
+        return "no fix"
+    return f"{message.latitude:.6f}°, {message.longitude:.6f}°, {number(message.altitude)} m high"
+
+
+def _parameters(message: Any) -> str:
+    changed = [one.name for one in (*message.new_parameters, *message.changed_parameters)]
+    return _first_of([_cut(name) for name in changed[:1]], changed)
+
+
 def _scan(message: Any) -> str:
     ranges = np.asarray(message.ranges, dtype=np.float64)
     seen = ranges[np.isfinite(ranges)]
@@ -194,11 +224,15 @@ _SUMMARIES: dict[str, Callable[[Any], str]] = {
     "diagnostic_msgs/msg/DiagnosticArray": _diagnostics,
     "geometry_msgs/msg/TransformStamped": _transform,
     "nav_msgs/msg/OccupancyGrid": _grid,
+    "nav_msgs/msg/Odometry": _odometry,
     "nav_msgs/msg/Path": _path,
+    "rcl_interfaces/msg/ParameterEvent": _parameters,
     "sensor_msgs/msg/CompressedImage": _compressed_image,
     "sensor_msgs/msg/Image": _image,
+    "sensor_msgs/msg/Imu": _imu,
     "sensor_msgs/msg/JointState": _joint_state,
     "sensor_msgs/msg/LaserScan": _scan,
+    "sensor_msgs/msg/NavSatFix": _fix,
     "sensor_msgs/msg/PointCloud2": _cloud,
     "tf2_msgs/msg/TFMessage": _transforms,
     "trajectory_msgs/msg/JointTrajectory": _trajectory,

@@ -8,6 +8,7 @@ from textual import events
 from textual.app import App, ComposeResult
 from textual.containers import Container
 from textual.content import Content
+from textual.geometry import Size
 from textual.widgets import Static
 
 from rsltrace.diff.row_sign import RowSign
@@ -24,6 +25,7 @@ from rsltrace_viewer.terminal.widgets.prompt import Prompt
 
 _WIDE = 110
 _WIDE_OF_TWO = 170
+_TOPICS_LEAST = 3
 _TIME = 12
 _STYLES = {
     RowSign.MATCH: "muted",
@@ -42,15 +44,14 @@ class RecordingShell(App[None]):
     CSS = """
     Screen { layout: vertical; overflow: hidden; }
     #body { height: 1fr; layout: vertical; }
-    #topics { height: 2fr; width: 1fr; }
-    #messages { height: 3fr; width: 1fr; border-top: solid $panel; }
-    #message { height: 3fr; width: 1fr; border-top: solid $panel; }
+    ListView { border-top: solid $panel; border-title-color: $text-muted; }
+    ListView:focus { border-top: heavy $primary; border-title-color: $text; }
+    #lists { height: 3fr; width: 1fr; layout: vertical; }
+    #message { height: 2fr; width: 1fr; }
     #footer { height: 1; background: $panel; padding: 0 1; }
-    .wide #body { layout: grid; grid-size: 2 2; grid-columns: 3fr 5fr; grid-rows: 1fr 1fr; }
-    .wide #topics { row-span: 2; height: 1fr; }
-    .wide #messages, .wide #message { height: 1fr; border-left: solid $panel; }
-    .wide.two #body { grid-columns: 1fr 2fr; }
-    #messages:focus, #message:focus { border-top: solid $accent; }
+    .wide #body { layout: horizontal; }
+    .wide #lists { height: 1fr; width: 3fr; }
+    .wide #message { height: 1fr; width: 2fr; border-left: solid $panel; }
     """
 
     def __init__(self, session: RecordingSession, *, light: bool = False) -> None:
@@ -73,8 +74,9 @@ class RecordingShell(App[None]):
         """Make the parts."""
         yield HeaderBar(id="header")
         with Container(id="body"):
-            yield ListView(id="topics")
-            yield ListView(id="messages")
+            with Container(id="lists"):
+                yield ListView(id="topics")
+                yield ListView(id="messages")
             yield Inspector(id="message")
         yield Prompt(id="prompt")
         yield Static(id="footer")
@@ -82,7 +84,7 @@ class RecordingShell(App[None]):
     def on_mount(self) -> None:
         """Show the topics, and read."""
         self.topics.focus()
-        self._fit(self.size.width)
+        self._fit(self.size)
         self._show_all()
         walk(self, "read", self.session.read(), self._read, at_once_s=0)
 
@@ -117,14 +119,15 @@ class RecordingShell(App[None]):
 
     # Drawing.
 
-    def _fit(self, width: int) -> None:
+    def _fit(self, size: Size) -> None:
         wide = _WIDE_OF_TWO if self.session.two else _WIDE
-        self.screen_stack[0].set_class(width >= wide, "wide")
-        self.screen_stack[0].set_class(self.session.two, "two")
+        self.screen_stack[0].set_class(size.width >= wide, "wide")
+        most = max(size.height // 3, _TOPICS_LEAST)
+        self.topics.styles.height = min(len(self.session.keys), most) + 1
 
     def on_resize(self, event: events.Resize) -> None:
         """Use the new size."""
-        self._fit(event.size.width)
+        self._fit(event.size)
         self.call_after_refresh(self._show_all)
 
     def _show_all(self) -> None:
@@ -140,6 +143,7 @@ class RecordingShell(App[None]):
             width=self.size.width,
         )
         self.topics.show(self._topic, len(session.keys))
+        self.topics.border_title = " topics: messages, rate "
         self._show_messages()
         self._show_footer()
 
@@ -147,6 +151,8 @@ class RecordingShell(App[None]):
         messages, session = self.messages, self.session
         messages.cursor = session.row
         messages.show(self._message, session.pairs.count)
+        topic = session.topic_text(session.place)[0] if session.keys else "no topic"
+        messages.border_title = Content(f" {topic}: number, time in s, values ")
         messages.call_after_refresh(messages.scroll_to_cursor)
         self._show_message()
 

@@ -16,7 +16,7 @@ from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.logs import LogLine, event_of
 from rsltrace_viewer.model.view import fit
 from rsltrace_viewer.session import RUN_B, Session
-from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
+from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces, node_piece
 
 _LEVELS = ((0, "all"), (30, "warnings and worse"), (40, "errors"))
 _NAME = 20
@@ -87,12 +87,14 @@ class LogScreen(Screen[Event | None]):
         run, line = self._lines[number]
         record = line.record
         style = "error" if record.level >= 40 else "warning" if record.level >= 30 else "plain"
+        node = f"/{record.name.replace('.', '/')}"
+        colour = self._session.node_colours.get(node)
         time = format_seconds(line.stamp_ns - self._session.runs[run].base_ns)[:-3]
         return (
             (f"{run} " if self._session.b is not None else "", "link"),
             (f"{time:>12} ", "muted"),
             (f"{record.level_name:<5} ", style),
-            (fit(printable(record.name), _NAME) + " ", "link"),
+            node_piece(fit(printable(record.name), _NAME) + " ", colour),
             (line.text, style),
         )
 

@@ -33,7 +33,7 @@ from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.keys import KEYS
 from rsltrace_viewer.terminal.widgets.bars import HeaderBar
-from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
+from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces, node_piece
 
 _BAR = 12
 _NUMBERS = 19
@@ -281,7 +281,9 @@ class OverviewScreen(Screen[Choice | None]):
         for row in rows[:most]:
             some = _some(row)
             bar = "█" * round(some.share * bars / largest) or "▏"
-            pieces = [(fit(_name(row, field), names) + " ", "plain"), (fit(bar, bars) + " ", "bar")]
+            colour = None if field == "topic" else self._session.node_colours.get(some.node)
+            pieces = [node_piece(fit(_name(row, field), names) + " ", colour)]
+            pieces.append((fit(bar, bars) + " ", "bar"))
             differ = len({part.count if part else 0 for part in row}) > 1
             pieces += [(_numbers(part), "error" if differ else "plain") for part in row]
             pieces += [(f"{text(row):>{_TIMES}}", "muted") for _, text in columns]
@@ -366,7 +368,8 @@ def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[_Column]:
     """Yield the columns of durations that there is something for: their heads, and their texts."""
     what = "mean, max" if runs == 1 else "means a, b"
     for words, of in _TIMES_OF.items():
-        if any(part is not None and of(part) for row in rows for part in row):
+        found = [of(part) for row in rows for part in row if part is not None]
+        if any(one is not None and one.most_ns for one in found):
             busy = words == "takes" and runs == 1
             yield f"{words}: {what}{', busy' * busy}", partial(_times, of, busy=busy)
 

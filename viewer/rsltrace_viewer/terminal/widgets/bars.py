@@ -11,6 +11,7 @@ from textual.widget import Widget
 from textual.widgets import Static
 
 from rsltrace.trace.model.texts import printable
+from rsltrace.trace.words.node_colours import NODE_COLOURS
 from rsltrace_viewer.model.view import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 
@@ -20,6 +21,16 @@ from rsltrace_viewer.terminal.keys import footer_keys
 def background_of(style: Style) -> Style:
     """Return what of ``style`` lies over others: its background and weight, not its colour."""
     return Style(bgcolor=style.bgcolor, bold=style.bold)
+
+
+FOCUSED = "▌"
+"""At the left of the title of the pane that has the focus, for screens without colours, too."""
+
+
+def node_style(widget: Widget, colour: int) -> Style:
+    """Return the colour of a node, that of ``NODE_COLOURS`` for the widget's theme."""
+    dark, light = NODE_COLOURS[colour]
+    return Style(color=dark if widget.app.current_theme.dark else light)
 
 
 def set_virtual_size(view: ScrollView, size: Size) -> None:

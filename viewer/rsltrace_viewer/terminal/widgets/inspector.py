@@ -30,7 +30,8 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
     }
     DEFAULT_CSS = """
     Inspector { background: $surface; scrollbar-size: 1 1; overflow-x: hidden;
-                overflow-y: scroll; padding: 0 0 0 1; }
+                overflow-y: scroll; padding: 0 0 0 1; border-top: solid $panel; }
+    Inspector:focus { border-top: heavy $primary; }
     Inspector > .inspector--section { color: $text; text-style: bold; }
     Inspector > .inspector--label { color: $text-muted; }
     Inspector > .inspector--field { color: $text; }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 from rich.segment import Segment as Piece
@@ -17,6 +18,7 @@ from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.lanes import Lane, Lanes, axis_text
 from rsltrace_viewer.model.timeline.columns import ShortNames
 from rsltrace_viewer.model.view import cells, fit
+from rsltrace_viewer.terminal.widgets.bars import FOCUSED, node_style
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LABEL_MAX = 28
@@ -29,6 +31,7 @@ class LanesView(Widget, can_focus=True):
         f"lanes--{name}"
         for name in (
             "axis",
+            "focused",
             "label",
             "own",
             "bar",
@@ -46,6 +49,7 @@ class LanesView(Widget, can_focus=True):
     DEFAULT_CSS = """
     LanesView { background: $surface; height: 6; }
     LanesView > .lanes--axis { color: $text-muted; }
+    LanesView > .lanes--focused { color: $text; text-style: bold; background: $primary; }
     LanesView > .lanes--label { color: $text-muted; }
     LanesView > .lanes--own { color: $text; text-style: bold; }
     LanesView > .lanes--bar { color: $text-primary; }
@@ -87,6 +91,7 @@ class LanesView(Widget, can_focus=True):
         self._two = False
         self._label_width = 8
         self._names = ShortNames(())
+        self._colours: Mapping[str, int] = {}
         self._styles: dict[str, Style] = {}
 
     @property
@@ -98,9 +103,12 @@ class LanesView(Widget, can_focus=True):
     def _before_lanes(self) -> int:
         return self._label_width + (4 if self._two else 2)
 
-    def fit_labels(self, labels: list[str], width: int, *, two: bool = False) -> None:
-        """Make room for the names of the lanes (of ``two`` runs) in ``width`` cells."""
-        self._two = two
+    def fit_labels(
+        self, labels: list[str], width: int, colours: Mapping[str, int], *, two: bool = False
+    ) -> None:
+        """Make room for the names of the lanes (of ``two`` runs) in ``width`` cells, in the
+        ``colours`` of their nodes."""
+        self._two, self._colours = two, colours
         shown = [printable(label) for label in labels]
         longest = max(map(cells, shown), default=4)
         self._names = ShortNames(shown)
@@ -174,6 +182,14 @@ class LanesView(Widget, can_focus=True):
         event.stop()
         self.post_message(self.Zoomed(-1))
 
+    def on_focus(self) -> None:
+        """Mark the line of times."""
+        self.refresh()
+
+    def on_blur(self) -> None:
+        """Mark the line of times no more."""
+        self.refresh()
+
     def _pick(self, x: int) -> None:
         column = x - self._before_lanes
         if self.lanes is None or not 0 <= column < self.lanes.columns or column == self.cursor:
@@ -220,8 +236,9 @@ class LanesView(Widget, can_focus=True):
         if y == self.size.height - 1:
             marks = self._divergences
             axis = axis_text(self.lanes, self._position, self.cursor, marks, self.base_ns)
-            text = fit(" " * self._before_lanes + axis, width)
-            return Strip([Piece(text, self._style("axis"))], width)
+            style, mark = ("focused", FOCUSED) if self.has_focus else ("axis", " ")
+            text = fit(mark + " " * (self._before_lanes - 1) + axis, width)
+            return Strip([Piece(text, self._style(style))], width)
         place = self._first_lane() + y
         if place >= len(self.lanes.lanes):
             return Strip([Piece(" " * width, self._style("empty"))], width)
@@ -234,9 +251,12 @@ class LanesView(Widget, can_focus=True):
         label = self._names.fit("" if again else printable(lane.label), self._label_width)
         lead = ">" if own and not again else " "
         run = f" {lane.run}" if self._two else ""
-        pieces = [Piece(f"{lead}{label}{run} ", self._style("own" if own else "label"))]
+        colour = self._colours.get(lane.label)
+        paint = Style() if colour is None else node_style(self, colour)
+        name = self._style("own" if own else "label") + paint
+        pieces = [Piece(f"{lead}{label}{run} ", name)]
         text = lane.letters or "".join(_BLOCKS[level] for level in lane.levels)
-        bar = self._style("bar")
+        bar = self._style("bar") + paint
         for column, character in enumerate(text):
             style = bar
             if column in lane.signs:

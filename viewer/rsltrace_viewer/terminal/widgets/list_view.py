@@ -6,17 +6,24 @@ from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from rich.segment import Segment as Piece
+from rich.style import Style
 from textual import events
 from textual.geometry import Size
 from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
-from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import background_of, node_style, set_virtual_size
 
 STYLES = ("plain", "muted", "title", "good", "error", "warning", "link", "bar")
 Pieces = Sequence[tuple[str, str]]
-"""Texts of a line, each with one of STYLES. They must be printable."""
+"""Texts of a line, each with one of STYLES, or that of ``node_piece``. They must be printable."""
+_NODE = "node-"
+
+
+def node_piece(text: str, colour: int | None) -> tuple[str, str]:
+    """Return a text in the colour of a node, if that has one."""
+    return text, "plain" if colour is None else f"{_NODE}{colour}"
 
 
 class ListView(ScrollView, can_focus=True, inherit_bindings=False):
@@ -123,19 +130,24 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         """Hide the cursor."""
         self.refresh()
 
+    def _style(self, name: str) -> Style:
+        if name.startswith(_NODE):
+            colour = int(name.removeprefix(_NODE))
+            return self._style("plain") + node_style(self, colour)
+        return self.get_component_rich_style(f"list--{name}")
+
     def render_line(self, y: int) -> Strip:
         """Return line ``y`` of the widget."""
         line = round(self.scroll_y) + y
         width = self.scrollable_content_region.width
-        style = self.get_component_rich_style
         if line >= self.count:
-            return Strip([Piece(" " * width, style("list--plain"))], width)
-        pieces = [Piece(text, style(f"list--{name}")) for text, name in self._source(line)]
+            return Strip([Piece(" " * width, self._style("plain"))], width)
+        pieces = [Piece(text, self._style(name)) for text, name in self._source(line)]
         strip = Strip(pieces)
         if strip.cell_length > width:
-            strip = Strip([*strip.crop(0, width - 1), Piece("…", style("list--muted"))])
-        strip = strip.adjust_cell_length(width, style("list--plain"))
+            strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("muted"))])
+        strip = strip.adjust_cell_length(width, self._style("plain"))
         if self.has_focus and line == self.cursor:
-            over = background_of(style("list--cursor"))
+            over = background_of(self._style("cursor"))
             return Strip([Piece(text, (old or over) + over) for text, old, _ in strip], width)
         return strip

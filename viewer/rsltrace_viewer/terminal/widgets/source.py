@@ -20,7 +20,7 @@ class SourceView(VerticalScroll, can_focus=True):
     DEFAULT_CSS = """
     SourceView { background: $surface; scrollbar-size: 1 1; border-top: solid $panel;
                  border-title-color: $text-muted; border-subtitle-color: $text-warning; }
-    SourceView:focus { border-top: solid $accent; }
+    SourceView:focus { border-top: heavy $primary; }
     SourceView Static { width: auto; }
     SourceView #note { color: $text-warning; }
     """

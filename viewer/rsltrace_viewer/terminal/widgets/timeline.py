@@ -14,13 +14,20 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from rsltrace.diff.row_sign import RowSign
-from rsltrace_viewer.model.timeline.columns import ColumnLayout, EventRow
+from rsltrace_viewer.model.timeline.columns import GAP, ColumnLayout, EventRow
 from rsltrace_viewer.model.view import fit
-from rsltrace_viewer.terminal.widgets.bars import background_of, set_virtual_size
+from rsltrace_viewer.terminal.widgets.bars import (
+    FOCUSED,
+    background_of,
+    node_style,
+    set_virtual_size,
+)
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
 _DRAWN_MAX = 1000
+_NODE = "node-"
+"""What a style begins with that is the colour of a node."""
 
 
 _SIGN_STYLES = {
@@ -40,9 +47,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         f"timeline--{name}"
         for name in (
             "header",
+            "focused",
             "muted",
             "time",
-            "node",
             "plain",
             "cursor",
             "related",
@@ -60,9 +67,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     Timeline { background: $background; scrollbar-size: 1 1; overflow-x: hidden;
                overflow-y: scroll; }
     Timeline > .timeline--header { color: $text-muted; text-style: bold; background: $surface; }
+    Timeline > .timeline--focused { color: $text; text-style: bold; background: $primary; }
     Timeline > .timeline--muted { color: $text-muted; }
     Timeline > .timeline--time { color: $text; }
-    Timeline > .timeline--node { color: $text-primary; }
     Timeline > .timeline--plain { color: $text; }
     Timeline > .timeline--cursor { background: $primary 30%; text-style: bold; }
     Timeline > .timeline--related { background: $secondary 25%; }
@@ -190,6 +197,17 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         if event.y >= 1 and row < self._count:
             self.post_message(self.Picked(row))
 
+    def on_focus(self) -> None:
+        """Mark the titles."""
+        self._refresh_titles()
+
+    def on_blur(self) -> None:
+        """Mark the titles no more."""
+        self._refresh_titles()
+
+    def _refresh_titles(self) -> None:
+        self.refresh(Region(0, 0, self.size.width, 1))
+
     def _refresh_row(self, row: int) -> None:
         y = row - round(self.scroll_y) + 1
         if 0 < y < self.size.height:
@@ -198,7 +216,10 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
         if style is None:
-            style = self.get_component_rich_style(f"timeline--{name}")
+            if name.startswith(_NODE):
+                style = self._style("plain") + node_style(self, int(name.removeprefix(_NODE)))
+            else:
+                style = self.get_component_rich_style(f"timeline--{name}")
             if name in ("cursor", "related"):
                 style = background_of(style)
             self._styles[name] = style
@@ -208,7 +229,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         """Return line ``y`` of the widget: the header, or a row."""
         width = self.size.width
         if y == 0:
-            return Strip([Piece(fit(self._columns.header(), width), self._style("header"))], width)
+            style, mark = ("focused", FOCUSED) if self.has_focus else ("header", " ")
+            text = fit(mark + self._columns.header()[GAP:], width)
+            return Strip([Piece(text, self._style(style))], width)
         row = round(self.scroll_y) + y - 1
         if self._source is None or not 0 <= row < self._count:
             text = f"  {self.empty}" if y == 2 and not self._count else ""
@@ -224,7 +247,11 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         lead = ">" if selected else {"cause": "←", "effect": "→"}.get(shown.related, " ")
         pieces = [Piece(lead, self._style("lead"))]
         for column, text in self._columns.cells(shown):
-            pieces.append(Piece(text + " ", self._style(_style_of(column.style, shown))))
+            name = _style_of(column.style, shown)
+            if name == "node":
+                colour = self._columns.colours.get(shown.event.node)
+                name = "muted" if colour is None else f"{_NODE}{colour}"
+            pieces.append(Piece(text + " ", self._style(name)))
         strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))
         over = "cursor" if selected else "related" if shown.related else ""
         if not over:
@@ -238,7 +265,7 @@ def _style_of(style: str, row: EventRow) -> str:
     sign, event = row.sign, row.event
     if style == "sign":
         return "muted" if sign is None else _SIGN_STYLES[sign]
-    if sign in (RowSign.ONLY_A, RowSign.ONLY_B, RowSign.DIFFERS) and style != "time":
+    if sign in (RowSign.ONLY_A, RowSign.ONLY_B, RowSign.DIFFERS) and style not in ("time", "node"):
         return _SIGN_STYLES[sign] if style in ("hash", "outputs") else "plain"
     if style == "mark":
         return {"!": "error", "w": "warning"}.get(row.mark, "mark")

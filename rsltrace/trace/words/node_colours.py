@@ -1,0 +1,36 @@
+"""A colour for each node, the same in the list, the lanes and the graph, and in every run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from zlib import crc32
+
+NODE_COLOURS = (
+    ("#76e2e3", "#086869"),
+    ("#b4cffe", "#2855ad"),
+    ("#ebb9f7", "#7e388e"),
+    ("#91d8fe", "#066386"),
+    ("#cfc5fe", "#6044a6"),
+    ("#719def", "#032e84"),
+    ("#0bb5b6", "#004142"),
+    ("#2eabe1", "#063d54"),
+    ("#c282d0", "#570c66"),
+    ("#a28ee8", "#3f1c7c"),
+)
+"""For a dark and for a light background. Red, amber and green are left out: they mean that runs
+differ."""
+
+
+def node_colours(names: Iterable[str]) -> dict[str, int]:
+    """Return the colour of each node, its place in ``NODE_COLOURS``.
+
+    It follows from the name; of two nodes with the same one, the later name takes the next that is
+    free.
+    """
+    count, found = len(NODE_COLOURS), dict[str, int]()
+    for name in sorted(set(names)):
+        wanted = crc32(name.encode(errors="replace")) % count
+        order = [*range(wanted, count), *range(wanted)]
+        used = set(found.values())
+        found[name] = next((one for one in order if one not in used), wanted)
+    return found
