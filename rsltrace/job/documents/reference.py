@@ -24,7 +24,7 @@ from rsltrace.job.values.times import TIME_SCHEMA
 
 _BOOLEAN = "true or false"
 _LARGE = 10_000
-"""Bounds of numbers beyond this are not shown: nobody comes near them."""
+"""Bounds of numbers beyond this are not shown: they do not matter to a reader."""
 
 _HEAD = """\
 # Jobs: every key

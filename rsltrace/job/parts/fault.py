@@ -52,7 +52,7 @@ class FaultSpec(JobPart):
     )
     duplicate: FullName = Field(
         default=None,
-        description="Topic of a message that arrives twice, `by` apart.",
+        description="Topic of a message that arrives again after `by`.",
         examples=["/scan"],
     )
     delay: FullName = Field(
