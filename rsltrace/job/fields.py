@@ -79,8 +79,7 @@ class JobFields(JobPart):
     )
     ros_arguments: Annotated[tuple[str, ...], check(items(_word))] = Field(
         default=(),
-        description="ROS arguments for all nodes, as after `--ros-args`. They override "
-        "everything else.",
+        description="ROS arguments for all nodes, as after `--ros-args`. They override all else.",
         examples=[["-p", "ekf:rate:=50", "-r", "scan:=/front/scan"]],
     )
     search_path: Annotated[tuple[str, ...], check(items(check_path))] = Field(
@@ -91,19 +90,18 @@ class JobFields(JobPart):
     start_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="start",
-        description="Simulated start time. Default: the first message of the bags, else 0.",
+        description="Simulated start time. Default: the bags' first message, else 0.",
         examples=["10s"],
     )
     construct_time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="construct_time",
-        description="Simulated time at which nodes are constructed. Default: the start.",
+        description="When nodes are constructed. Default: the start.",
         examples=["0s"],
     )
     stop: StopSpec = Field(
         default=StopSpec(),
-        description="What ends the run: the first condition that holds. Default: the end of the "
-        "bags, or no work left.",
+        description="What ends the run. Default: the end of the bags, or no work left.",
         examples=[{"duration": "60s"}],
     )
     seed: Annotated[int, check(whole(0, SEED_MAX))] = Field(
@@ -119,19 +117,18 @@ class JobFields(JobPart):
     )
     livelock_limit: Annotated[int, check(whole(1))] = Field(
         default=LIVELOCK_LIMIT,
-        description="Maximum number of events without progress of simulated time.",
+        description="Maximum number of events at one simulated time.",
         examples=[1000000],
     )
     bags: Annotated[tuple[BagSpec, ...], parts("path")] = Field(
         default=(),
-        description="rosbag2 recordings (MCAP or sqlite3) to play. Messages with equal times "
-        "play in the order of this list. Truncated bags play as far as they go; "
-        "recorded services and actions do not play.",
+        description="rosbag2 recordings (MCAP or sqlite3) to play, also truncated ones; at "
+        "equal times in this order. Recorded services and actions do not play.",
         examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
     )
     progress: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
         default=None,
-        description="Topic for the progress of the bags, a `std_msgs/msg/Float32` from 0 to 1.",
+        description="Topic for the progress of the bags, a `std_msgs/msg/Float32` up to 1.",
         examples=["/rslcpp/progress"],
     )
     hooks: HooksSpec = Field(
@@ -146,8 +143,7 @@ class JobFields(JobPart):
     )
     guard: Annotated[GuardSpec, guard_part] = Field(
         default=GuardSpec(),
-        description="How sources of nondeterminism outside ROS are handled; `false` allows them "
-        "all.",
+        description="How sources of nondeterminism are handled; `false` allows all.",
         examples=[{"clock": "virtual", "thread": "warn"}, False],
     )
     delay: Annotated[DelaysSpec | None, given] = Field(
@@ -158,8 +154,7 @@ class JobFields(JobPart):
 
     policy: Annotated[PolicySpec | None, policy_part] = Field(
         default=None,
-        description="Which ready callback runs next. Default: first come, first served, timers "
-        "last.",
+        description="Which ready callback runs next. Default: `fifo`.",
         examples=["rate_monotonic", {"recorded": "run1.mcap"}],
     )
     threads: Annotated[ThreadsSpec | None, part("switch")] = Field(
@@ -170,19 +165,18 @@ class JobFields(JobPart):
     min_time_step_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="min_time_step",
-        description="Smallest step of simulated time. What is due within a step runs late.",
+        description="Smallest step of simulated time. Work due within a step runs late.",
         examples=["1ms"],
     )
     executors: Annotated[tuple[ExecutorSpec, ...] | None, executors_part] = Field(
         default=None,
-        description="Simulated executors: one for all nodes (`single_threaded`), one for each "
-        "(`per_node`), or a list. Nodes that are not listed have one each.",
+        description="Simulated executors: one for all nodes (`single_threaded`), one for "
+        "each (`per_node`), or a list. Other nodes have one each.",
         examples=["single_threaded", [{"nodes": ["/camera", "/detector"], "workers": 2}]],
     )
     execution: Annotated[ExecutionSpec | None, given] = Field(
         default=None,
-        description="Execution times of callbacks. The executor is busy meanwhile, and outputs "
-        "leave at the end.",
+        description="Execution times of callbacks.",
         examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
     )
     clocks: Annotated[tuple[ClockSpec, ...], clocks_part] = Field(
@@ -196,14 +190,11 @@ class JobFields(JobPart):
     )
     faults: Annotated[tuple[FaultSpec, ...], parts()] = Field(
         default=(),
-        description="Faults at exact times: nodes that crash, hang or restart; messages that are "
-        "lost, late, duplicated or changed.",
+        description="Faults of single nodes and messages, at exact times.",
         examples=[
             [
                 {"crash": "/planner", "at": "2s"},
-                {"restart": "/map", "topic": "/goal", "message": 3, "for": "500ms"},
                 {"drop": "/scan", "message": 12, "to": "/slam"},
-                {"change": "/scan", "message": 30, "field": "ranges[0]", "value": "nan"},
             ]
         ],
     )
@@ -214,7 +205,6 @@ class JobFields(JobPart):
         examples=[
             [
                 {"always": "/odom.pose.pose.position.x < 10"},
-                {"eventually": "/stop", "after": "/scan: min(ranges) < 0.3", "within": "200ms"},
                 {"never": "log error"},
             ]
         ],
@@ -225,17 +215,12 @@ class JobFields(JobPart):
     ] = Field(
         default_factory=dict,
         description="Numbers computed from the finished run, by name.",
-        examples=[
-            {
-                "distance": {"expression": 'last("/odom").pose.pose.position.x', "unit": "m"},
-                "stops": 'count("/stop")',
-            }
-        ],
+        examples=[{"stops": 'count("/stop")'}],
     )
 
     vary: Annotated[VarySpec | None, given] = Field(
         default=None,
-        description="Settings that `rsltrace explore --strategy vary` changes from run to run.",
+        description="Settings that `rsltrace explore --strategy vary` changes.",
         examples=[{"settings": {"nodes.ekf.parameters.rate": [10.0, 50.0]}, "method": "grid"}],
     )
 

@@ -6,6 +6,7 @@ when one has none, or when the file is stale.
 
 from __future__ import annotations
 
+import re
 import textwrap
 from collections.abc import Iterator
 from io import StringIO
@@ -21,19 +22,22 @@ from rsltrace.job.parts.keys import attached, file_fields, models_in
 from rsltrace.job.reading.compose import CompositionKeys
 from rsltrace.job.values.times import TIME_SCHEMA
 
+_BOOLEAN = "true or false"
+_LARGE = 10_000
+"""Bounds of numbers beyond this are not shown: they do not matter to a reader."""
+
 _HEAD = """\
 # Jobs: every key
 
 <!-- Made by `make docs` from the models in rsltrace/job; do not edit. -->
 
 A job file is YAML. `rsltrace init` writes a first one, `rsltrace check job.yaml` checks it without
-running it. A mistake is an error with file, line, column and what was expected. A rule that names a
-topic, service, node or parameter that does not exist is a note of `check` and `record`.
+running it. A mistake is an error with file, line, column and what was expected. A rule for a topic,
+service, node or parameter that does not exist is a note.
 
-- **Times** are seconds (`0.5`), or a number with a unit: `ns`, `us`, `ms`, `s`, `min` or `h`. They
-  are exact.
+- **Times** are seconds (`0.5`), or a number with a unit: `ns`, `us`, `ms`, `s`, `min` or `h`.
 - **Sizes** are bytes, or a number with a unit: `500kB`, `4MiB`.
-- **Paths** are relative to the file that they are in.
+- **Paths** are relative to their file.
 - **Globs** match whole names; `*` also matches `/`.
 - **YAML anchors** work. Keys that begin with `x-` are ignored and may hold them.
 - **Editors** complete and check job files: run `rsltrace schema > job.schema.json`, and begin the
@@ -42,6 +46,8 @@ topic, service, node or parameter that does not exist is a note of `check` and `
   `--set nodes.ekf.parameters.rate=20.0` (a node by name, an entry by number from 0),
   `--set bags.+=../bag` (a new entry), `--set stop.events=null` (no such key). The value is YAML.
   Quote names with a dot. Later ones win.
+
+A type is named only where the example does not show it.
 """
 
 
@@ -116,15 +122,18 @@ def _extends(model: type[BaseModel], other: type[BaseModel]) -> bool:
 
 
 def _entry(key: str, field: FieldInfo) -> list[str]:
-    facts = [_words(field_schema(field), field)]
+    kind = _words(field_schema(field), field)
+    values = [value for value in field.examples or () if not isinstance(value, (bool, int, float))]
+    values = [value for value in values if f"`{flow(value)}`" not in kind]
     default = file_default(field)
+    facts = [] if values and not re.search(r"[`\d]", kind) else [kind]
     if field.is_required():
         facts.append("required")
     elif default is not None and default not in ({}, []):
+        facts = facts if kind != _BOOLEAN else []
         facts.append(f"default `{flow(default)}`")
-    text = f"- **`{key}`** ({'; '.join(facts)}): {(field.description or '').strip()}"
-    values = [value for value in field.examples or () if not isinstance(value, (bool, int, float))]
-    values = [value for value in values if f"`{flow(value)}`" not in facts[0]]
+    brackets = f" ({'; '.join(facts)})" if facts else ""
+    text = f"- **`{key}`**{brackets}: {(field.description or '').strip()}"
     examples = "  " + ", ".join(f"`{flow(value)}`" for value in values)
     return [*_wrapped(text, "  ").splitlines(), *[examples] * bool(values)]
 
@@ -168,12 +177,12 @@ def _words(schema: dict[str, Any], field: FieldInfo | None = None) -> str:
         open_below = schema.get("exclusiveMinimum")
         if open_below is not None:
             word += f" > {open_below}"
-        if least is not None:
+        if least is not None and least > -_LARGE:
             word += f" ≥ {least}"
-        if most is not None and most < 2**63 - 1:
+        if most is not None and most < _LARGE:
             word += f" ≤ {most}"
         return word
-    return {"string": "text", "boolean": "true or false"}.get(str(kind), "any value")
+    return {"string": "text", "boolean": _BOOLEAN}.get(str(kind), "any value")
 
 
 def flow(value: Any) -> str:

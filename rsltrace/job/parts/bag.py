@@ -118,8 +118,8 @@ class BagSpec(JobPart):
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="Simulated time of the first message. Default: the recorded time. Header "
-        "stamps do not change.",
+        description="Simulated time of the first message. Default: the recorded time. "
+        "Header stamps stay.",
         examples=["0s"],
     )
     rate: Annotated[float, check(number(0, open_below=True))] = Field(
@@ -129,7 +129,7 @@ class BagSpec(JobPart):
     )
     loop: Annotated[bool | int, check(_check_loop)] = Field(
         default=False,
-        description="Number of passes; `true` repeats forever and needs a `stop`.",
+        description="Number of passes; `true`: forever, needs a `stop`.",
         examples=[True, 3],
     )
     by: Annotated[
@@ -137,8 +137,8 @@ class BagSpec(JobPart):
         check(one_of("log_time", "publish_time", "header_stamp")),
     ] = Field(
         default="log_time",
-        description="The time that a message plays at: log time, publish time (MCAP only), or "
-        "header stamp. Messages without a stamp use the log time.",
+        description="When a message plays: log time, publish time (MCAP only), or header "
+        "stamp (else log time).",
         examples=["header_stamp"],
     )
     remappings: Annotated[dict[str, str], check(_check_bag_remappings)] = Field(

@@ -52,7 +52,7 @@ class LatencySpec(JobPart):
     )
     via: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
         default=(),
-        description="Nodes (globs) that sample: their outputs depend on the last message received.",
+        description="Nodes (globs) that sample, as `--via` of `rsltrace latency`.",
         examples=[["/controller"]],
     )
     measure: Annotated[str, check(one_of(*MEASURES))] = Field(
@@ -177,13 +177,12 @@ class CheckSpec(JobPart):
     )
     always: Condition = Field(
         default=None,
-        description="Must be true of every message: `/topic: EXPRESSION` or `/topic.field < 10`.",
+        description="Must be true of every message.",
         examples=["/odom.pose.pose.position.x < 10", "/scan: min(ranges) > 0.1"],
     )
     never: Condition = Field(
         default=None,
-        description="Must not happen: a message, an expression over its fields, a log record, an "
-        "exception, a finding of the guard.",
+        description="Must not happen: a message, a log record, an exception, a finding.",
         examples=["/cmd_vel.linear.x > 1.5", "log error"],
     )
     eventually: Condition = Field(
@@ -193,8 +192,7 @@ class CheckSpec(JobPart):
     )
     rate: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
         default=None,
-        description="Topic whose rate must be `at_least` or `at_most` a value, counted `over` a "
-        "time.",
+        description="Topic whose rate must be `at_least` or `at_most` a value.",
         examples=["/scan"],
     )
     latency: Annotated[LatencySpec | None, given] = Field(
@@ -204,8 +202,7 @@ class CheckSpec(JobPart):
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function of the finished `rsltrace.Trace`. It returns `None` or `True` if "
-        "all is well; else `False`, a text, or a list of `(event, text)`.",
+        description="Function of the finished `rsltrace.Trace`: see `docs/checks.md`.",
         examples=["my_robot.checks:no_collision"],
     )
     after: Condition = Field(
@@ -216,7 +213,7 @@ class CheckSpec(JobPart):
     within_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="within",
-        description="How long the check applies after that, or after the start.",
+        description="How long the check applies after that or the start.",
         examples=["200ms"],
     )
     at_least: Annotated[float | None, check(_rate, optional=True)] = Field(

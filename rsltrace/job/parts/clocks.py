@@ -107,14 +107,13 @@ class ClockSpec(JobPart):
     )
     advances: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether each reading of a ROS clock advances it by a nanosecond. By default "
-        "it stands still during a callback.",
+        description="Whether each reading of a ROS clock advances it by a nanosecond. "
+        "Default: it stands still during a callback.",
         examples=[True],
     )
     source: Annotated[Literal["run", "topic"], check(one_of("run", "topic"))] = Field(
         default="run",
-        description="What drives ROS time with `use_sim_time`: the `run`, or the `topic` /clock, "
-        "with time 0 before its first message.",
+        description="What drives ROS time with `use_sim_time`: the `run`, or the `topic` /clock.",
         examples=["topic"],
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(

@@ -53,7 +53,7 @@ class DelaySpec(DistributionSpec):
 
     drop: Probability = Field(
         default=0.0,
-        description="Probability of loss. Reliable messages are sent again `retransmit` later.",
+        description="Probability of loss. Reliable messages are late by `retransmit`.",
         examples=[0.01],
     )
     burst: Annotated[BurstSpec | None, given] = Field(
@@ -68,7 +68,7 @@ class DelaySpec(DistributionSpec):
     )
     keep_order: bool = Field(
         default=True,
-        description="Whether messages of a link stay in order, as in DDS.",
+        description="Whether messages of a link stay in order.",
         examples=[False],
     )
     retransmit_ns: Annotated[int, check(positive_time)] = Field(
@@ -163,8 +163,7 @@ class DelaysSpec(JobPart):
     )
     outages: Annotated[tuple[OutageSpec, ...], parts()] = Field(
         default=(),
-        description="Outages. Best-effort messages are lost; reliable ones wait in the "
-        "publisher's history.",
+        description="Outages. Best-effort messages are lost; reliable ones wait.",
         examples=[[{"node": "/lidar", "from": "10s", "to": "12s"}]],
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(

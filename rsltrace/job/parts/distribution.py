@@ -160,8 +160,7 @@ class EmpiricalSpec(JobPart):
     percent: Annotated[tuple[float, ...] | None, check(items(number(0, 100)), optional=True)] = (
         Field(
             default=None,
-            description="Percentage of samples up to each value, 0 to 100. Default: equally "
-            "spaced.",
+            description="Percentage of samples up to each value. Default: equally spaced.",
             examples=[[0, 90, 100]],
         )
     )
@@ -216,7 +215,7 @@ class SeriesSpec(JobPart):
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="CSV file with two columns: time since the start, value.",
+        description="CSV file: time since the start, value.",
         examples=["link.csv"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(

@@ -91,13 +91,12 @@ class FaultSpec(JobPart):
 
     crash: FullName = Field(
         default=None,
-        description="Node whose process ends at once, without `finally` blocks and exit handlers.",
+        description="Node that ends at once, without `finally` blocks.",
         examples=["/planner"],
     )
     hang: FullName = Field(
         default=None,
-        description="Node whose process does nothing for some time (`for`) or to the end. Its "
-        "queues fill meanwhile.",
+        description="Node that does nothing `for` some time or to the end.",
         examples=["/planner"],
     )
     restart: FullName = Field(
@@ -112,28 +111,27 @@ class FaultSpec(JobPart):
     )
     duplicate: FullName = Field(
         default=None,
-        description="Topic of a message that arrives twice, `by` apart.",
+        description="Topic of a message that arrives again after `by`.",
         examples=["/scan"],
     )
     delay: FullName = Field(
         default=None,
-        description="Topic of a message that is late `by` some time. With `keep_order`, later "
-        "messages wait for it.",
+        description="Topic of a message that is late `by` some time.",
         examples=["/scan"],
     )
     change: FullName = Field(
         default=None,
-        description="Topic of a bag whose message has another value in `field`.",
+        description="Topic of a bag; `field` of a message changes.",
         examples=["/scan"],
     )
     swap: FullName = Field(
         default=None,
-        description="Topic of a bag whose message changes places with the next one.",
+        description="Topic of a bag; a message and the next one change places.",
         examples=["/odom"],
     )
     repeat: FullName = Field(
         default=None,
-        description="Topic of a bag whose message repeats the one before.",
+        description="Topic of a bag; a message repeats the one before.",
         examples=["/odom"],
     )
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -154,13 +152,13 @@ class FaultSpec(JobPart):
     )
     message: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None,
-        description="Which message of the topic, from 1, in the order of publication.",
+        description="Which message of the topic, from 1.",
         examples=[3],
     )
     for_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="for",
-        description="How long a node hangs (default: to the end) or is gone (default: no time).",
+        description="How long a node hangs or is gone.",
         examples=["500ms"],
     )
     by_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -177,8 +175,7 @@ class FaultSpec(JobPart):
 
     field: Annotated[str | None, check(text(check_field), optional=True)] = Field(
         default=None,
-        description="The field to change: `[3]` is an item of an array, `[-1]` the last one, "
-        "`[*]` all.",
+        description="The field to change; `[-1]` is the last item, `[*]` all.",
         examples=["ranges[3]"],
     )
     value: Annotated[Any, check(field_value, optional=True)] = Field(
@@ -198,7 +195,7 @@ class FaultSpec(JobPart):
     )
     length: Annotated[int | None, check(whole(0), optional=True)] = Field(
         default=None,
-        description="New length of the array: it is cut, or the last item repeats.",
+        description="New length of the array; the last item may repeat.",
         examples=[0],
     )
 

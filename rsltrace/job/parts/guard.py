@@ -108,14 +108,13 @@ class GuardSpec(JobPart):
     )
     pin: Annotated[bool | None, check(flag, optional=True)] = Field(
         default=None,
-        description="Whether `rsltrace record` pins its process: hash seed, memory addresses, time "
-        "zone, locale and thread counts. Only for the whole job. Default: `true`.",
+        description="Whether `rsltrace record` pins its process: hash seed, addresses, time"
+        " zone, locale, threads. Only for the job. Default: `true`.",
         examples=[False],
     )
     state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
         default=None,
-        description="Whether node states are hashed after each callback; `record` also keeps the "
-        "attributes.",
+        description="Whether node states are hashed after each event; `record` also keeps them.",
         examples=[True, "record"],
     )
     clock: Annotated[SourceSpec | None, _source(NondeterminismSource.CLOCK)] = _about(

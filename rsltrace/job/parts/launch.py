@@ -49,7 +49,7 @@ class StartAfterSpec(JobPart):
     delay_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="delay",
-        description="Delay after the start, or after the last of the other conditions.",
+        description="Delay after the start, or after the other conditions.",
         examples=["2s"],
     )
     topic: FullName = Field(
@@ -67,13 +67,12 @@ class StartAfterSpec(JobPart):
     )
     started: EntryName = Field(
         default=None,
-        description="After another entry has started: its constructor returned, or its main "
-        "waits or spins.",
+        description="After another entry has started: its constructor returned, or its main waits.",
         examples=["driver", 0],
     )
     ended: EntryName = Field(
         default=None,
-        description="After another entry has ended: a `main`, `executable`, `script` or `module`.",
+        description="After another entry, not a `node`, has ended.",
         examples=["my_robot/calibrate", 0],
     )
 

@@ -79,7 +79,7 @@ class NodeSpec(JobPart):
 
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="A Node subclass, or a function that returns nodes: `module:Class` or "
+        description="A Node subclass or a function that returns nodes: `module:Class` or "
         "`folder/file.py:Class`.",
         examples=["my_robot.ekf:EkfNode"],
     )
@@ -90,8 +90,7 @@ class NodeSpec(JobPart):
     )
     executable: Annotated[str | None, check(text(check_executable), optional=True)] = Field(
         default=None,
-        description="An installed executable: `package/name`, as for `ros2 run`. Compiled ones "
-        "run in their own process.",
+        description="An executable: `package/name`, as for `ros2 run`.",
         examples=["demo_nodes_py/talker"],
     )
     script: Annotated[str | None, check(check_path, optional=True)] = Field(
@@ -106,7 +105,7 @@ class NodeSpec(JobPart):
     )
     program: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="An executable file that uses rcl (C, C++), run in its own process.",
+        description="An executable file (C, C++), run in its own process.",
         examples=["build/talker"],
     )
     component: Annotated[str | None, check(text(check_component), optional=True)] = Field(
@@ -136,17 +135,17 @@ class NodeSpec(JobPart):
     )
     working_directory: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="Working directory of a process. Default: that of rsltrace.",
+        description="Working directory of a process.",
         examples=["data"],
     )
     respawn: Annotated[RespawnSpec | None, part("delay")] = Field(
         default=None,
-        description="Delay after which an ended process starts again. Default: it does not.",
+        description="Delay after which an ended process starts again.",
         examples=["1s", {"delay": "500ms", "times": 3}],
     )
     required: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Whether the run ends when this entry ends. Not for a `node`.",
+        description="Whether the run ends with this entry. Not for a `node`.",
         examples=[True],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
@@ -180,9 +179,8 @@ class NodeSpec(JobPart):
     )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
         default="stop",
-        description="What an exception in a callback does: `stop` ends the run with status 3, "
-        "`log` records it and continues. A constructor that raises always ends the "
-        "run.",
+        description="What an exception in a callback does: `stop` ends the run with status "
+        "3, `log` continues. An exception in a constructor always ends the run.",
         examples=["log"],
     )
     guard: Annotated[GuardSpec | None, guard_part] = Field(
@@ -192,13 +190,12 @@ class NodeSpec(JobPart):
     )
     start_after: Annotated[StartAfterSpec | None, part("delay")] = Field(
         default=None,
-        description="When the entry starts: after a time, or after a topic, service, node or "
-        "entry is there.",
+        description="When the entry starts: after a time, a topic, service, node or entry.",
         examples=["2s", {"service": "/set_mode"}, {"ended": "my_robot/calibrate", "delay": "1s"}],
     )
     stdin: Annotated[tuple[InputSpec, ...] | None, inputs] = Field(
         default=None,
-        description="Terminal input of the process: a text file or a list. Not for a `node`.",
+        description="Terminal input: a text file or a list. Not for a `node`.",
         examples=["answers.txt", ["start", {"at": "2s", "keys": "wwq"}]],
     )
     # Not a key of a job file: where the entry came from, if not from the job itself.

@@ -42,7 +42,7 @@ class InputSpec(JobPart):
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
-        description="Time since the start. Default: when the input before has been read.",
+        description="Time since the start. Default: after the input before.",
         examples=["2.5s"],
     )
     line: Annotated[str | None, check(_line, optional=True)] = Field(

@@ -21,14 +21,13 @@ class HooksSpec(JobPart):
 
     before: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function of the job, called before the first node is constructed. It may "
-        "return nodes.",
+        description="Function of the job, called before the construction. May return nodes.",
         examples=["my_robot.setup:prepare"],
     )
     after: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="Function of the list of nodes, called after construction and before the "
-        "run. It may return more nodes.",
+        description="Function of the list of nodes, called after the construction. May "
+        "return more nodes.",
         examples=["my_robot.setup:wire"],
     )
 
@@ -38,7 +37,7 @@ class RecordSpec(JobPart):
 
     payloads: Annotated[bool, check(flag)] = Field(
         default=True,
-        description="Whether to keep messages. Their hashes are always kept.",
+        description="Whether to keep messages.",
         examples=[False],
     )
     topics: Globs = Field(
@@ -53,8 +52,7 @@ class RecordSpec(JobPart):
     )
     segment_events: Annotated[int, check(whole(1, SEGMENT_EVENTS))] = Field(
         default=SEGMENT_EVENTS,
-        description="Write the file after this many events; a killed run loses fewer. Use 1 "
-        "(slow) to investigate a crash.",
+        description="Events per segment, the most that a killed run loses. 1 is slow.",
         examples=[1],
     )
 

@@ -59,7 +59,7 @@ class DepartureSpec(JobPart):
         examples=[37],
     )
     run: Annotated[int, check(whole(0))] = Field(
-        description="Index of the candidate, by the time it became ready, timers last.",
+        description="Index of the candidate, in `fifo` order.",
         examples=[2],
     )
     of: Annotated[str | None, check(text(), optional=True)] = Field(
@@ -100,9 +100,9 @@ class PolicySpec(JobPart):
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
-        description="`fifo`: first come, first served, timers last. `rate_monotonic`: shortest "
-        "period of the chain first. `wait_set`: as rclcpp's executors. `rclpy`: as "
-        "rclpy's. `permutation`: random order at each instant.",
+        description="`fifo`: first come, first served, timers last. `rate_monotonic`: "
+        "shortest period first. `wait_set`: as rclcpp's executors. `rclpy`: as "
+        "rclpy's. `permutation`: random.",
         examples=["rate_monotonic"],
     )
     priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts(optional=True)] = Field(
@@ -112,8 +112,7 @@ class PolicySpec(JobPart):
     )
     departures: Annotated[tuple[DepartureSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
-        description="First come, first served, except for these choices, which `rsltrace "
-        "explore` writes.",
+        description="`fifo`, except for these choices, which `rsltrace explore` writes.",
         examples=[[{"choice": 37, "run": 2}]],
     )
     pct: Annotated[PctSpec | None, part("depth")] = Field(
@@ -225,8 +224,8 @@ class ThreadsSpec(JobPart):
 
     switch: Annotated[str, check(one_of(WHEN_BLOCKED, EVERY_LINE))] = Field(
         default=WHEN_BLOCKED,
-        description="`when_blocked`: a thread runs until it blocks or ends. `every_line`: the "
-        "policy chooses a thread before each line of user code.",
+        description="`when_blocked`: when a thread blocks or ends. `every_line`: before "
+        "each line of user code.",
         examples=["every_line"],
     )
 

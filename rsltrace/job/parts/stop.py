@@ -56,8 +56,8 @@ class StopSpec(JobPart):
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
-        description="When this function returns `True` or an exit status. It is called with a "
-        "`Progress` between time steps.",
+        description="When this function of a `Progress` returns `True` or an exit status, "
+        "between time steps.",
         examples=["my_robot.checks:finished"],
     )
     quiescence_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(

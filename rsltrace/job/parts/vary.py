@@ -188,8 +188,7 @@ class VarySpec(JobPart):
     method: Annotated[Literal["grid", "random", "latin_hypercube"], check(one_of(*METHODS))] = (
         Field(
             default="random",
-            description="How values are combined: every combination (`grid`), `random`, or "
-            "evenly spread (`latin_hypercube`, needs SciPy).",
+            description="How values are combined; `latin_hypercube` needs SciPy.",
             examples=["latin_hypercube"],
         )
     )

@@ -68,8 +68,9 @@ class CompositionKeys(JobPart):
 
     base: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
-        description="A job file to extend. Mappings are merged key by key, entries of `nodes` by "
-        "`name`; other lists replace those of the base, and `null` removes a key.",
+        description="A job file to extend. Mappings are merged key by key, entries of "
+        "`nodes` by `name`; other lists replace the base's, and `null` removes "
+        "a key.",
         examples=["../robot/job.yaml"],
     )
     include: Annotated[tuple[str, ...], check(_paths)] = Field(
@@ -80,10 +81,10 @@ class CompositionKeys(JobPart):
     )
     vars: Annotated[dict[str, Any], check(_variables)] = Field(
         default_factory=dict,
-        description="Values for `$(var NAME)`, which `--set vars.NAME=...` overrides. Values may "
-        "also contain `$(env NAME default)`, `$(find-pkg-share PACKAGE)`, "
-        "`$(find-pkg-prefix PACKAGE)` and `$(dirname)`, the folder of the file. "
-        "Unquoted text is parsed again afterwards. Write `\\$(` for a plain `$(`.",
+        description="Values for `$(var NAME)`; `--set vars.NAME=...` overrides them. Texts "
+        "may also contain `$(env NAME default)`, `$(find-pkg-share PACKAGE)`, "
+        "`$(find-pkg-prefix PACKAGE)`, `$(dirname)` and `\\$(` for a plain `$(`."
+        " Unquoted texts are parsed again.",
         examples=[{"robot": "husky", "rate": 50.0}],
     )
 
