@@ -19,11 +19,10 @@ import click
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
 from rsltrace.cli.options import json_option, seed_option, timeout_option, until_option
 from rsltrace.errors import EXIT_USAGE, RsltraceError
-from rsltrace.search.perturb import KINDS
+from rsltrace.search.perturb import KINDS, Perturbation, PerturbedRun
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.search.perturb import Perturbation, PerturbedRun
     from rsltrace.search.verify import VerifyResult
 
 
