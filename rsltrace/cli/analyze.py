@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rsltrace.job import Job
     from rsltrace.native.timing.analysis import TimingAnalysis
     from rsltrace.native.timing.chains import ObservedChains
-    from rsltrace.native.timing.curves import Supply
+    from rsltrace.native.timing.system import Supply
 
 
 @click.command()
@@ -144,7 +144,7 @@ def analyze(
 
 
 def _supply(reservation: str | None) -> Supply:
-    from rsltrace.native.timing.curves import PROCESSOR, Supply
+    from rsltrace.native.timing.system import PROCESSOR, Supply
 
     if reservation is None:
         return PROCESSOR

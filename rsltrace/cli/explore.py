@@ -194,10 +194,9 @@ def explore(
     from rsltrace.checks.evaluate import check_texts
     from rsltrace.checks.metrics import check_metrics
     from rsltrace.search.explore.search import Explorer
-    from rsltrace.search.explore.strategies.named import strategy_named
+    from rsltrace.search.explore.strategies.named import check_vary, strategy_named
     from rsltrace.search.explore.table import ResultsFolder
     from rsltrace.search.explore.trial import JobSource
-    from rsltrace.search.explore.vary import check_vary
 
     if resume and force:
         raise click.UsageError(

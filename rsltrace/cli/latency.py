@@ -7,11 +7,10 @@ import shlex
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.checks.latency.measure import measure_latencies
+from rsltrace.checks.latency.measure import Latencies, measure_latencies
 from rsltrace.cli.output.latency_text import (
     as_csv,
     as_json,
@@ -23,9 +22,6 @@ from rsltrace.errors import TraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
-
-if TYPE_CHECKING:
-    from rsltrace.checks.latency.measure import Latencies
 
 
 @click.command()

@@ -28,6 +28,7 @@ from rsltrace.trace.words.logs import missing_servers, silent_topics
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
+    from rsltrace.native.native_run import NativeOptions
     from rsltrace.run import RunResult
     from rsltrace.simulation.loop.stop import Stop
 
@@ -151,18 +152,10 @@ def record(
     path = output or default_output(named)
     _check_first(loaded, bag, force=force)
     if native:
-        _record_native(
-            loaded,
-            path,
-            bag,
-            force=force,
-            quiet=quiet,
-            as_json=as_json,
-            executor=executor or "single",
-            processes=processes,
-            domain=domain,
-            policy=policy,
-        )
+        from rsltrace.native.native_run import NativeOptions
+
+        options = NativeOptions(executor or "single", processes, domain, policy)
+        _record_native(loaded, path, bag, options, force=force, quiet=quiet, as_json=as_json)
         return
     shown_notes: list[str] = []
     result = _recorded(
@@ -266,14 +259,11 @@ def _record_native(
     job: Job,
     path: Path,
     bag: Path | None,
+    options: NativeOptions,
     *,
     force: bool,
     quiet: bool,
     as_json: bool,
-    executor: str,
-    processes: bool,
-    domain: int | None,
-    policy: str | None,
 ) -> None:
     """Run a job natively, and end the process."""
     from rsltrace.cli.output.native_run import leave, report_native, run_native
@@ -281,13 +271,10 @@ def _record_native(
     result = run_native(
         job,
         path,
+        options,
         force=force,
         echo=not quiet,
         shows=not (quiet or as_json),
-        executor=executor,
-        processes=processes,
-        domain=domain,
-        policy=policy,
         note=_note,
         begins=lambda: _say_if_it_has_no_end(job),
     )

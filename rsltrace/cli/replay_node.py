@@ -12,12 +12,11 @@ import click
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
 from rsltrace.diff.options import DiffOptions
-from rsltrace.errors import NodeError
+from rsltrace.errors import NodeError, RunError
 from rsltrace.guard.pin import unpin
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.errors import RunError
     from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.preparation import ReplayPlan
     from rsltrace.run import RunCallbacks

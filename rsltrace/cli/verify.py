@@ -25,12 +25,11 @@ from rsltrace.cli.options import (
     until_option,
 )
 from rsltrace.errors import EXIT_USAGE, RsltraceError
-from rsltrace.search.perturb import KINDS
+from rsltrace.search.perturb import KINDS, Perturbation, PerturbedRun
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.search.history.run_record import RunRecord
-    from rsltrace.search.perturb import Perturbation, PerturbedRun
     from rsltrace.search.verify import VerifyResult
 
 

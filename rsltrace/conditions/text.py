@@ -24,7 +24,6 @@ import re
 from collections.abc import Callable
 from functools import partial
 
-from rsltrace.conditions.changes import TimeCondition, WatchCondition, WhenCondition
 from rsltrace.conditions.condition import ActiveCondition, EventCondition
 from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.names import RunNames
@@ -37,7 +36,10 @@ from rsltrace.conditions.occurrences import (
     IndexCondition,
     LogCondition,
     NodeCondition,
+    TimeCondition,
     TopicCondition,
+    WatchCondition,
+    WhenCondition,
     says_pattern,
     says_words,
 )

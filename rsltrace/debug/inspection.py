@@ -28,13 +28,12 @@ from rsltrace.conditions.expressions import (
 )
 from rsltrace.conditions.names import RunNames, nodes_called
 from rsltrace.conditions.view import EventView
-from rsltrace.debug.current_event import source
+from rsltrace.debug.current_event import CurrentEventView, source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean, near_or_all
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import graph_overview
 
 if TYPE_CHECKING:
-    from rsltrace.debug.current_event import CurrentEventView
     from rsltrace.debug.event_history import EventLedger
     from rsltrace.run.session import RunSession
 

@@ -169,7 +169,7 @@ class Supervisor:
         return {"index": cause + 1, "stamp_ns": sender["stamp_ns"], "event": sender}
 
     def _last_changed(self, request: Message) -> Message:
-        from rsltrace.conditions.changes import NOT_THERE
+        from rsltrace.conditions.occurrences import NOT_THERE
 
         name = self._node(request)
         text = f"watch node({name!r}).{request['attribute']}"

@@ -71,19 +71,30 @@ class ProcessorTime:
     beside_ns: int = 0
 
 
+@dataclass(frozen=True, slots=True)
+class NativeOptions:
+    """``executor`` is that of each entry, ``single`` or ``multi`` (threaded). With ``processes``
+    each entry is a process of its own, as it is anyway if one of them is a program. Without a
+    ``domain_id`` the nodes are alone in a free domain of this machine. ``policy`` gives callbacks
+    and threads priorities: ``rate_monotonic``, or ``priority``, that of the job."""
+
+    executor: str = "single"
+    processes: bool = False
+    domain_id: int | None = None
+    policy: str | None = None
+
+
 @dataclass
 class NativeRun:
     """A native run. Only its own thread calls it, but for ``stop`` and ``fail``.
 
-    ``rules`` are those of ``policy``, None if it goes by rate; ``levels`` are the real-time
+    ``rules`` are those of its policy, None if it goes by rate; ``levels`` are the real-time
     priorities that threads had.
     """
 
     job: Job
     observer: RunCallbacks
-    executor: str
-    domain_id: int | None
-    policy: str | None = None
+    options: NativeOptions
     rules: tuple[PriorityRule, ...] | None = None
     notes: list[str] = field(default_factory=list)
 
@@ -107,9 +118,9 @@ class NativeRun:
         inputs = StopInputs(self.job, self._start_ns, trace_size=lambda: self.writer.size)
         self._stop_rules = stop_rules(inputs)
         self._conditions = conditions_of(self._stop_rules)
-        if self.policy is not None and (refused := real_time_class()):
+        if self.options.policy is not None and (refused := real_time_class()):
             self.note(f"{refused}; executors go by priorities all the same")
-        if without := support.ignored(self.job, self.policy):
+        if without := support.ignored(self.job, self.options.policy):
             self.note(
                 f"a native run is not steered; without effect in the job: {', '.join(without)}"
             )
@@ -129,7 +140,8 @@ class NativeRun:
         """Create the trace, which ``spans`` come to. ``sources`` are the files of the user's code,
         None if they are loaded here."""
         job = self.job
-        discovery = "this machine" if self.domain_id is None else "as the environment says"
+        policy = self.options.policy
+        discovery = "this machine" if self.options.domain_id is None else "as the environment says"
         self.writer = stack.enter_context(
             TraceWriter(output, force=force, events_per_segment=job.record.segment_events)
         )
@@ -148,8 +160,8 @@ class NativeRun:
                 "discovery": discovery,
                 "wall_ns": str(self.clocks.wall_ns),
                 "steady_ns": str(self.clocks.steady_ns),
-                "ignored": ", ".join(support.ignored(job, self.policy)),
-                **({} if self.policy is None else {"policy": self.policy, "priorities": order()}),
+                "ignored": ", ".join(support.ignored(job, policy)),
+                **({} if policy is None else {"policy": policy, "priorities": order()}),
             },
         )
         self.span_writer = SpanWriter(spans, recorder, self.clocks, job.base_dir)
@@ -250,7 +262,7 @@ class NativeRun:
         )
 
     def _levels(self) -> dict[str, str]:
-        if self.policy is None:
+        if self.options.policy is None:
             return {}
         levels = sorted(self.levels.items(), key=lambda one: (-one[1], one[0]))
         return {"thread_priorities": ", ".join(f"{name} {level}" for name, level in levels)}

@@ -17,6 +17,7 @@ from rsltrace.native.message_observer import MessageObserver
 from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
     LOOK_EVERY_S,
+    NativeOptions,
     NativeResult,
     NativeRun,
     ProcessorTime,
@@ -42,22 +43,14 @@ _CONSTRUCTED_WITHIN_S = 5.0
 def run_natively(
     job: Job,
     output: Path,
+    options: NativeOptions,
     *,
-    force: bool = False,
-    echo: bool = True,
-    executor: str = "single",
-    processes: bool = False,
-    domain_id: int | None = None,
-    policy: str | None = None,
-    observer: RunCallbacks | None = None,
+    force: bool,
+    echo: bool,
+    observer: RunCallbacks,
 ) -> NativeResult:
     """Run a job natively and record it. What goes wrong in the run is in the result's ``error``.
-
-    ``echo`` lets nodes print their log records. ``executor`` is that of each entry, ``single`` or
-    ``multi`` (threaded). With ``processes`` each entry is a process of its own, as it is anyway if
-    one of them is a program. Without a ``domain_id`` the nodes are alone in a free domain of this
-    machine. ``policy`` gives callbacks and threads priorities: ``rate_monotonic``, or ``priority``,
-    that of the job.
+    ``echo`` lets nodes print their log records.
 
     :raises JobError, SetupError, OutputError: the run could not start or be written.
     """
@@ -65,10 +58,10 @@ def run_natively(
     expanded = expand_launch_files(job)
     support.check(expanded.job)
     kind: type[SingleProcessRun | MultiProcessRun] = SingleProcessRun
-    if processes or support.needs_processes(expanded.job):
+    if options.processes or support.needs_processes(expanded.job):
         kind = MultiProcessRun
-    rules = support.priority_rules(expanded.job, policy)
-    run = kind(expanded.job, observer or RunCallbacks(), executor, domain_id, policy, rules)
+    rules = support.priority_rules(expanded.job, options.policy)
+    run = kind(expanded.job, observer, options, rules)
     run.notes += expanded.notes
     with preserved_process(), ExitStack() as stack:
         stack.enter_context(search_path(run.job, native=True))
@@ -87,18 +80,18 @@ class SingleProcessRun(NativeRun):
         self.message_observer = MessageObserver(self.recorder, self.entities)
         self.nodes = NodeObserver(self.entities)
         self.priorities: Priorities | None = None
-        if self.policy is not None:
+        if self.options.policy is not None:
             self.priorities = Priorities(self.entities, self.rules)
         self._cpu_ns = time.process_time_ns()
         self._start = threading.Event()
         self._running: list[RunningEntry] = []
         self.entries = node_entries(self.job, note=self.note)
         self.prepare(output)
-        number = stack.enter_context(domain(self.domain_id))
+        number = stack.enter_context(domain(self.options.domain_id))
         stack.enter_context(rclpy_running(echo=echo))
         described = {
             "middleware": boundary().real.rclpy_get_rmw_implementation_identifier(),
-            "executor": f"{EXECUTORS[self.executor]} per entry of the job",
+            "executor": f"{EXECUTORS[self.options.executor]} per entry of the job",
             "processes": "1",
             "domain": str(number),
         }
@@ -143,7 +136,7 @@ class SingleProcessRun(NativeRun):
             return PriorityExecutor(self.priorities)
         import rclpy.executors
 
-        return getattr(rclpy.executors, EXECUTORS[self.executor])()
+        return getattr(rclpy.executors, EXECUTORS[self.options.executor])()
 
     def _ended(self, one: RunningEntry, error: BaseException | None) -> None:
         """Take note that an entry is over."""

@@ -8,13 +8,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.diff import diff_traces
-from rsltrace.errors import ReplayError
+from rsltrace.errors import ReplayError, RunError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.preparation import ReplayPlan
@@ -26,9 +25,6 @@ from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
-
-if TYPE_CHECKING:
-    from rsltrace.errors import RunError
 
 # The result of a replay.
 
@@ -236,25 +232,18 @@ def _branch(
     kept: Path | None,
 ) -> ReplayResult:
     """Compare a branch with the trace it branches from."""
-    trace = plan.trace
     with Trace.open(place) as branch:
-        found = diff_traces(trace, branch, DiffOptions(context=_CONTEXT))
+        found = diff_traces(plan.trace, branch, DiffOptions(context=_CONTEXT))
     name = THE_BRANCH if kept is None else str(kept)
     found = replace(found, b=replace(found.b, path=name))
-    return ReplayResult(
-        trace=trace.name,
-        verified=verification.verified,
-        events=trace.event_count,
+    difference = None if found.identical else found
+    return replace(
+        _result(plan, verification, run, difference, kept),
         digest=run.digest,
         start_ns=run.start_ns,
         end_ns=run.end_ns,
-        ended=run.stop_reason,
         is_whole=False,
-        path=kept,
-        diff=None if found.identical else found,
-        error=run.error,
         notes=tuple(dict.fromkeys([*plan.notes, *run.notes])),
-        interrupted=verification.interrupted,
         edits=tuple(edit.text for edit in editing.all),
     )
 

@@ -453,7 +453,7 @@ class RunSession:
 
     def becomes(self, job: Job) -> None:
         """Continue as the run of another job that differs only in what is still to come: its
-        policy, and additional faults. ``why_not`` of ``rsltrace.run.branching`` says if that is
+        policy, and additional faults. ``why_not`` of ``rsltrace.run.forked`` says if that is
         possible.
 
         :raises JobError: its policy cannot be made.

@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from rsltrace.errors import ExploreError, JobError
 from rsltrace.job import Job, NodeSpec, VarySpec, load_job
 from rsltrace.search.explore.strategies.faults import FaultWalk
-from rsltrace.search.explore.strategies.named import VaryWalk
+from rsltrace.search.explore.strategies.named import Variations, VaryWalk, check_vary
 from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
-from rsltrace.search.explore.vary import Variations, check_vary
 from tests.tiers import cases
 
 A = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback" / "a.mcap"

@@ -155,7 +155,7 @@ def test_times_are_those_of_the_callbacks(graph: tuple[Trace, str]) -> None:
 def test_info_and_cat_show_it(graph: tuple[Trace, str], command: Any) -> None:
     trace, _ = graph
     told = command("info", trace.name).stdout
-    assert "none: a native run is observed" in told
+    assert "none: no two native runs have the same times" in told
     assert "real time, from 20" in told
     assert "times of callbacks" in told
     values = json.loads(command("info", trace.name, "--json").stdout)
@@ -265,7 +265,7 @@ def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path) -> 
     [
         ("nodes: [{component: a/b, container: /c}]", (), "job.yaml:2:"),
         ("nodes: [{node: robot:Talker}]\nhooks: {before: robot:Talker}", (), "has no hooks"),
-        ("nodes: [{node: robot:Talker}]", ("--seed", "1"), "--native steers nothing"),
+        ("nodes: [{node: robot:Talker}]", ("--seed", "1"), "have no effect on a native run"),
     ],
 )
 def test_what_cannot_be_native_is_refused(

@@ -8,12 +8,14 @@ from itertools import accumulate
 import pytest
 
 from rsltrace.native.timing.bounds import bounds
-from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
 from rsltrace.native.timing.system import (
+    PROCESSOR,
+    Arrivals,
     CallbackKey,
     ChainTask,
     ExecutorModel,
     ExecutorOrder,
+    Supply,
     TaskSystem,
 )
 

@@ -18,21 +18,18 @@ from rsltrace.trace.model.texts import format_duration, format_seconds
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
     from rsltrace.job import Job
-    from rsltrace.native.native_run import NativeResult
+    from rsltrace.native.native_run import NativeOptions, NativeResult
     from rsltrace.simulation.loop.stop import Stop
 
 
 def run_native(
     job: Job,
     path: Path,
+    options: NativeOptions,
     *,
     force: bool,
     echo: bool,
     shows: bool,
-    executor: str,
-    processes: bool,
-    domain: int | None,
-    policy: str | None,
     note: Callable[[str], None],
     begins: Callable[[], None],
 ) -> NativeResult:
@@ -47,17 +44,8 @@ def run_native(
             begins()
             on_interrupt(stop)
 
-        return run_natively(
-            job,
-            path,
-            force=force,
-            echo=echo,
-            executor=executor,
-            processes=processes,
-            domain_id=domain,
-            policy=policy,
-            observer=RunCallbacks(progress=on_progress, interrupt=interrupt, note=note),
-        )
+        observer = RunCallbacks(progress=on_progress, interrupt=interrupt, note=note)
+        return run_natively(job, path, options, force=force, echo=echo, observer=observer)
 
 
 def report_native(result: NativeResult, checked: CheckReport | None, *, as_json: bool) -> None:

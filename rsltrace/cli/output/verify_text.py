@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.search.perturb import CORE_TYPE, KERNEL
+from rsltrace.search.perturb import CORE_TYPE, KERNEL, PerturbedRun
 
 if TYPE_CHECKING:
-    from rsltrace.search.perturb import PerturbedRun
     from rsltrace.search.verify import HiddenDifference, VerifyResult
 
 _LINES_MAX = 40

@@ -7,16 +7,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import report_lines
-from rsltrace.diff.result import Diff
+from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.errors import TraceError
-
-if TYPE_CHECKING:
-    from rsltrace.diff.result import BagDiff
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import MoreDivergences, Remark
@@ -25,14 +24,11 @@ from rsltrace.diff.report.line import (
     notes_section,
     wrapped,
 )
-from rsltrace.diff.result import ComparedRun, Diff
+from rsltrace.diff.result import BagDiff, ComparedRun, Diff, Divergence
 from rsltrace.diff.sentences.runs import ALL_HINT, recordings_sentence, remark_text
 from rsltrace.diff.sentences.values import setting_name
 from rsltrace.trace.model.texts import contrasting_texts, format_seconds, printable
 from rsltrace.trace.words.phrases import as_sentence, seconds_text
-
-if TYPE_CHECKING:
-    from rsltrace.diff.result import BagDiff, Divergence
 
 # The report of two traces as a person reads it: verdict first, on one screen.
 

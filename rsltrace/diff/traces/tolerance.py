@@ -7,20 +7,15 @@ and the runs otherwise did the same things at the same times.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.facts.remarks import Remark, TruncatedRecording
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result import ComparedRun
+from rsltrace.diff.result import BagDiff, ComparedRun
 from rsltrace.trace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
-
-if TYPE_CHECKING:
-    from rsltrace.diff.result import BagDiff
 
 # What there is to know of each of the two runs as a whole.
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace import errors
 from rsltrace.adapters.rclpy.boundary.installation import boundary
@@ -38,9 +38,6 @@ from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import NS_PER_S, format_seconds
 
-if TYPE_CHECKING:
-    from rsltrace.native.processes.children import ObservedProcess
-
 # When the entries of a native run begin that do not begin with it (``start_after:``).
 
 
@@ -57,7 +54,6 @@ class StartQueue:
         self._lock = threading.Lock()
         self._facts: set[StartFact] = set()
         self._waiting: list[tuple[ObservedProcess, StartRule, int]] = []
-        self._since_ns: dict[int, int] = {}
 
     @property
     def waiting(self) -> list[ObservedProcess]:
@@ -220,23 +216,24 @@ class MultiProcessRun(NativeRun):
         self._log_type = get_message_class("rcl_interfaces/msg/Log")
         self.prepare(output)
         self._rules = start_rules(self.job)
-        if self.domain_id is None:
+        if self.options.domain_id is None:
             check_loopback()
-        number = stack.enter_context(domain(self.domain_id))
+        number = stack.enter_context(domain(self.options.domain_id))
         stack.callback(self._kill_all)
-        kind = EXECUTORS[self.executor]
-        like = EntryOrder(self.job, 0, kind, echo, self.policy, self.rules)
+        kind = EXECUTORS[self.options.executor]
+        like = EntryOrder(self.job, 0, kind, echo, self.options.policy, self.rules)
         starts = starts_of(self.job, like)
         for start in starts:
             self._start(start)
         self._wait_until_ready()
         described = {
             "middleware": boundary().real.rclpy_get_rmw_implementation_identifier(),
-            "executor": f"{EXECUTORS[self.executor]} per entry of the job",
+            "executor": f"{EXECUTORS[self.options.executor]} per entry of the job",
             "processes": str(len(starts)),
             "domain": str(number),
         }
-        if self.policy is not None and (mains := [one.name for one in starts if one.is_main]):
+        mains = [one.name for one in starts if one.is_main]
+        if self.options.policy is not None and mains:
             self.note(
                 f"--policy has no effect in mains, which spin for themselves: {', '.join(mains)}"
             )

@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from rsltrace.native.timing.curves import Arrivals
 from rsltrace.native.timing.system import (
     ONCE_NS,
+    Arrivals,
     ChainTask,
     ExecutorModel,
     ExecutorOrder,

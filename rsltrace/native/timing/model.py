@@ -11,13 +11,15 @@ from typing import Any
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.native.timing.chains import ChainPath, ObservedChains
-from rsltrace.native.timing.curves import PROCESSOR, Arrivals, Supply
 from rsltrace.native.timing.system import (
     ONCE_NS,
+    PROCESSOR,
+    Arrivals,
     CallbackKey,
     ChainTask,
     ExecutorModel,
     ExecutorOrder,
+    Supply,
     TaskSystem,
 )
 from rsltrace.run.plans.network import network_plan

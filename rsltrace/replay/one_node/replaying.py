@@ -386,7 +386,7 @@ def replay_node(
         path=None if output is None else place,
         error=run.error,
         interrupted=interruption(run),
-        notes=tuple(dict.fromkeys([*plan.notes, *_notes(unit, columns, run, bool(found))])),
+        notes=tuple(dict.fromkeys([*plan.notes, *_notes(unit, run, bool(found))])),
     )
 
 
@@ -399,9 +399,7 @@ def entries_of(trace: Trace, columns: RecordingColumns) -> list[int]:
     return some or list(range(len(columns.constructions)))
 
 
-def _notes(
-    unit: ReplayedEntry, columns: RecordingColumns, run: RunResult, differs: bool
-) -> Iterator[str]:
+def _notes(unit: ReplayedEntry, run: RunResult, differs: bool) -> Iterator[str]:
     if unit.others:
         yield f"{', '.join(unit.others)} ran with it: the same entry of the job makes them"
     if differs:

@@ -18,11 +18,9 @@ from rsltrace.adapters.rclpy.messages.message_spec import (
     ItemType,
     MessageSpec,
     PrimitiveType,
+    SequenceType,
     StringType,
     message_spec,
-)
-from rsltrace.adapters.rclpy.messages.message_spec import (
-    SequenceType as SequenceType,
 )
 from rsltrace.errors import BagError, did_you_mean
 from rsltrace.job import Job, locate

@@ -198,7 +198,7 @@ class _PausedRun:
     """A run that is paused after its prefix."""
 
     def __init__(self, task: dict[str, Any], overlay: Mapping[str, Any], stack: ExitStack) -> None:
-        from rsltrace.run.branching import run_up_to, why_no_branches
+        from rsltrace.run.forked import run_up_to, why_no_branches
         from rsltrace.run.process import preserved_process, skip_final_collection
         from rsltrace.run.session import RunSession
         from rsltrace.search.explore.outcome import TrialOptions
@@ -254,7 +254,7 @@ class _PausedRun:
         answer_and_end(lambda: self._made(task, TrialOptions(**task["wants"])), self._answer_at)
 
     def _made(self, task: dict[str, Any], wants: TrialOptions) -> dict[str, Any]:
-        from rsltrace.run.branching import why_no_branch
+        from rsltrace.run.forked import why_no_branch
         from rsltrace.search.explore.outcome import result_of_run
 
         began = time.perf_counter()

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
+from rsltrace.diff.report.ci import command_data, command_property
 from rsltrace.errors import ExploreError
 from rsltrace.search.explore.report.exploration import (
     Exploration,
@@ -157,17 +159,7 @@ def _effect_values(explored: Exploration) -> list[dict[str, Any]]:
         found = effects(explored.results)
     except ExploreError:  # without scipy; the page says so
         return []
-    return [
-        {
-            "setting": one.setting,
-            "outcome": one.outcome,
-            "strength": one.strength,
-            "sign": one.sign,
-            "p": one.p,
-            "runs": one.runs,
-        }
-        for one in found
-    ]
+    return [asdict(one) for one in found]
 
 
 def junit_text(explored: Exploration) -> str:
@@ -177,11 +169,13 @@ def junit_text(explored: Exploration) -> str:
     numbers = {"tests": count, "failures": str(len(found)), "errors": "0"}
     time = f"{explored.wall_s:.3f}"
     suites = Element("testsuites", {"name": "rsltrace explore", **numbers, "time": time})
-    suite = SubElement(suites, "testsuite", {"name": _text(explored.job), **numbers, "time": time})
+    suite = SubElement(
+        suites, "testsuite", {"name": printable(explored.job), **numbers, "time": time}
+    )
     for cause in found:
         case = _case(suite, explored, f"{cause.failure.kind}: {cause.key}")
         said = f"{len(cause.runs)} of {len(explored.results)} runs: {cause.failure.text}"
-        kind = {"type": cause.failure.kind, "message": _text(said)}
+        kind = {"type": cause.failure.kind, "message": printable(said)}
         SubElement(case, "failure", kind).text = printable_lines(_details(explored, cause))
     if not found:
         case = _case(suite, explored, f"{len(explored.results)} runs")
@@ -192,7 +186,9 @@ def junit_text(explored: Exploration) -> str:
 
 
 def _case(suite: Element, explored: Exploration, name: str) -> Element:
-    return SubElement(suite, "testcase", {"classname": _text(explored.job), "name": _text(name)})
+    return SubElement(
+        suite, "testcase", {"classname": printable(explored.job), "name": printable(name)}
+    )
 
 
 def _details(explored: Exploration, cause: FailureCause) -> str:
@@ -209,17 +205,17 @@ def github_text(explored: Exploration) -> str:
     it names or else at the job, and a notice where there is none."""
     found = causes(explored)
     if not found:
-        name = _property(_from_here(explored.job))
+        name = command_property(printable(_from_here(explored.job)))
         said = f"{len(explored.results)} runs, none failed"
         said += f"; {explored.caution}" if explored.caution else ""
-        return f"::notice file={name}::{_escaped(said)}"
+        return f"::notice file={name}::{command_data(printable_lines(said))}"
     lines = []
     for cause in found:
         file, line = _place(explored, cause)
-        where = f"file={_property(file)}" + (f",line={line}" if line else "")
-        title = _property(f"{cause.failure.kind}: {cause.key}")
+        where = f"file={command_property(printable(file))}" + (f",line={line}" if line else "")
+        title = command_property(printable(f"{cause.failure.kind}: {cause.key}"))
         said = f"{len(cause.runs)} of {len(explored.results)} runs\n{_details(explored, cause)}"
-        lines.append(f"::error {where},title={title}::{_escaped(said)}")
+        lines.append(f"::error {where},title={title}::{command_data(printable_lines(said))}")
     return "\n".join(lines)
 
 
@@ -234,16 +230,3 @@ def _from_here(path: str) -> str:
     """Return a path as GitHub wants it: from the folder of the checkout."""
     shown = os.path.relpath(path)
     return Path(os.path.abspath(path) if shown.startswith("..") else shown).as_posix()
-
-
-def _text(text: str) -> str:
-    return printable(text)
-
-
-def _escaped(text: str) -> str:
-    text = printable_lines(text)
-    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
-
-
-def _property(text: str) -> str:
-    return _escaped(printable(text)).replace(":", "%3A").replace(",", "%2C")
