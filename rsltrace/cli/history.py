@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
 
 import click
@@ -23,7 +24,12 @@ _BAD_LINES_MAX = 10
 )
 @click.option("--job", metavar="GLOB", default="*", help="Show only these jobs.")
 @click.option("--branch", metavar="GLOB", default="*", help="Show only runs of these branches.")
-@click.option("--since", metavar="DATE", default="", help="Show only runs since DATE (2026-11-01).")
+@click.option(
+    "--since",
+    type=click.DateTime(["%Y-%m-%d"]),
+    metavar="DATE",
+    help="Show only runs since DATE (2026-11-01, UTC).",
+)
 @click.option(
     "--format",
     "form",
@@ -44,7 +50,7 @@ def history(
     places: tuple[str, ...],
     job: str,
     branch: str,
-    since: str,
+    since: datetime | None,
     form: str,
     output: Path | None,
 ) -> None:
@@ -60,7 +66,7 @@ def history(
 
     if output is not None:
         check_not_input(output, [Path(one) for one in places if "://" not in one])
-        form = "html" if output.suffix == ".html" else form
+        form = "html" if (form, output.suffix) == ("text", ".html") else form
     bad = 0
 
     def on_bad(name: str, line: int) -> None:
@@ -70,7 +76,8 @@ def history(
             text = f"{name}:{line}: skipped, it is cut off or not written by rsltrace"
             tell(printable(f"rsltrace: warning: {text}"))
 
-    found = summarize(places, job=job, branch=branch, since=since, on_bad=on_bad)
+    day = "" if since is None else f"{since:%Y-%m-%d}"
+    found = summarize(places, job=job, branch=branch, since=day, on_bad=on_bad)
     if bad > _BAD_LINES_MAX:
         tell(f"rsltrace: warning: {bad - _BAD_LINES_MAX} more lines were skipped")
     if form == "html":

@@ -185,9 +185,9 @@ import sys
 from pathlib import Path
 from rsltrace.search.history.run_record import recorded
 for number in range(int(sys.argv[2])):
-    words = [f"{sys.argv[3]} {number}" * 400]
+    words = [f"{sys.argv[3]} {number}" * 40]
     with recorded(sys.argv[1], "verify", Path(), lambda path: words) as run:
-        run.fails("x" * 400)
+        run.fails("x" * 4000)
 """
 
 
@@ -348,3 +348,14 @@ def test_a_million_lines_have_the_right_answer_in_little_memory(tmp_path: Path) 
         assert answer == [count, changes, sum(failed), 100 * count, failed]
         peaks.append(peak)
     assert peaks[1] - peaks[0] < 120 << 10  # KiB, of lines with 250 MB
+
+
+def test_what_is_written_can_be_read_whatever_the_names_are(
+    command: Command, tmp_path: Path
+) -> None:
+    odd = os.fsdecode(b"a \xff\x1b\n.mcap")
+    (tmp_path / odd).write_bytes(A.read_bytes())
+    assert command("diff", odd, B, "--history", "runs.jsonl").returncode == 1
+    done = command("history", "runs.jsonl", "--json")
+    assert done.stderr == ""
+    assert json.loads(done.stdout)["jobs"][0]["job"] == r"'a \udcff\x1b\n.mcap'"

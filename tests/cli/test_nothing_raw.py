@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -81,6 +82,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "escaped.yaml").write_text(
         'nodes: [{node: "m\\e]0;x\\a:N"}]\nstop: {duration: "\\x9b1"}\n"k\\r\\b": 1\n'
     )
+    line = {"time": "2026-11-01T10:00:00.000Z", "by": ESCAPES, "verdict": "failed"}
+    line |= dict.fromkeys(("job", "commit", "branch", "reason"), ESCAPES)
+    lines = [json.dumps({**line, "digest": digit * 16}) for digit in "ab"]
+    (folder / f"runs{ESCAPES}.jsonl").write_text("\n".join([*lines, ESCAPES]), encoding="utf-8")
     (folder / f"x{ESCAPES}.mcap").write_bytes((folder / "a.mcap").read_bytes())
     return folder
 
@@ -120,6 +125,8 @@ _TRACES = ("a.mcap", "a2.mcap", f"x{ESCAPES}.mcap")
             for form in ("text", "markdown", "github", "html")
         ),
         ("info", "a2.mcap", "--format", "html"),
+        *(("history", f"runs{ESCAPES}.jsonl", *more) for more in ((), ("--json",))),
+        ("history", f"runs{ESCAPES}.jsonl", "--format", "html"),
         ("diff", "a2.mcap", "b2.mcap", "--all"),
         ("diff", "a2.mcap", "b2.mcap", "--abs", "*=1"),
         ("diff", "a.mcap", "b.mcap", "--check"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import subprocess
@@ -175,6 +176,14 @@ def test_the_action_passes_fails_and_keeps_what_it_made(robot: Path) -> None:
     assert ran.uploaded == []
     assert "rsltrace: 2 jobs, 2 failed" in ran.output
     assert "robots/a/job.yaml failed with exit status" in ran.summary
+
+    ran = run_action(robot, jobs=jobs, history="runs/robot.jsonl", artifact="")
+    change(robot, 1.5)
+    ran = run_action(robot, jobs=jobs, history="runs/robot.jsonl", artifact="")
+    lines = map(json.loads, (robot / "runs" / "robot.jsonl").read_text().splitlines())
+    found = [(one["job"], one["verdict"], one["digest"] != "") for one in lines]
+    job = "golden/robots/a/job.mcap"
+    assert found == [(job, "error", False), (job, "passed", True)]
 
 
 @pytest.mark.long

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -236,6 +237,67 @@ def test_several_runs_and_equal_ones_have_a_page(monkeypatch: pytest.MonkeyPatch
     assert "1 of 2 runs diverges from a.mcap." in page.text
     assert page.rows[2][:2] == ["b.mcap", "schedule"]
     contained(made("diff", "a.mcap", "a.mcap"))
+
+
+def history_lines(text: str, runs: int = 300) -> str:
+    """Return lines of a history with ``text`` in every field that may have it."""
+    return "".join(
+        json.dumps(
+            {
+                "time": f"2026-11-01T10:{number // 60:02d}:{number % 60:02d}.000Z",
+                "by": "explore",
+                "job": f"{number % 3}{text}",
+                "commit": f"{number // 3}{text}",
+                "branch": text,
+                "digest": f"{number // 100:016x}",
+                "verdict": ("passed", "passed", "failed")[number % 3],
+                "reason": text,
+                "runs": 10,
+                "failed": number % 2,
+            }
+        )
+        + "\n"
+        for number in range(1, runs + 1)
+    )
+
+
+def test_the_page_of_a_history_has_its_jobs_and_changes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs.jsonl").write_text(history_lines(".yaml") + "{\n")
+    text = made("history", "runs.jsonl")
+    contained(text)
+    page = Page(text)
+    assert "300 runs of 3 jobs at 101 commits" in page.text
+    assert "1 line could not be read" in page.text
+    kinds = [value for name, value in page.attributes if name == "class" and value in _CELLS]
+    explained, warned = 1, 1
+    cells = [kinds.count(kind) for kind in _CELLS]
+    assert cells == [76 + explained, 38 + explained + warned, 3, 1]
+    changes = [row for row in page.rows if len(row) == 5 and "→" in row[3]]
+    assert len(changes) == 4
+    assert changes[0][1:3] == ["0.yaml", ".yaml"]
+    (failing,) = [row for row in page.rows if "of 100 runs" in row[1:2][0] if len(row) > 1]
+    assert failing[:3] == ["2.yaml", "100 of 100 runs (100 %)", "50 of 1,000 orders (5 %)"]
+
+
+_CELLS = ("good", "bad", "good changed", "bad changed")
+
+
+def test_nothing_in_a_history_becomes_markup(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    pages = []
+    for text in (MARKUP, "x" * len(MARKUP), "<" * 60_000):
+        Path("runs.jsonl").write_text(history_lines(text, runs=130))
+        pages.append(made("history", "runs.jsonl"))
+        contained(pages[-1])
+    one, other, _ = map(Page, pages)
+    assert MARKUP[:20] in one.text
+    assert one.tags == other.tags
+    assert [name for name, _ in one.attributes] == [name for name, _ in other.attributes]
 
 
 @pytest.mark.skipif(_CHROMIUM is None, reason="needs chromium")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -309,6 +310,32 @@ def test_tests_are_no_code_of_the_job(team: Run, tmp_path: Path) -> None:
     assert made.returncode == 0, made.stdout
     assert _modules(tmp_path / "golden" / "test_counts.mcap") == {"counting"}
     assert _modules(tmp_path / "golden" / "test_own.mcap") == {"counting", "test_own"}
+
+
+def test_comparisons_are_lines_of_a_history(team: Run, tmp_path: Path) -> None:
+    (tmp_path / "test_robot.py").write_text(
+        "from rsltrace.testing import assert_matches_golden\n"
+        f"a, b = {str(A)!r}, {str(B)!r}\n"
+        "def test_same(rsltrace_golden):\n    rsltrace_golden(a, 'a.mcap')\n"
+        "def test_other():\n    assert_matches_golden(b, 'a.mcap')\n"
+        "def test_missing(rsltrace_golden):\n    rsltrace_golden(b, 'b.mcap')\n"
+    )
+    shutil.copy(A, tmp_path / "a.mcap")
+    team("--rsltrace-history", "option.jsonl")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nrsltrace_history = ini.jsonl\n")
+    team("-k", "same")
+    team("-k", "same", RSLTRACE_HISTORY="variable.jsonl")
+    team("-k", "same", "--rsltrace-update")
+
+    def verdicts(name: str) -> list[tuple[str, str]]:
+        lines = (tmp_path / name).read_text().splitlines()
+        return [(one["job"], one["verdict"]) for one in map(json.loads, lines)]
+
+    same = ("a.mcap", "passed")
+    assert verdicts("option.jsonl") == [same, ("a.mcap", "failed"), ("b.mcap", "error")]
+    assert verdicts("ini.jsonl") == verdicts("variable.jsonl") == [same]
+    failed = (tmp_path / "option.jsonl").read_text().splitlines()[1]
+    assert "/obstacle_filter: the callback for /scan at 2.1 s" in failed
 
 
 def _modules(path: Path) -> set[str]:

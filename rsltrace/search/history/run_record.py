@@ -28,7 +28,7 @@ from rsltrace.terminal import tell
 from rsltrace.trace.mcap.remote import filesystem_of
 from rsltrace.trace.mcap.source import public_address, redacted
 from rsltrace.trace.model.regular_file import not_replaceable
-from rsltrace.trace.model.texts import shortened
+from rsltrace.trace.model.texts import printable, shortened
 
 if sys.platform != "win32":
     import fcntl
@@ -36,7 +36,7 @@ if sys.platform != "win32":
 SUFFIX = ".jsonl"
 DIRTY = "-dirty"
 """Follows a commit whose tracked files were changed, as ``git describe --dirty`` has it."""
-_REASON_MAX = 500
+_TEXT_MAX = 2000
 _COMMITS = ("GITHUB_SHA", "CI_COMMIT_SHA")
 _BRANCHES = ("GITHUB_HEAD_REF", "GITHUB_REF_NAME", "CI_COMMIT_REF_NAME")
 
@@ -51,7 +51,7 @@ class RunRecord:
 
     ``commit`` and ``branch`` are empty if unknown. ``reason`` is the first divergence, the most
     frequent cause of failures, or the error. ``runs`` are the runs of a search, ``failed`` those
-    that failed. The fields of one verdict are set while the command runs.
+    that failed. The command sets the result while it runs.
     """
 
     time: _Time
@@ -120,9 +120,11 @@ def recorded(place: str | None, by: str, file: Path, arguments: Arguments) -> It
 def _write(place: str, record: RunRecord, begin: float) -> None:
     now = datetime.now(timezone.utc)
     record.time = f"{now:%Y-%m-%dT%H:%M:%S}.{now.microsecond // 1000:03d}Z"
-    record.reason = shortened(record.reason.partition("\n")[0], _REASON_MAX)
-    if record.seconds is None:
-        record.seconds = round(time.monotonic() - begin, 3)
+    record.seconds = round(time.monotonic() - begin, 3)
+    record.reason = shortened(printable(record.reason.partition("\n")[0]), _TEXT_MAX)
+    record.job, record.branch = (
+        shortened(printable(text), _TEXT_MAX) for text in (record.job, record.branch)
+    )
     line = json.dumps(asdict(record), separators=(",", ":")).encode() + b"\n"
     name = f"{now:%Y%m%dT%H%M%S}-{uuid.uuid4().hex[:12]}{SUFFIX}"
     if "://" in place:

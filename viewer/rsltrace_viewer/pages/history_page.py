@@ -29,9 +29,9 @@ def history_page(found: HistorySummary) -> str:
         ),
         changes=[change_cells(one) for one in found.changes],
         failing=[job_cells(one) for one in found.jobs if one.failed],
-        commits=[commit_text(one) for one in found.commits],
+        commits=[commit_text(one) for one in reversed(found.commits)],
         rows=[
-            (one.job, [_cell(found.results.get((one.job, commit))) for commit in found.commits])
+            (one.job, [_cell(found.results.get((one.job, at))) for at in reversed(found.commits)])
             for one in found.jobs
         ],
         command=bisect_command(found),
