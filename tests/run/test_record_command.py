@@ -309,7 +309,7 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
         "        print('stuck', flush=True)\n"
         "        while True:\n"
         "            try:\n"
-        "                while True: pass\n"
+        "                while True: sum(range(9))\n"
         "            except KeyboardInterrupt: print('swallowed', flush=True)\n",
     )
     process = _start(tmp_path)
@@ -318,6 +318,7 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
     assert process.stderr is not None
     process.send_signal(signal.SIGINT)
     assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    time.sleep(0.5)  # its handler is over
     process.send_signal(signal.SIGINT)
     assert process.stdout.readline() == "swallowed\n"
     process.send_signal(signal.SIGINT)
