@@ -135,7 +135,7 @@ def _late(
             int(one["output_event"]),
             int(one["output_ns"]),
             f"{format_duration(int(one['duration']))} since {chain.hops[0].topic} of event "
-            f"{int(one['input_event'])} ({format_seconds(int(one['input_ns']))} s)",
+            f"{int(one['input_event'])} ({format_seconds(trace.stamp(int(one['input_ns'])))} s)",
         )
         for one in moments[durations >= spec.below_ns][:KEPT_MAX]
     ]

@@ -182,7 +182,7 @@ class RateProperty(RunProperty):
         for begin_ns, index, count in self._stretches(stamp_ns):
             stretches += 1
             hz = count * NS_PER_S / self.over_ns
-            until = format_seconds(begin_ns + self.over_ns)
+            until = format_seconds(begin_ns + self.over_ns - self.start_ns)
             said = f"{count} messages from here to {until} s: {hz:g} Hz"
             if self.at_least is not None and count < self._least:
                 self._violated(index, begin_ns, f"{said}, at least {self.at_least:g} Hz")

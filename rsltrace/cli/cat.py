@@ -54,7 +54,8 @@ class EventLines:
         names = self._words.names
         self._index_width = max(len(str(trace.event_count)), 5)
         self._start_ns = trace.start_ns
-        self._time_width = len(format_seconds(trace.stamp(trace.end_ns)))
+        ends = [trace.end_ns, *trace.segments["start_stamp"][:1].tolist()]
+        self._time_width = max(len(format_seconds(at - self._start_ns)) for at in ends)
         self._node_width = min(max(names.longest_node, 1), _COLUMN_MAX)
         self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
 

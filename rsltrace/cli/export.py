@@ -83,7 +83,11 @@ def export(
     from rsltrace.trace.recordings.export import check_bag_folder, export_bag
 
     with Trace.open(trace) as opened:
-        whole, events, end = opened.complete, opened.event_count, format_seconds(opened.end_ns)
+        whole, events, end = (
+            opened.complete,
+            opened.event_count,
+            format_seconds(opened.stamp(opened.end_ns)),
+        )
     if perfetto is not None:
         require_perfetto()
         check_output_file(perfetto, [trace], force=force, example="run.pftrace")

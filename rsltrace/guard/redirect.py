@@ -15,7 +15,7 @@ import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from functools import wraps
+from functools import update_wrapper, wraps
 from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
@@ -96,7 +96,8 @@ class Redirected:
         self.real = copy_of(function)
         place = _Function.from_address(id(function))
         self._saved = (place.definition, place.owner, place.vectorcall)
-        self._definition = _MethodDef(function.__name__.encode(), address, flags, None)
+        told = _MethodDef.from_address(place.definition).doc if place.definition else None
+        self._definition = _MethodDef(function.__name__.encode(), address, flags, told)
         _count_up(id(target))
         place.definition = ctypes.addressof(self._definition)
         place.owner = id(target)
@@ -149,6 +150,7 @@ class RedirectedMethod:
         if place.function != id(method.__func__) or place.owner != id(method.__self__):
             raise _unknown_layout()
         self._saved = place.function
+        update_wrapper(target, method.__func__)  # inspect.signature shows that of the method
         _count_up(id(target))
         place.function = id(target)
 

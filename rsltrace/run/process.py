@@ -71,7 +71,7 @@ def housekeeping(
         if observer.progress is None:
             return collect_at
         with engage(None):  # the caller's code runs in real time
-            observer.progress(dispatcher().loop.now_ns, end_ns, events)
+            observer.progress(dispatcher().loop.stamp, end_ns, events)
         return min(collect_at, events + _PROGRESS_EVERY_EVENTS)
 
     return between_steps

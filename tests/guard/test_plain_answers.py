@@ -13,7 +13,7 @@ import rsltrace
 from rsltrace.trace.reader import Trace
 
 CODE = """
-import pickle, io
+import inspect, io, os, pickle, random
 import numpy as np
 
 A, B = np.array([1.0, 2.0]), np.array([0.0, 4.0])
@@ -32,6 +32,12 @@ def counted():
     pickle.Pickler(file).dump(Counted())
     return pickle.loads(file.getvalue()).__dict__
 
+def signature(function):
+    try:
+        return inspect.signature(function)
+    except ValueError:
+        return None
+
 def answers():
     return [str(one) for one in (
         np.divide(A, B, np.zeros_like(A), where=B != 0).tolist(),
@@ -45,6 +51,8 @@ def answers():
         apply(function=len, where="abc"),
         sorted({0.5, 2**2000, 3})[0],
         counted(),
+        *map(signature, (os.listdir, hash, open, random.seed, random.choice, random.random,
+                         np.empty, np.random.seed, np.random.normal, pickle.dumps)),
     )]
 """
 NODE = """

@@ -37,6 +37,7 @@ from rsltrace.trace.model.event import (
     RandomDecision,
     encode_decision,
 )
+from rsltrace.trace.model.texts import Stamp
 from tests.tiers import cases
 
 NODES, TOPICS = 3, 4
@@ -79,6 +80,9 @@ class MadeRun:
     @property
     def event_count(self) -> int:
         return len(self.rows)
+
+    def stamp(self, stamp_ns: int) -> Stamp:
+        return Stamp(stamp_ns)
 
     def metadata(self, name: str) -> dict[str, str]:
         return {"mode": "native"} if self.timings and name == METADATA_NATIVE else {}

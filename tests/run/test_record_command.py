@@ -273,28 +273,55 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
         assert trace.complete
 
 
-def test_a_third_interrupt_ends_a_process_that_unwinds(job_file: Any, tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_an_endless_recursion(job_file: Any, tmp_path: Path) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
         "class Stuck(Talker):\n"
         "    def tick(self):\n"
-        "        print('stuck', flush=True)\n"
         "        import sys\n"
         "        sys.setrecursionlimit(10**9)\n"
-        "        def f(n): return f(n + 1)\n"
-        "        f(0)\n",
+        "        self.f(0)\n"
+        "    def f(self, n):\n"
+        "        if n == 200_000: print('stuck', flush=True)\n"
+        "        self.f(n + 1)\n",
     )
     process = _start(tmp_path)
     assert process.stdout is not None
     assert process.stdout.readline() == "stuck\n"
     assert process.stderr is not None
-    time.sleep(2)  # the recursion is deep now
     process.send_signal(signal.SIGINT)
     assert any("closing the trace" in line for line in process.stderr), "the first one has come"
-    for _ in range(2):
-        assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=300)
+    assert process.returncode == 130
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert trace.complete
+
+
+@pytest.mark.long
+def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
+    job_file: Any, tmp_path: Path
+) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Stuck}]\n",
+        "class Stuck(Talker):\n"
+        "    def tick(self):\n"
+        "        print('stuck', flush=True)\n"
+        "        while True:\n"
+        "            try:\n"
+        "                while True: sum(range(9))\n"
+        "            except KeyboardInterrupt: print('swallowed', flush=True)\n",
+    )
+    process = _start(tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "stuck\n"
+    assert process.stderr is not None
+    process.send_signal(signal.SIGINT)
+    assert any("closing the trace" in line for line in process.stderr), "the first one has come"
+    time.sleep(0.5)  # its handler is over
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "swallowed\n"
+    process.send_signal(signal.SIGINT)
     process.communicate(timeout=60)
     assert process.returncode == -signal.SIGINT
     with Trace.open(tmp_path / "out.mcap") as trace:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -226,7 +226,9 @@ class ChainLatency:
         moments = self.moments(measure)
         if not len(moments):
             return None
-        return ChainDuration(*map(int, moments[moments["duration"].argmax()]))
+        found = ChainDuration(*map(int, moments[moments["duration"].argmax()]))
+        stamp = self._flow.trace.stamp
+        return replace(found, input_ns=stamp(found.input_ns), output_ns=stamp(found.output_ns))
 
     def moments(self, measure: str) -> npt.NDArray[np.void]:
         """Return the ``durations`` of a measure with their events: MOMENT_DTYPE."""

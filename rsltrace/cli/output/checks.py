@@ -32,6 +32,7 @@ class CheckReport:
             load = load_function if functions else None
             self.results = evaluate_checks(trace, job, load)
             self.metrics = evaluate_metrics(trace, job, load)
+            self._start_ns = trace.start_ns
             self._places = {
                 one.event: _place(trace, one.event)
                 for result in self.results
@@ -101,7 +102,9 @@ class CheckReport:
     def _where(self, found: Violation) -> str:
         at = "at the end" if found.event is None else f"event {found.event}"
         place = "" if found.event is None else self._places.get(found.event, "")
-        return printable(f"{at}, {format_seconds(found.stamp_ns)} s{place}: {found.text}")
+        return printable(
+            f"{at}, {format_seconds(found.stamp_ns - self._start_ns)} s{place}: {found.text}"
+        )
 
 
 def _place(trace: Trace, index: int) -> str:

@@ -15,7 +15,7 @@ import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import partial, wraps
 from sys import _getframe
 from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
 from typing import Any
@@ -273,7 +273,7 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
         seed: Callable[..., Any] = _numpy_of(guard, stream).seed
         return seed
 
-    draw = _drawing("numpy.random.seed()", real, seeding)
+    draw = wraps(real)(_drawing("numpy.random.seed()", real, seeding))
     for place in (module, module.mtrand):
         replace_attribute(stack, place, "seed", draw)
 

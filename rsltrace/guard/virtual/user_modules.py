@@ -47,7 +47,7 @@ class _Rewriter(ast.NodeTransformer):
         instead = ""
         if name == "datetime64" and node.args and _says_now(node.args[0]):
             instead = _NOW
-        elif (name in NEW_ARRAYS and node.args) or _leaves_some(node):
+        elif (name in NEW_ARRAYS and (node.args or node.keywords)) or _leaves_some(node):
             instead = _FILLED
         if instead:
             node.args.insert(0, function)

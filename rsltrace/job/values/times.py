@@ -301,10 +301,7 @@ class TimeInRun(NamedTuple):
         end_ns = start_ns + _RUN_NS_MAX if end_ns is None else end_ns
         if 0 < start_ns <= self.time_ns <= end_ns < stamp_ns:
             shown = format_time(self.time_ns)
-            raise TimeError(
-                f"times count from the start of the run, which is simulated time "
-                f"{format_time(start_ns)}: write @{shown} for simulated time {shown}"
-            )
+            raise TimeError(f"times count from the start: write @{shown} for that simulated time")
         return stamp_ns
 
 

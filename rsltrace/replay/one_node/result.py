@@ -34,7 +34,7 @@ def as_text(result: NodeReplayResult, *, everything: bool) -> Iterator[str]:
     if result.same:
         return
     shown: Sequence[OutputChange] = result.changes
-    rows = [row for change in shown for row in _rows(change)]
+    rows = [row for change in shown for row in _rows(change, result.start_ns)]
     left = 0
     if not everything and len(rows) > _ROWS:
         count, shown = 0, []
@@ -44,15 +44,15 @@ def as_text(result: NodeReplayResult, *, everything: bool) -> Iterator[str]:
                 break
             shown.append(change)
         left = len(result.changes) - len(shown)
-        rows = [row for change in shown for row in _rows(change)][:_ROWS]
+        rows = [row for change in shown for row in _rows(change, result.start_ns)][:_ROWS]
     yield ""
     yield from table([("time (s)", "output", "field", "recorded", "now"), *rows])
     if left:
         yield f"and {left} more {'output' if left == 1 else 'outputs'} (--all shows them)"
 
 
-def _rows(change: OutputChange) -> Iterator[tuple[str, ...]]:
-    when, name = format_seconds(change.time_ns), printable(change.name)
+def _rows(change: OutputChange, start_ns: int) -> Iterator[tuple[str, ...]]:
+    when, name = format_seconds(change.time_ns - start_ns), printable(change.name)
     output = name if change.kind == "message" else f"{change.kind} {name}"
     for one in change.fields:
         path, before, after = one.path, one.a, one.b
@@ -222,7 +222,7 @@ class NodeReplayResult:
             return f"{self.node} ran, but there is nothing to compare its outputs with ({run})"
         if first is None:
             return f"{self.node} is unchanged: {self.compared} outputs as recorded ({run})"
-        when = format_seconds(first.time_ns)
+        when = format_seconds(first.time_ns - self.start_ns)
         at = f"{first.kind} {first.name} at {when} s is {first.change.value}"
         more = len(self.changes) - 1
         later = f", and {more} later" if more else ""

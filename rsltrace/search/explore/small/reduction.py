@@ -15,6 +15,7 @@ from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.trial import ERROR, Failure, JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
 from rsltrace.simulation.loop.policy import decode_choices
+from rsltrace.trace.model.texts import Stamp
 from rsltrace.trace.reader import Trace
 
 T = TypeVar("T")
@@ -206,7 +207,7 @@ class TrialReduction:
         )
         with Trace.open(self._trace()) as trace:
             choices = trace.attachment(ATTACHMENT_CHOICES)
-            end_ns = trace.end_ns
+            end_ns = trace.stamp(trace.end_ns)
         if "policy" in overlay or choices is not None:
             made = enumerate(decode_choices(choices or b""))
             departures = tuple({"choice": number, "run": run} for number, run in made if run)
@@ -275,7 +276,7 @@ class TrialReduction:
             at_ns = end_ns if event is None else trace.event(event).stamp_ns
         at_ns = min(at_ns, end_ns)
         if at_ns < end_ns and self._fails_for_its_parts(replace(parts, until_ns=at_ns)):
-            return replace(parts, until_ns=at_ns)
+            return replace(parts, until_ns=Stamp(at_ns, start_ns))
         passes_ns, fails_ns = max(at_ns, start_ns) if at_ns < end_ns else start_ns, end_ns
         for _ in range(_TIMES_TRIED):
             middle_ns = (passes_ns + fails_ns) // 2
@@ -285,7 +286,7 @@ class TrialReduction:
                 fails_ns = middle_ns
             else:
                 passes_ns = middle_ns
-        return parts if fails_ns == end_ns else replace(parts, until_ns=fails_ns)
+        return parts if fails_ns == end_ns else replace(parts, until_ns=Stamp(fails_ns, start_ns))
 
     def _nearest_passing(
         self, parts: OverlayParts, failing: TrialResult

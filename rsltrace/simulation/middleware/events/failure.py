@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import os
 import traceback
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
+from types import FrameType, TracebackType
 
 from rsltrace.errors import NodeError, RunError
 from rsltrace.simulation.loop.loop import Dispatchable
@@ -21,6 +22,8 @@ from rsltrace.trace.model.event import EventFlag, OutputKind
 from rsltrace.trace.model.texts import format_seconds
 
 _RAISED = int(EventFlag.RAISED)
+_FRAMES_MAX = 5000
+"""So many are kept of each end of a traceback."""
 _OWN_FILES = (
     os.path.join(Path(__file__).resolve().parents[3], ""),  # this package
     "<serialize ",  # the code that is made for a message type
@@ -127,13 +130,31 @@ def is_own_frame(frame: FrameType) -> bool:
 def user_traceback(error: BaseException) -> str:
     """Return the traceback without rsltrace's frames, if others remain."""
     with contextlib.suppress(Exception):
+        left_out = sum(map(_shorten, (error, error.__cause__, error.__context__)))
         summary = traceback.TracebackException(
             type(error), error, error.__traceback__, compact=True
         )
         if not all(map(_is_own_line, summary.stack)):
             _leave_out_own(summary)
-        return _writable("".join(summary.format()))
+        text = _writable("".join(summary.format()))
+        return f"{left_out} frames of a recursion are left out\n{text}" if left_out else text
     return f"{type(error).__qualname__} (its text could not be made)"
+
+
+def _shorten(error: BaseException | None) -> int:
+    """Cut the middle out of the traceback of a very deep recursion, and return how many frames that
+    were: Python makes a text of a million in minutes, and takes no Ctrl-C meanwhile."""
+    head = None if error is None else error.__traceback__
+    count, tail, at = 0, deque[TracebackType](maxlen=_FRAMES_MAX), head
+    while at is not None:
+        count += 1
+        tail.append(at)
+        head = at if count == _FRAMES_MAX else head
+        at = at.tb_next
+    left_out = max(count - 2 * _FRAMES_MAX, 0)
+    if left_out and head is not None:
+        head.tb_next = tail[0]
+    return left_out
 
 
 def _is_own_line(line: traceback.FrameSummary) -> bool:

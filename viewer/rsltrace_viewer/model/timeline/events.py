@@ -58,7 +58,8 @@ class EventTexts:
         self._run = run
         self.of = lru_cache(maxsize=_ROWS_KEPT)(self._of)
         self.index_width = max(len(str(max(run.count - 1, 0))), 5)
-        self.time_width = len(format_seconds(run.end_ns - run.base_ns))
+        ends = (run.start_ns, run.end_ns)
+        self.time_width = max(len(format_seconds(at - run.base_ns)) for at in ends)
         names = [run.node_name(e.id) for e in run.entities.values()]
         self.node_width = min(max(map(len, names), default=5), _NODE_WIDTH_MAX)
         entities = (_short(run.entity_name(e.id)) for e in run.entities.values())
