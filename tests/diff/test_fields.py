@@ -243,7 +243,7 @@ def test_arrays_are_summarised() -> None:
     assert (found.smallest, found.largest) == (0.0, 0.5)
     assert found.ulp == 2097152
     assert notes_text(found) == "NaN in b only: 1; infinite in b only: 1; sign of zero: 1"
-    assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100]"
+    assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100 in all]"
 
 
 def test_arrays_of_other_length_show_what_is_beyond() -> None:
@@ -285,7 +285,7 @@ def test_long_binary_fields_are_shown_as_a_hex_dump() -> None:
     assert notes_text(found) == "length 200 and 100"
     assert found.first[0][0] == 96
     # short ones are numbers
-    assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8]"
+    assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8 in all]"
 
 
 def test_messages_in_arrays_are_compared_one_by_one() -> None:

@@ -131,9 +131,8 @@ def field_values(path: str, event: Event) -> list[str]:
     leaves = [leaf for message in event.messages for leaf in message.leaves or ()]
     values = [value for name, value in leaves if name == path]
     items = [value for name, value in leaves if re.fullmatch(rf"{re.escape(path)}\[\d+\]", name)]
-    values += [f"[{', '.join(items)}]"] if items else []
-    lengths = [f"{value.strip('[]')} items" for value in values if value.startswith("[")]
-    return [*values, *lengths]
+    few = f"[{', '.join(items[:4])}, … {len(items)} in all]"
+    return [*values, *(value.strip("[]") for value in values), f"[{', '.join(items)}]", few]
 
 
 def check_picture(text: str, rows: list[Row]) -> None:

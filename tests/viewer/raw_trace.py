@@ -111,7 +111,7 @@ def leaves_of(message: Any, path: str = "") -> Iterator[tuple[str, str]]:
     names = getattr(message, "__slots__", None)
     if names is not None:
         if set(names) == {"sec", "nanosec"}:  # a time is shown in seconds
-            yield path, str(Decimal(message.nanosec).scaleb(-9) + message.sec)
+            yield path, f"{Decimal(message.nanosec).scaleb(-9) + message.sec:f}"
         if set(names) == set("xyzw"):  # a quaternion is shown as the angle of its turn
             x, y, z, w = (getattr(message, name) for name in "xyzw")
             turn = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -122,7 +122,7 @@ def leaves_of(message: Any, path: str = "") -> Iterator[tuple[str, str]]:
             joints = zip(message.name, message.position, strict=False)
             yield from ((name, str(value)) for name, value in joints)
     elif isinstance(message, (list, tuple, bytes, memoryview, array)):
-        yield path, f"[{len(message)}]"
+        yield path, f"[{len(message)} item{'' if len(message) == 1 else 's'}]"
         for place, item in enumerate(message):
             yield from leaves_of(item, f"{path}[{place}]")
     else:
