@@ -265,13 +265,13 @@ def names_of(path: str) -> set[str]:
 
 
 def is_change(shown: tuple[str, str], values: tuple[str, str]) -> bool:
-    """Whether two texts are two different values, and not further from each other than these."""
+    """Whether two texts are two values that differ, and do not look much further apart."""
     if not all(is_value(*one) for one in zip(shown, values, strict=True)):
         return False
     if not all(map(NUMBER.fullmatch, (*shown, *values))):
         return values[0] != values[1]
     differences = [abs(float(old) - float(new)) for old, new in (shown, values)]
-    return not differences[0] > 2 * differences[1]
+    return not differences[0] > 10 * differences[1]
 
 
 def is_one_of(text: str, values: list[str]) -> bool:

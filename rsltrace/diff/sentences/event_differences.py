@@ -87,7 +87,7 @@ def _exaggerates(rounded: tuple[str, str], exact: tuple[str, str]) -> bool:
         shown, real = (abs(float(a) - float(b)) for a, b in (rounded, exact))
     except ValueError:
         return False
-    return shown > 2 * real
+    return shown > 10 * real
 
 
 def _rounded(text: str, digits: int) -> str:
