@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.diff.bags.comparison import ContentKeys
-from rsltrace.diff.facts.evidence import FieldDifference
+from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference, Presence
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.diff.sentences.values import notes_text
 from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.diff.values.globs import FieldRules
@@ -21,6 +22,7 @@ from rsltrace.diff.values.numbers import ulp_distance
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.model.event import OutputKind
 from tests.tiers import cases
 
 SCHEMA = f"""\
@@ -241,7 +243,7 @@ def test_arrays_are_summarised() -> None:
     assert (found.smallest, found.largest) == (0.0, 0.5)
     assert found.ulp == 2097152
     assert notes_text(found) == "NaN in b only: 1; infinite in b only: 1; sign of zero: 1"
-    assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100]"
+    assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100 in all]"
 
 
 def test_arrays_of_other_length_show_what_is_beyond() -> None:
@@ -283,7 +285,7 @@ def test_long_binary_fields_are_shown_as_a_hex_dump() -> None:
     assert notes_text(found) == "length 200 and 100"
     assert found.first[0][0] == 96
     # short ones are numbers
-    assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8]"
+    assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8 in all]"
 
 
 def test_messages_in_arrays_are_compared_one_by_one() -> None:
@@ -494,3 +496,25 @@ def test_tolerances_in_arrays_do_not_cover_what_has_no_distance() -> None:
     assert not tolerated([1.0, math.inf], [3.0, 4.0])
     odd = nan_of(0x7FF8000000000001)
     assert tolerated([1.0, math.nan], [3.0, odd])
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "text", "brief"),
+    [
+        ("0.123456789", "2.5", "x 0.1235 → 2.5", "x 0.1235 → 2.5"),
+        ("1.4375", "1.437500001", "x 1.4375 → 1.437500001", "x 1.4375 → 1.437500001"),
+        ("1.8125", "1.81250000075", "x 1.8125 → 1.812500001", "x 1.8125 → 1.812500001"),
+        ("2.5", "2.5000000000000004", "x 2.5 → 2.5000000000000004", "x 2.5 → …0004"),
+        ("0.0", "-0.0", "x 0.0 → -0.0", "x 0.0 → -0.0"),
+        ("nan", "1.23456789", "x nan → 1.235", "x nan → 1.235"),
+    ],
+)
+def test_rounded_numbers_of_a_row_are_not_further_from_each_other_than_the_exact_ones(
+    a: str, b: str, text: str, brief: str
+) -> None:
+    fields = (FieldDifference("x", a, b),)
+    one = MessageDifference(
+        OutputKind.MESSAGE, "/t", "a_msgs/msg/X", 0, Presence.BOTH, 1, 2, fields
+    )
+    assert event_differences_text([one]) == f"/t {text}"
+    assert event_differences_text([one], brief=True) == brief

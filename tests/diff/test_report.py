@@ -84,8 +84,8 @@ ALL_FIELDS = (
     FieldDifference("ranges[17]", "0.1", "0.2", 0.1, 13421773, elements=(1, 360)),
     FieldDifference(
         "intensities",
-        "[0.0, 1.0, … 360]",
-        "[0.0, 2.0, … 360]",
+        "[0.0, 1.0, … 360 in all]",
+        "[0.0, 2.0, … 360 in all]",
         ulp=99,
         notes=(FieldNote(FieldNoteKind.NAN_IN_B, count=1),),
         elements=(17, 360),

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import base64
-import hashlib
 import json
 import os
 import re
 import shutil
 import subprocess
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from mcap import records
-from mcap.opcode import Opcode
 from rsltrace_viewer.model.plots.series import Series
 from rsltrace_viewer.pages.charts import curves, histogram
 
@@ -27,47 +22,12 @@ from rsltrace.diff import diff_files
 from rsltrace.diff.traces.aligned_runs import AlignedRuns
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
+from tests.pages.page import MARKUP, Page, contained, with_names
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 PAIRS = sorted(path.parent for path in SAMPLES.glob("*/a.mcap"))
-VOID = frozenset(("meta", "br", "img", "link"))
-MARKUP = """</td></pre><script>alert(1)</script><img src=x onerror="alert(1)">'&{{7*7}}"""
 _ROW_VALUE = re.compile(r"(-?[\d.e+-]+) → (-?[\d.e+-]+)")
 _CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
-
-
-class Page(HTMLParser):
-    """The tags of a page with their attributes, its text, and the cells of its tables."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.attributes: list[tuple[str, str | None]] = []
-        self.text = ""
-        self.rows: list[list[str]] = []
-        self.classes: list[str] = []
-        self._open: list[str] = []
-        self.feed(text)
-        assert self._open == []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        self.attributes += attrs
-        if tag not in VOID:
-            self._open.append(tag)
-        if tag == "tr":
-            self.rows.append([])
-            self.classes.append(dict(attrs).get("class") or "")
-        elif tag in ("td", "th"):
-            self.rows[-1].append("")
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self._open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
-        if self._open[-1:] and "tr" in self._open and self.rows[-1]:
-            self.rows[-1][-1] += data
 
 
 def made(*words: str) -> str:
@@ -75,23 +35,6 @@ def made(*words: str) -> str:
     result = CliRunner().invoke(cli, [*words, "--format", "html"])
     assert result.exit_code in (0, 1), result.output
     return result.output
-
-
-def contained(text: str) -> None:
-    """Check that a page is small, loads nothing and runs nothing but its own script."""
-    page = Page(text)
-    assert len(text) < 1_000_000
-    names = {name for name, _ in page.attributes}
-    assert not names & {"src", "href", "style", "srcset", "action"}
-    assert not [name for name in names if name.startswith("on")]
-    assert [page.tags.count(tag) for tag in ("script", "style", "img", "link")] == [1, 1, 0, 0]
-    policy = next(value or "" for name, value in page.attributes if name == "content")
-    assert policy.startswith("default-src 'none'; ")
-    for tag in ("script", "style"):
-        (own,) = re.findall(rf"<{tag}>(.*?)</{tag}>", text, re.S)
-        assert not re.search(r"url\(|@import|https?:|fetch|XMLHttp", own)
-        digest = base64.b64encode(hashlib.sha256(own.encode()).digest()).decode()
-        assert f"{tag}-src 'sha256-{digest}';" in policy
 
 
 @pytest.mark.parametrize("folder", PAIRS, ids=lambda path: path.name)
@@ -146,26 +89,6 @@ def test_an_event_that_moved_stands_in_both_places(monkeypatch: pytest.MonkeyPat
     rows = [row for row in Page(made("diff", "a.mcap", "b.mcap")).rows if len(row) == 8]
     assert ["252", "", "+15 ms ↓ b 253"] in [[*r[1:3], r[7][:14]] for r in rows if r[0] == "~"]
     assert ["", "253", "+15 ms ↑ a 252"] in [[*r[1:3], r[7][:14]] for r in rows if r[0] == "~"]
-
-
-def with_names(parts: list[mcap_parts.Part], extra: str) -> None:
-    """Put ``extra`` behind every name and the texts of the metadata."""
-    for part in parts:
-        record = part.record if part.opcode == Opcode.METADATA else None
-        if isinstance(record, records.Metadata) and not record.name.startswith("rosbag2"):
-            kept = ("digest", "version", "resolved", "checksum")
-            record.metadata = {
-                key: text if key in kept else text + extra for key, text in record.metadata.items()
-            }
-            part.record = record
-    for topic in ("/rsltrace/entities", "/rsltrace/findings", "/rsltrace/code_lines"):
-        mcap_parts.change_messages(
-            parts,
-            topic,
-            lambda data, nth, topic=topic: with_strings(
-                data, topic, lambda n, text: text and text + extra.encode() if n == 0 else text
-            ),
-        )
 
 
 def with_logs(parts: list[mcap_parts.Part], extra: str) -> None:

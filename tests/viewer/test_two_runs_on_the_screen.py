@@ -9,213 +9,35 @@ from __future__ import annotations
 
 import json
 import re
-import struct
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
+from textual._compositor import Compositor
 
-DecoderFactory = pytest.importorskip("mcap_ros2.decoder").DecoderFactory
+from campaigns.attack import mcap_parts
+from rsltrace.diff import diff_files
+from rsltrace.diff.options import DiffOptions
+from tests.pages.page import MARKUP, Page, aligned_rows, check_page, contained, with_names
+from tests.viewer.raw_trace import Event, read
+from tests.viewer.shown_rows import NUMBER, Row, check_both_runs, check_one_run, rows_on
 
 Drive = Callable[..., None]
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 NAMES = ("schedule", "delayed_input", "missing_event", "nondeterministic_callback")
 MS = 1_000_000
-_SHOWN = re.compile(r"(\S*) ?(\S+) → (\S+)")
 
 
-@dataclass
-class Read:
-    """An event as it is in the file, with the values of its input and outputs."""
-
-    index: int
-    stamp_ns: int
-    cause: tuple[int, int]
-    values: set[str] = field(default_factory=set)
-    outputs: list[set[str]] = field(default_factory=list)
+@pytest.fixture(autouse=True)
+def _no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compose nothing for the terminal that is not there: that takes most of the time."""
+    monkeypatch.setattr(Compositor, "render_update", lambda self, **_: self._dirty_regions.clear())
 
 
-def read(path: Path) -> list[Read]:
-    """Read a trace without any code of rsltrace."""
-    messages: dict[tuple[str, int], set[str]] = {}
-    names: dict[int, tuple[str, int]] = {}
-    events: list[Read] = []
-    outputs: list[tuple[int, int, int, int]] = []
-    with path.open("rb") as file:
-        factory = DecoderFactory()
-        for schema, channel, message in make_reader(file).iter_messages(log_time_order=False):
-            data = message.data[4:]
-            if channel.topic == "/rsltrace/events":
-                _, index, stamp, cause, _, _, _, _, output, _, _, _ = struct.unpack(
-                    "<QQQQQQQIIIBB", data
-                )
-                events.append(Read(index, stamp, (cause, output)))
-            elif channel.topic == "/rsltrace/outputs":
-                event, _, entity, kind, sequence = struct.unpack("<QQIII", data)
-                outputs.append((event, entity, kind, sequence))
-            else:
-                decoder = factory.decoder_for(channel.message_encoding, schema)
-                assert decoder is not None
-                decoded = decoder(message.data)
-                if channel.topic == "/rsltrace/entities":
-                    names[decoded.id] = (decoded.name, decoded.kind)
-                elif not channel.topic.startswith("/rsltrace/details"):
-                    messages[channel.topic, message.sequence] = set(values_of(decoded))
-    prefixes = {2: "/rsltrace/request", 3: "/rsltrace/response"}
-    for event, entity, kind, sequence in outputs:
-        topic = "/rosout" if kind == 4 else prefixes.get(kind, "") + names[entity][0]
-        found = messages.get((topic, sequence), set()) if kind <= 4 else set()
-        events[event].outputs.append(found)
-        events[event].values |= found
-    for one in events:
-        cause, output = one.cause
-        if cause < len(events) and output < len(events[cause].outputs):
-            one.values |= events[cause].outputs[output]
-    return events
-
-
-def values_of(message: Any) -> Iterator[str]:
-    """Yield all values in a message."""
-    if hasattr(message, "__slots__"):
-        for name in message.__slots__:
-            yield from values_of(getattr(message, name))
-    elif isinstance(message, (list, tuple)):
-        for item in message:
-            yield from values_of(item)
-    else:
-        yield str(message).lower() if isinstance(message, bool) else str(message)
-
-
-def said(text: str, values: set[str]) -> bool:
-    """Whether a value on the screen is one of these, as far as its digits go."""
-    if text in values:
-        return True
-    try:
-        number = float(text)
-    except ValueError:
-        return any(text.strip('"…') in value for value in values)
-    digits = len(re.sub(r"e.*|[-.]", "", text).lstrip("0"))
-    return any(
-        float(f"{float(value):.{max(digits, 4)}g}") == number
-        for value in values
-        if re.fullmatch(r"-?[0-9.]+(e-?[0-9]+)?", value)
-    )
-
-
-@dataclass
-class Row:
-    """A line of the list of events."""
-
-    sign: str
-    numbers: tuple[int | None, ...]
-    time_ns: int
-    text: str
-    unit_ns: int = 1
-    """The digits of the time that there is room for."""
-
-    def is_at(self, stamp_ns: int) -> bool:
-        return self.time_ns == stamp_ns - stamp_ns % self.unit_ns
-
-
-def rows_on(screen: str) -> list[Row]:
-    """Return what the lines of the list say, by the places of its headings."""
-    lines = screen.splitlines()
-    top = next(n for n, line in enumerate(lines) if "what it did" in line)
-    head = lines[top]
-    what = head.index("what it did")
-    two = re.match(r" +a +b +time", head) is not None
-    ends = [head.index(" a ") + 2, head.index(" b ") + 2] if two else [head.index("event") + 5]
-    found = []
-    for line in lines[top + 1 :]:
-        if not re.match(r"[>←→ ][=≠~+?-] ", line) or line.startswith(" ? help"):
-            break
-        starts = [4, *ends[:-1]]
-        texts = [line[start:end].strip() for start, end in zip(starts, ends, strict=True)]
-        time = line[ends[-1] :].split()[0]
-        text = line[what:].partition("│")[0]
-        text = re.sub(r" +[▁▂▃▄▅▆▇█]?$", "", text.rstrip())
-        seconds, _, part = time.partition(".")
-        assert len(part) in (6, 9), line
-        unit_ns = 10 ** (9 - len(part))
-        number = tuple(int(text) if text else None for text in texts)
-        time_ns = int(seconds) * 10**9 + int(part) * unit_ns
-        found.append(Row(line[1], number, time_ns, text, unit_ns))
-    return found
-
-
-def check_alone(rows: list[Row], own: list[Read], other: list[Read]) -> int:
-    """Check the list of one run; return how many values were compared."""
-    compared = 0
-    assert [row.numbers for row in rows] == [(event.index,) for event in own]
-    for row, event in zip(rows, own, strict=True):
-        assert row.is_at(event.stamp_ns)
-        for value in re.findall(r"[\w.ω]+=([^\s…\[]+)(?= |$)", row.text):
-            assert said(value.strip(","), event.values), (row, event.values)
-            compared += 1
-        assert " → " not in row.text
-        assert "only in" not in row.text
-    return compared
-
-
-def check_both(rows: list[Row], a: list[Read], b: list[Read]) -> dict[str, int]:
-    """Check the list of both runs; return how many rows of which kind there were."""
-    counts = {"moved": 0, "only": 0, "differs": 0, "same": 0, "values": 0}
-    for side, events in enumerate((a, b)):
-        assert [row.numbers[side] for row in rows if row.numbers[side] is not None] == [
-            event.index for event in events
-        ]
-    at = [
-        {
-            row.numbers[side]: place
-            for place, row in enumerate(rows)
-            if row.numbers[side] is not None
-        }
-        for side in (0, 1)
-    ]
-    for place, row in enumerate(rows):
-        i, j = row.numbers
-        event = a[i] if i is not None else b[j or 0]
-        assert row.is_at(event.stamp_ns)
-        moved = re.search(r"([↓↑]) ([ab]) (\d+)", row.text)
-        if moved:
-            counts["moved"] += 1
-            side = "ab".index(moved[2])
-            assert row.numbers[side] is None
-            there = at[side][int(moved[3])]
-            assert (there > place) == (moved[1] == "↓")
-            own = row.numbers[1 - side]
-            back = f"{'↑' if moved[1] == '↓' else '↓'} {'ba'[side]} {own}"
-            assert back in rows[there].text
-            i, j = (own, int(moved[3])) if side else (int(moved[3]), own)
-        elif row.sign in "-+":
-            counts["only"] += 1
-            assert row.text.startswith(f"only in {'a' if row.sign == '-' else 'b'}")
-            assert row.numbers["-+".index(row.sign)] is not None
-            assert row.numbers["+-".index(row.sign)] is None
-            continue
-        assert i is not None
-        assert j is not None
-        if row.sign == "≠":
-            counts["differs"] += 1
-            for _, x, y in _SHOWN.findall(row.text):
-                if "…" not in x + y:
-                    assert said(x, a[i].values), (row, a[i].values)
-                    assert said(y.rstrip(","), b[j].values), (row, b[j].values)
-                    assert x != y
-                    counts["values"] += 1
-        else:
-            counts["same"] += 1
-            assert a[i].values == b[j].values
-            assert (a[i].stamp_ns == b[j].stamp_ns) or row.sign == "~"
-    return counts
-
-
-def screens(drive: Drive, pair: tuple[Path, Path]) -> tuple[list[list[Row]], list[list[Read]]]:
+def screens(drive: Drive, pair: tuple[Path, Path]) -> tuple[list[list[Row]], list[list[Event]]]:
     """Return the rows of the modes of both, a and b, on a screen that holds all of them, and the
     events of the two traces."""
     traces = [read(path) for path in pair]
@@ -231,49 +53,59 @@ def screens(drive: Drive, pair: tuple[Path, Path]) -> tuple[list[list[Row]], lis
     return found, traces
 
 
-SIZES = ((80, 24), (120, 40), (200, 60))
+async def whole_list(viewer: Any) -> list[Row]:
+    """Return the rows of the list of events, read a page at a time from the first to the last."""
+    await viewer.press("home")
+    rows = rows_on(viewer.text)
+    while True:
+        await viewer.press("pagedown")
+        page = rows_on(viewer.text)
+        first = next((n for n, row in enumerate(rows) if row.numbers == page[0].numbers), len(rows))
+        again = len(rows) - first
+        assert [row.numbers for row in rows[first:]] == [row.numbers for row in page[:again]]
+        if again == len(page):
+            return rows
+        rows += page[again:]
 
 
 def check_everywhere(drive: Drive, pair: tuple[Path, Path], folder: Path) -> None:
-    """Check a pair on a screen that holds all of it, on screens of every size around the
-    divergence, and in Rerun's recording."""
-    found, (a, b) = screens(drive, pair)
-    check_both(found[0], a, b)
-    for size in SIZES:
+    """Check every row of a pair on screens of three sizes, in Rerun's recording and on the page."""
+    a, b = map(read, pair)
+    rows: list[Row] = []
 
-        async def steps(viewer: Any) -> None:
-            for keys in (["z"], ["pagedown"], ["z"], ["pageup"], ["end"]):
-                await viewer.press(*keys)
-                check_page(rows_on(viewer.text), found[0], a, b)
+    async def steps(viewer: Any) -> None:
+        check_both_runs(rows_on(viewer.text), a, b)
+        await viewer.press("z")
+        for width, height in ((80, 24), (120, 40), (200, 60)):
+            await viewer.resize(width, height)
+            shown = await whole_list(viewer)
+            check_both_runs(shown, a, b)
+            assert not rows or [row.numbers for row in shown] == [row.numbers for row in rows]
+            rows[:] = shown
+        for own in (a, b):
+            await viewer.press("o")
+            check_one_run(await whole_list(viewer), own)
 
-        drive(pair, steps, size=size)
-    check_recording([row.numbers for row in found[0]], pair, (a, b), folder / "pair.rrd")
+    drive(pair, steps, size=(80, 24))
+    for side, own in enumerate((a, b)):
+        assert len([row for row in rows if row.numbers[side] is not None]) == len(own)
+    check_recording([row.numbers for row in rows], pair, (a, b), folder / "pair.rrd")
+    on_page = check_page(page_of(pair), a, b)
+    shown = [row for row in rows if row.numbers in [one.numbers for one in on_page]]
+    assert [(row.sign, row.numbers) for row in on_page] == [(r.sign, r.numbers) for r in shown]
 
 
-def check_page(page: list[Row], rows: list[Row], a: list[Read], b: list[Read]) -> None:
-    """Check that a page is a part of the rows, with the values of their events."""
-    assert page
-    first = [row.numbers for row in rows].index(page[0].numbers)
-    shown = rows[first : first + len(page)]
-    assert [row.numbers for row in page] == [row.numbers for row in shown]
-    for row, whole in zip(page, shown, strict=True):
-        assert row.sign == whole.sign
-        assert row.is_at(whole.time_ns)
-        i, j = whole.numbers
-        if moved := re.search(r"[↓↑] [ab] (\d+)", whole.text):
-            i, j = (i, int(moved[1])) if j is None else (int(moved[1]), j)
-            there = re.search(r"[↓↑] [ab] \d+ ", row.text)
-            assert there is None or there[0] == moved[0] + " "
-        for _, x, y in _SHOWN.findall(row.text) if None not in (i, j) else ():
-            if "…" not in x + y and not row.text.endswith(y):
-                assert said(x, a[i or 0].values), (row, whole)
-                assert said(y.rstrip(","), b[j or 0].values), (row, whole)
+def page_of(pair: tuple[Path, Path]) -> str:
+    """Return what ``rsltrace diff --format html`` prints."""
+    from rsltrace_viewer.pages.diff_page import diff_page
+
+    return diff_page([diff_files(*map(str, pair))], DiffOptions())
 
 
 def check_recording(
     rows: list[tuple[int | None, ...]],
     pair: tuple[Path, Path],
-    events: tuple[list[Read], list[Read]],
+    events: tuple[list[Event], list[Event]],
     output: Path,
 ) -> None:
     """Check that a recording has the rows of the screen, and the events and values of the runs."""
@@ -304,13 +136,21 @@ def check_recording(
         for path, found in both.rows.items():
             curve = re.fullmatch(rf"/run_{'ab'[side]}/topics/(?!rsltrace).*", path)
             for row in found if curve else ():
-                values = {float(v) for v in own[numbers[row["row"]]].values if is_number(v)}
+                values = numbers_of(own[numbers[row["row"]]], path.split("/topics")[1])
                 for value in row.get("Scalars:scalars") or ():
                     assert value in values or value != value, (path, row)
 
 
-def is_number(text: str) -> bool:
-    return re.fullmatch(r"-?(inf|nan|[0-9.]+(e[-+]?[0-9]+)?)", text) is not None
+def numbers_of(event: Event, place: str) -> set[float]:
+    """Return the numbers that an event sent in a field, by its place in a recording."""
+    found = set()
+    for message in event.outputs:
+        name, field = place[: len(message.name)], place[len(message.name) + 1 :]
+        for path, value in message.leaves or () if name == message.name else ():
+            names = re.sub(r"\[\d+\]", "", path)
+            if f".{field}." in f"..{names}." and NUMBER.fullmatch(value):
+                found.add(float(value))
+    return found
 
 
 @pytest.mark.parametrize(
@@ -320,8 +160,50 @@ def is_number(text: str) -> bool:
         for name in NAMES
     ],
 )
-def test_samples_in_every_size_and_in_rerun(drive: Drive, name: str, tmp_path: Path) -> None:
+def test_samples_everywhere(drive: Drive, name: str, tmp_path: Path) -> None:
     check_everywhere(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"), tmp_path)
+
+
+@pytest.fixture(scope="session")
+def faults() -> list[str]:
+    """Fifty of the faults that ``make truth`` plants."""
+    pytest.importorskip("rclpy")
+    from campaigns.truth import faults
+
+    faults.load()
+    names = [name for name in faults.FAULTS if faults.FAMILIES[name] != "recordings"]
+    return names[:: len(names) // 50]
+
+
+@pytest.mark.few(2)
+@pytest.mark.ros
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # files left open
+@pytest.mark.parametrize("number", [0, 13, *(n for n in range(50) if n not in (0, 13))])
+def test_planted_pairs_everywhere(
+    drive: Drive, faults: list[str], number: int, tmp_path: Path
+) -> None:
+    """Also where every name is markup: nothing but the names is another on the page."""
+    from campaigns.truth.campaign import try_case
+
+    try_case(faults[number], 0, tmp_path)
+    pair = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    check_everywhere(drive, pair, tmp_path)
+    pages = []
+    for extra in ("", MARKUP, "x" * len(MARKUP)):
+        named = tmp_path / f"a{len(pages)}.mcap", tmp_path / f"b{len(pages)}.mcap"
+        for path, output in zip(pair, named, strict=True):
+            parts = mcap_parts.take_apart(path.read_bytes())
+            with_names(parts, extra)
+            output.write_bytes(mcap_parts.put_together(parts))
+        text = page_of(named)
+        contained(text)
+        pages.append(Page(text))
+    assert pages[1].tags == pages[2].tags
+    plain, hostile = (
+        [(r.sign, r.numbers, r.time_ns, r.delta, r.text.replace(MARKUP, "")[:20]) for r in rows]
+        for rows in map(aligned_rows, pages[:2])
+    )
+    assert plain == hostile
 
 
 @pytest.mark.parametrize(
@@ -329,8 +211,8 @@ def test_samples_in_every_size_and_in_rerun(drive: Drive, name: str, tmp_path: P
 )
 def test_samples(drive: Drive, name: str) -> None:
     both, (a, b) = screens(drive, (SAMPLES / name / "a.mcap", SAMPLES / name / "b.mcap"))
-    counts = check_both(both[0], a, b)
-    compared = check_alone(both[1], a, b), check_alone(both[2], b, a)
+    counts = check_both_runs(both[0], a, b)
+    compared = check_one_run(both[1], a), check_one_run(both[2], b)
     if name == "missing_event":
         assert counts["only"] > 30
     else:
@@ -391,11 +273,11 @@ def test_constructed_pairs(drive: Drive, simulator: Any, tmp_path: Path, case: s
         faults = [simulator.Fault(kind, first, **more)]
     simulator.Simulation(whole, tmp_path / "b.mcap", tuple(faults)).run()
     found, (a, b) = screens(drive, (tmp_path / "a.mcap", tmp_path / "b.mcap"))
-    counts = check_both(found[0], a, b)
+    counts = check_both_runs(found[0], a, b)
     pair = tmp_path / "a.mcap", tmp_path / "b.mcap"
     check_recording([row.numbers for row in found[0]], pair, (a, b), tmp_path / "pair.rrd")
-    assert check_alone(found[1], a, b) > 20
-    assert check_alone(found[2], b, a) > 20
+    assert check_one_run(found[1], a) > 20
+    assert check_one_run(found[2], b) > 20
     expected = {
         "order": "moved",
         "many moves": "moved",

@@ -42,7 +42,10 @@ def message(**fields: Any) -> Any:
         (message(data=7), "7"),
         (message(header=message(stamp=1, frame_id="map"), ok=True, text="a\x1b[2J"), None),
         (message(orientation=message(x=0.0, y=0.0, z=1.0, w=0.0)), "3.142"),
-        (message(ranges=np.zeros(360), covariance=np.ones(36), gain=2.5), "ranges=[360] gain=2.5"),
+        (
+            message(ranges=np.zeros(360), covariance=np.ones(36), gain=2.5),
+            "ranges=[360 items] gain=2.5",
+        ),
         (message(a=message(x=1.0), b=message(x=2.0)), "a.x=1 b.x=2"),
         (message(pair=np.array([1.5, 2.0]), empty=[]), "pair=[1.5 2]"),
     ],

@@ -4,6 +4,7 @@ say it in these words."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference, Presence
 from rsltrace.diff.sentences.values import IN_ONE, no_fields_text
@@ -69,14 +70,24 @@ def _short(a: str, b: str, most: int) -> tuple[str, str]:
     """Return two values as short as they can be and still differ, of about ``most`` characters."""
     for digits in range(4, 18):
         rounded = _rounded(a, digits), _rounded(b, digits)
-        if rounded[0] != rounded[1]:
+        if rounded[0] != rounded[1] and not _exaggerates(rounded, (a, b)):
             a, b = rounded
             break
-    differs = (place for place, (x, y) in enumerate(zip(a, b, strict=False)) if x != y)
-    alike = next(differs, min(len(a), len(b))) - _ALIKE
+    pairs = enumerate(zip_longest(a, b, fillvalue="0"))  # 2.5 is 2.500
+    alike = next((place for place, (x, y) in pairs if x != y), min(len(a), len(b))) - _ALIKE
     if alike > 1 and max(len(a), len(b)) > most:
-        a, b = f"…{a[alike:]}", f"…{b[alike:]}"
+        a, b = (f"…{text[alike:]}" if len(text) > alike else text for text in (a, b))
     return shortened(a, most), shortened(b, most)
+
+
+def _exaggerates(rounded: tuple[str, str], exact: tuple[str, str]) -> bool:
+    """Return whether two numbers look much further from each other than they are, as 1.8125 and
+    1.8125001 do in four digits: one may be rounded up and the other down."""
+    try:
+        shown, real = (abs(float(a) - float(b)) for a, b in (rounded, exact))
+    except ValueError:
+        return False
+    return shown > 10 * real
 
 
 def _rounded(text: str, digits: int) -> str:

@@ -144,10 +144,10 @@ def diff_arrays(
 
 
 def array_text(values: npt.NDArray[Any], count: int = 4) -> str:
-    """Return an array as ``[0.1, 0.2, … 360]``: the first few elements, and how many if more."""
+    """Return an array as ``[0.1, … 360 in all]``: the first few elements, and how many if more."""
     type_name = values.dtype.name
     shown = [number_text(value, type_name) for value in values[:count].tolist()]
-    more = [f"… {len(values)}"] if len(values) > count else []
+    more = [f"… {len(values)} in all"] if len(values) > count else []
     return f"[{', '.join(shown + more)}]" if len(shown) + len(more) != 1 else f"[{shown[0]}]"
 
 

@@ -287,7 +287,7 @@ def _items(values: Any) -> str:
         return "[]"
     if len(values) <= 3 and not dataclasses.is_dataclass(values[0]):
         return "[" + " ".join(value for item in values for _, value in _leaves(item, "")) + "]"
-    return f"[{len(values)}]"
+    return f"[{_count(values, 'item')}]"  # [5] is an array of one five
 
 
 def _yaw(x: float, y: float, z: float, w: float) -> float:
