@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.diff.sentences.event_differences import TURNS, number
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
+from rsltrace.trace.words.phrases import TURNS, number
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import EventText, outputs_text
 
