@@ -21,8 +21,8 @@ from rsltrace.trace.words.node_colours import NODE_COLOURS
 _FOLDER = Path(__file__).parent / "templates"
 _TEXT_MAX, _REPORT_MAX = 4000, 100_000
 _NODES = Markup("").join(
-    Markup(".c{} rect {{ stroke: light-dark({}, {}); stroke-width: 2 }}\n").format(n, light, dark)
-    for n, (dark, light) in enumerate(NODE_COLOURS)
+    Markup(f".c{number} rect {{ stroke: light-dark({light}, {dark}); stroke-width: 2 }}\n")
+    for number, (dark, light) in enumerate(NODE_COLOURS)
 )
 """The colours of nodes in a graph."""
 

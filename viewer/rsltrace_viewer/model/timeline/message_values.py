@@ -121,14 +121,13 @@ def _odometry(message: Any) -> str:
 
 
 def _imu(message: Any) -> str:
-    turns = [*_named("", message.angular_velocity, TURNS)]
-    texts = [*turns, *_named("a", message.linear_acceleration)]
-    return " ".join(texts) or "ω=0 a=0"
+    turns = _named("", message.angular_velocity, TURNS)
+    return " ".join([*turns, *_named("a", message.linear_acceleration)]) or "ω=0 a=0"
 
 
 def _named(before: str, vector: Any, names: Mapping[str, str] = MappingProxyType({})) -> list[str]:
     """Return the parts of a vector that are not zero, each with its name."""
-    found = ((axis, number(float(getattr(vector, axis)))) for axis in "xyz")
+    found = ((axis, number(float(getattr(vector, axis)), 3)) for axis in "xyz")
     return [f"{before}{names.get(axis, axis)}={text}" for axis, text in found if text != "0"]
 
 
