@@ -124,6 +124,8 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
         (ros_message(f"{nav}/Path"), "0 poses"),
         (ros_message(f"{nav}/OccupancyGrid"), "0x0 cells of 0 m"),
         (odometry(1.2, 0.5), "x=1.2 vx=0.5 ω=-0.1"),
+        (odometry(0, 0.5), "vx=0.5 ω=-0.1"),
+        (ros_message(f"{nav}/Odometry"), "x=0 y=0"),
         (ros_message(f"{sensor}/Imu"), "ω=0 a=0"),
         (ros_message(f"{sensor}/Imu", linear_acceleration=vector(z=9.806)), "az=9.81"),
         (ros_message(f"{sensor}/NavSatFix", latitude=47.1, longitude=-8), FIX),

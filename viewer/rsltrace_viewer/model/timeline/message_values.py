@@ -115,9 +115,11 @@ def _transform(one: Any) -> str:
 
 
 def _odometry(message: Any) -> str:
-    velocity = message.twist.twist
-    moves = [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
-    return " ".join([_values(message.pose.pose), *moves])
+    pose, velocity = message.pose.pose, message.twist.twist
+    turned = number(_yaw(*(float(getattr(pose.orientation, axis)) for axis in "xyzw")), 3)
+    texts = [*_named("", pose.position), *([f"θ={turned}"] if turned != "0" else ())]
+    texts += [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
+    return " ".join(texts) or "x=0 y=0"
 
 
 def _imu(message: Any) -> str:
