@@ -58,3 +58,19 @@ def test_of_one_run_it_says_why_the_selected_callback_was_late(
                 assert next(question.answers())[0] == _printed("b.mcap", *names), question
 
     drive(Path("b.mcap"), steps)
+
+
+def test_in_the_overview_it_is_asked_about_the_whole_run(
+    drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(SAMPLES)
+
+    async def steps(viewer: Any) -> None:
+        lines = viewer.text.splitlines()
+        line = next(n for n, text in enumerate(lines) if "/picker client /close" in text)
+        await viewer.press(*["down"] * (line - 1), "r")
+        printed = _printed("b.mcap", "/picker", "/close")
+        assert viewer.app.screen.text().plain.splitlines() == printed
+        assert "had not ended at 10.0 s" in printed[0]
+
+    drive(Path("b.mcap"), steps, overview=True)

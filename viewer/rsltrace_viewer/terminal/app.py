@@ -291,6 +291,11 @@ class ViewerApp(Stepping):
                 self._go_to_event(index, other=name == RUN_B)
             elif what == "key":
                 self.call_next(self.run_action, text)
+            elif what == "reason":
+                from rsltrace_viewer.model.callback_question import CallbackQuestion
+
+                node, _, name = text.partition(" ")
+                self._answer(CallbackQuestion(self.session.a, False, node, name))
             else:
                 try:
                     self._filter(text)
