@@ -37,7 +37,7 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
     Exit status: 0 if the callback ran as expected, 1 if there is a reason why it did not, 2 if
     there is no such node, topic or callback.
     """
-    from rsltrace.why.answer import AsExpected, evidence, sentence
+    from rsltrace.why.answer import AsExpected, answer_lines
     from rsltrace.why.answer import as_json as reason_json
     from rsltrace.why.answer import why as find_reason
 
@@ -47,7 +47,7 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
         if as_json:
             say(json.dumps(reason_json(reason), indent=2))
         else:
-            say("\n  ".join((sentence(reason), *evidence(reason))))
+            say("\n".join(answer_lines(reason)))
     if reason.event is not None and not as_json:
         tell(f"next: rsltrace view {path_word(str(trace))} --at {reason.event}")
     return int(not isinstance(reason, AsExpected))

@@ -303,6 +303,12 @@ def sentence(reason: Reason) -> str:
     return as_sentence(f"{reason.words()}{where}")
 
 
+def answer_lines(reason: Reason) -> Iterator[str]:
+    """Yield a reason as a sentence, then its evidence."""
+    yield sentence(reason)
+    yield from (f"  {line}" for line in evidence(reason))
+
+
 def evidence(reason: Reason) -> Iterator[str]:
     """Yield the lines that show what the trace says, printable."""
     yield from map(printable, _evidence(reason))

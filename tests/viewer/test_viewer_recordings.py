@@ -26,6 +26,7 @@ from rsltrace_viewer.terminal.screens.help import KeysScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen
 from rsltrace_viewer.terminal.screens.report import ReportScreen
 from rsltrace_viewer.terminal.screenshot import settle, text_of
+from textual import events
 from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
@@ -371,3 +372,20 @@ def test_the_difference_of_two_curves() -> None:
     assert found.values.tolist() == [0.5, 0.5]
     assert found.note == "|a − b| ≤ 0.5"
     assert difference([a]) is None
+
+
+@pytest.mark.parametrize("size", [(80, 24), (120, 36)])
+def test_a_click_meets_the_line_below_the_title_of_a_list(
+    bags: tuple[Path, Path], size: tuple[int, int]
+) -> None:
+    async def steps(app: RecordingApp, press: Any) -> None:
+        place = len(app.session.keys) - 1
+        x, y = app.topics.region.x + 4, app.topics.region.y + place + 1
+        app.topics.on_click(
+            events.Click(app.topics, 4, place + 1, 0, 0, 1, False, False, False, x, y)
+        )
+        await press("home")
+        assert app.session.place == place
+        assert "values" in str(app.messages.border_title)
+
+    drive(bags[:1], steps, size=size)

@@ -80,6 +80,20 @@ def transform(x: float) -> Any:
     return made
 
 
+def vector(**parts: float) -> Any:
+    return ros_message("geometry_msgs/msg/Vector3", **parts)
+
+
+def odometry(x: float, speed: float) -> Any:
+    made = ros_message("nav_msgs/msg/Odometry")
+    made.pose.pose.position.x = x
+    made.twist.twist.linear, made.twist.twist.angular = vector(x=speed), vector(z=-0.1)
+    return made
+
+
+FIX = "47.100000°, -8.000000°, 0 m high"
+
+
 def test_common_messages_say_what_one_wants_to_know() -> None:
     sensor, nav = "sensor_msgs/msg", "nav_msgs/msg"
     ranges = np.array([0.4, 8.9, np.inf], dtype=np.float32)
@@ -112,6 +126,26 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
         (ros_message(f"{nav}/Path", poses=[pose, pose]), "2 poses to y=3"),
         (ros_message(f"{nav}/Path"), "0 poses"),
         (ros_message(f"{nav}/OccupancyGrid"), "0x0 cells of 0 m"),
+        (odometry(1.2, 0.5), "x=1.2 vx=0.5 ω=-0.1"),
+        (odometry(0, 0.5), "vx=0.5 ω=-0.1"),
+        (ros_message(f"{nav}/Odometry"), "x=0 y=0"),
+        (ros_message(f"{sensor}/Imu"), "ω=0 a=0"),
+        (ros_message(f"{sensor}/Imu", linear_acceleration=vector(z=9.806)), "az=9.81"),
+        (ros_message(f"{sensor}/NavSatFix", latitude=47.1, longitude=-8), FIX),
+        (
+            ros_message(
+                f"{sensor}/NavSatFix", status=ros_message(f"{sensor}/NavSatStatus", status=-1)
+            ),
+            "no fix",
+        ),
+        (
+            ros_message(
+                "rcl_interfaces/msg/ParameterEvent",
+                new_parameters=[ros_message("rcl_interfaces/msg/Parameter", name="rate")] * 2,
+                changed_parameters=[],
+            ),
+            "rate and 1 more",
+        ),
         (
             ros_message("diagnostic_msgs/msg/DiagnosticArray", status=status),
             "WARN battery: low and 1 more",

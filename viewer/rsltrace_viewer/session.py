@@ -43,7 +43,6 @@ from rsltrace_viewer.model.timeline.columns import (
 )
 from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
 from rsltrace_viewer.model.timeline.message_values import RowValues
-from rsltrace_viewer.model.timeline.pair_values import PairValues
 from rsltrace_viewer.model.view import OneRun, View
 
 if TYPE_CHECKING:
@@ -51,6 +50,7 @@ if TYPE_CHECKING:
     from rsltrace.diff.traces.aligned_runs import Block
     from rsltrace_viewer.model.comparison import Comparison
     from rsltrace_viewer.model.plots.runs import RunPlots
+    from rsltrace_viewer.model.timeline.pair_values import PairValues
 
 SEEK: dict[str, tuple[EventFilter, str]] = {
     "raised": (conditions.RAISED, "exception"),
@@ -74,14 +74,17 @@ class Session:
         self.a = a
         self.b = b
         self.comparison: Comparison | None = None
+        self._pair_values: PairValues | None = None
         self.side = BOTH if b is not None else RUN_A
         self.view: View = OneRun(a.count)
         if b is not None:
             for run in (a, b):
                 refuse_native(run.trace, "its events are at times of their own (see rsltrace diff)")
             from rsltrace_viewer.model.comparison import Comparison
+            from rsltrace_viewer.model.timeline.pair_values import PairValues
 
             self.view = self.comparison = Comparison(a, b)
+            self._pair_values = PairValues(self.comparison.runs)
         self.rows: RowList = AllRows(self.view.count)
         self.filter_text = ""
         self.search: Sought | None = None
@@ -96,7 +99,6 @@ class Session:
         runs = self.runs
         self._texts = {name: EventTexts(run) for name, run in runs.items()}
         self.values = {name: RowValues(run) for name, run in runs.items()}
-        self._pair_values = PairValues(self.comparison.runs) if self.comparison else None
         self._names = self._short_names()
         self.lane_window = LaneWindow([run for run in (a, b) if run is not None])
         self.logs: dict[str, Logs] = {}

@@ -37,7 +37,10 @@ text { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; fill: #1f2328; }
 .back { stroke: #8c959f; }
 .apart { stroke: #cf222e; stroke-dasharray: 5 4; stroke-width: 1.6; }
 .lonely rect { stroke-dasharray: 3 3; }
-"""
+""" + "".join(
+    f".c{number} rect {{ stroke: {light}; stroke-width: 2; }}\n"
+    for number, (_, light) in enumerate(NODE_COLOURS)
+)
 
 
 @dataclass
@@ -235,7 +238,7 @@ def _svg(boxes: list[_Box], edges: list[_Edge], in_page: bool) -> Iterator[str]:
     for edge in edges:
         yield _path(boxes[edge.source], boxes[edge.target], edge)
     for box in boxes:
-        yield _drawn(box, in_page)
+        yield _drawn(box)
     yield "</svg>"
 
 
@@ -269,19 +272,15 @@ def _straight(source: _Box, target: _Box, edge: _Edge) -> str:
     return path
 
 
-def _drawn(box: _Box, in_page: bool) -> str:
+def _drawn(box: _Box) -> str:
     width, x, y = box.width, box.x - box.width / 2, box.y - _BOX_HEIGHT / 2
     radius = 6 if box.kind == "node" else _BOX_HEIGHT / 2
     lonely = " lonely" if box.lonely else ""
-    stroke = ""
-    if box.colour is not None:
-        dark, light = NODE_COLOURS[box.colour]
-        colour = f"light-dark({light}, {dark})" if in_page else light
-        stroke = f' style="stroke: {colour}; stroke-width: 2"'
+    colour = "" if box.colour is None else f" c{box.colour}"
     label, title = escape(printable(box.label)), escape(printable(box.title))
     return (
-        f'<g class="{box.kind}{lonely}"><title>{title}</title>'
+        f'<g class="{box.kind}{lonely}{colour}"><title>{title}</title>'
         f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{_BOX_HEIGHT:.0f}" '
-        f'rx="{radius:.0f}"{stroke}/><text x="{box.x:.1f}" y="{box.y + 4:.1f}" '
+        f'rx="{radius:.0f}"/><text x="{box.x:.1f}" y="{box.y + 4:.1f}" '
         f'text-anchor="middle">{label}</text></g>'
     )

@@ -10,8 +10,8 @@ from rsltrace.diff.facts.evidence import FieldDifference, MessageDifference, Pre
 from rsltrace.diff.sentences.values import IN_ONE, no_fields_text
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import shortened
+from rsltrace.trace.words.phrases import TURNS, number
 
-TURNS = {"x": "ωx", "y": "ωy", "z": "ω"}
 _FIELDS_MAX = 5
 _MESSAGES_MAX = 6
 _VALUE_MAX, _BRIEF_MAX = 30, 12
@@ -109,9 +109,3 @@ def field_name(path: str, *, whole: bool = False) -> str:
     if path == "data":
         return ""
     return ".".join([*names[-2:-1], name]) if whole else name
-
-
-def number(value: float, digits: int = 4) -> str:
-    """Return a number in so many digits: ``0.31``, ``1.234e+06``."""
-    text = f"{value:.{digits}g}"
-    return "0" if text == "-0" else text

@@ -102,3 +102,13 @@ def as_sentence(text: str) -> str:
 def path_word(path: str) -> str:
     """Return a path as a word of a command, never an option."""
     return shlex.quote(f"./{path}" if path.startswith("-") else path)
+
+
+TURNS = {"x": "ωx", "y": "ωy", "z": "ω"}
+"""The names of the parts of an angular velocity."""
+
+
+def number(value: float, digits: int = 4) -> str:
+    """Return a number in so many digits: ``0.31``, ``1.234e+06``."""
+    text = f"{value:.{digits}g}"
+    return "0" if text == "-0" else text

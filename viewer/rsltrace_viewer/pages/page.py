@@ -16,14 +16,20 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from rsltrace.trace.model.texts import printable_lines, shortened
+from rsltrace.trace.words.node_colours import NODE_COLOURS
 
 _FOLDER = Path(__file__).parent / "templates"
 _TEXT_MAX, _REPORT_MAX = 4000, 100_000
+_NODES = Markup("").join(
+    Markup(f".c{number} rect {{ stroke: light-dark({light}, {dark}); stroke-width: 2 }}\n")
+    for number, (dark, light) in enumerate(NODE_COLOURS)
+)
+"""The colours of nodes in a graph."""
 
 
 def render_page(template: str, **values: object) -> str:
     """Return a page, ending in a newline."""
-    style, script = (_own(name) for name in ("style.css", "script.js"))
+    style, script = _own("style.css") + _NODES, _own("script.js")
     policy = (
         f"default-src 'none'; style-src {_digest(style)}; script-src {_digest(script)}; "
         "base-uri 'none'; form-action 'none'"

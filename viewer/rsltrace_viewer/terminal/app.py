@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from textual.app import SystemCommand
 from textual.binding import Binding
+from textual.content import Content
 from textual.screen import Screen
 from textual.widget import Widget
 
@@ -32,6 +33,9 @@ from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt
 from rsltrace_viewer.terminal.widgets.timeline import Timeline
+
+if TYPE_CHECKING:
+    from rsltrace_viewer.model.callback_question import CallbackQuestion
 
 _ONLY = ("only-timeline", "only-inspector", "only-lanes", "only-source")
 
@@ -287,6 +291,11 @@ class ViewerApp(Stepping):
                 self._go_to_event(index, other=name == RUN_B)
             elif what == "key":
                 self.call_next(self.run_action, text)
+            elif what == "reason":
+                from rsltrace_viewer.model.callback_question import CallbackQuestion
+
+                node, _, name = text.partition(" ")
+                self._answer(CallbackQuestion(self.session.a, False, node, name))
             else:
                 try:
                     self._filter(text)
@@ -371,6 +380,33 @@ class ViewerApp(Stepping):
         from rsltrace_viewer.terminal.screens.plot import PlotScreen
 
         self.push_screen(PlotScreen(self.session.plots()))
+
+    def action_reason(self) -> None:
+        """Ask why the selected callback did not come, or came late."""
+        from rsltrace_viewer.model.callback_question import selected_callback
+
+        question = selected_callback(self.session)
+        if question is None:
+            self._say("why is asked about callbacks: of subscriptions, timers, services, clients")
+        else:
+            self._answer(question)
+
+    def _answer(self, question: CallbackQuestion) -> None:
+        from rsltrace_viewer.terminal.screens.text import TextScreen
+
+        def gone(event: int | None) -> None:
+            if event is not None:
+                self._go_to_event(event, other=question.other)
+
+        def arrive(found: tuple[list[str], int | None] | None, done: bool) -> None:
+            if found is not None:
+                self._say("")
+                lines, event = found
+                text = Content.styled(lines[0], "bold") + Content("\n" + "\n".join(lines[1:]))
+                self.push_screen(TextScreen(question.command, text, event), gone)
+
+        self._say("looking for the reason … Esc stops")
+        walk(self, "seek", question.answers(), arrive, at_once_s=0)
 
     def action_verdict(self) -> None:
         """Show the whole report on two traces."""

@@ -62,6 +62,7 @@ KEYS: tuple[Key, ...] = (
     Key("e", "e", "effect", "to what it caused (a list, if several)", FOLLOW, "effects", 4),
     Key("backspace,b", "b Backspace", "go_back", "back to where you were", FOLLOW, "back", 8),
     Key("f", "f", "go_forward", "forward again", FOLLOW),
+    Key("r", "r", "reason", "why the callback came late or not at all", FOLLOW, "reason", 6),
     Key("m", "m", "mark", "set or remove a mark", FOLLOW),
     Key("apostrophe", "'", "next_mark(1)", "next mark", FOLLOW),
     Key("quotation_mark", '"', "next_mark(-1)", "previous mark", FOLLOW),

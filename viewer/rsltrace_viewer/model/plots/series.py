@@ -207,7 +207,7 @@ def _field_series(run: Run, source: PlotSource) -> Iterator[Series]:
         return
     count = trace.message_counts.get(channel.id, 0)
     step = max(-(-count // SAMPLES_MAX), 1)
-    note = f"every {step}th of {count:,} messages" if step > 1 else f"{count:,} messages"
+    note = f"one in {step} of {count:,} messages" if step > 1 else f"{count:,} messages"
     times, values = [], []
     for sequence in range(0, count, step):
         stamp_ns, data = trace.message(channel.id, sequence)

@@ -105,7 +105,7 @@ class RecordingPlots:
 def _field(recording: Recording, topic: Topic, field: str) -> Iterator[Series]:
     count = len(topic.data)
     step = max(-(-count // SAMPLES_MAX), 1)
-    note = f"every {step}th of {count:,} messages" if step > 1 else f"{count:,} messages"
+    note = f"one in {step} of {count:,} messages" if step > 1 else f"{count:,} messages"
     times, values = [], []
     for place in range(0, count, step):
         data = topic.data[place]

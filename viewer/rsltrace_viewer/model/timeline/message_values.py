@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.diff.sentences.event_differences import TURNS, number
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
+from rsltrace.trace.words.phrases import TURNS, number
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import EventText, outputs_text
 
@@ -115,20 +115,21 @@ def _transform(one: Any) -> str:
 
 
 def _odometry(message: Any) -> str:
-    velocity = message.twist.twist
-    moves = [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
-    return " ".join([_values(message.pose.pose), *moves])
+    pose, velocity = message.pose.pose, message.twist.twist
+    turned = number(_yaw(*(float(getattr(pose.orientation, axis)) for axis in "xyzw")), 3)
+    texts = [*_named("", pose.position), *([f"θ={turned}"] if turned != "0" else ())]
+    texts += [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
+    return " ".join(texts) or "x=0 y=0"
 
 
 def _imu(message: Any) -> str:
-    turns = [*_named("", message.angular_velocity, TURNS)]
-    texts = [*turns, *_named("a", message.linear_acceleration)]
-    return " ".join(texts) or "ω=0 a=0"
+    turns = _named("", message.angular_velocity, TURNS)
+    return " ".join([*turns, *_named("a", message.linear_acceleration)]) or "ω=0 a=0"
 
 
 def _named(before: str, vector: Any, names: Mapping[str, str] = MappingProxyType({})) -> list[str]:
     """Return the parts of a vector that are not zero, each with its name."""
-    found = ((axis, number(float(getattr(vector, axis)))) for axis in "xyz")
+    found = ((axis, number(float(getattr(vector, axis)), 3)) for axis in "xyz")
     return [f"{before}{names.get(axis, axis)}={text}" for axis, text in found if text != "0"]
 
 

@@ -50,7 +50,8 @@ _LATER = "↓↑ Enter shows the events of a line   Esc closes"
 _OWN_KEYS = ("help", "theme", "overview", "escape", "quit", "enter", "yank")
 Choice = tuple[str, str]
 """What was chosen: ``filter`` with its text, ``event`` with its run and number (``b 12``), ``key``
-with the action that a key has among the events, ``more`` with the table to be shown whole."""
+with the action that a key has among the events, ``more`` with the table to be shown whole,
+``reason`` with the node and the name of the callback that is asked about."""
 _Line = tuple[Pieces, Choice | None]
 _Row = Sequence[OverviewSection | None]
 """The same node, topic or callback in each run."""
@@ -77,6 +78,8 @@ class OverviewScreen(Screen[Choice | None]):
         self._first = first
         self._whole: set[str] = set()
         self._lines: list[_Line] = []
+        self._asked: dict[Choice | None, str] = {}
+        """By the choice of its line, the node and the name of a callback."""
 
     def compose(self) -> ComposeResult:
         """Make the parts."""
@@ -96,7 +99,11 @@ class OverviewScreen(Screen[Choice | None]):
     def on_key(self, event: events.Key) -> None:
         """A key of the events: go there, and do what it does."""
         pressed = [key for key in KEYS if event.key in key.keys.split(",")]
-        if pressed and not pressed[0].action.startswith(_OWN_KEYS):
+        callback = self._asked.get(self._lines[self.query_one(ListView).cursor][1])
+        if callback is not None and pressed and pressed[0].action == "reason":
+            event.stop()
+            self.dismiss(("reason", callback))
+        elif pressed and not pressed[0].action.startswith(_OWN_KEYS):
             event.stop()
             self.dismiss(("key", f"app.{pressed[0].action}"))
 
@@ -287,7 +294,10 @@ class OverviewScreen(Screen[Choice | None]):
             differ = len({part.count if part else 0 for part in row}) > 1
             pieces += [(_numbers(part), "error" if differ else "plain") for part in row]
             pieces += [(f"{text(row):>{_TIMES}}", "muted") for _, text in columns]
-            yield pieces, ("filter", _filter_of(field, some))
+            choice = ("filter", _filter_of(field, some))
+            if field == "entity":
+                self._asked[choice] = f"{some.node} {some.name}"
+            yield pieces, choice
         if len(rows) > most:
             more = f"… and {len(rows) - most} more: Enter shows them"
             yield ((more, "muted"),), ("more", field)

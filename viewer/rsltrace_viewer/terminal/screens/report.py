@@ -2,66 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar
 
-from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
-from textual.containers import Vertical, VerticalScroll
 from textual.content import Content
-from textual.screen import ModalScreen
-from textual.widgets import OptionList, Static
-from textual.widgets.option_list import Option
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import Style
 from rsltrace.diff.result import BagDiff, Diff, Divergence
-
-# A list to choose one of: the effects of an event, the traces of a folder.
-
-
-class PickScreen(ModalScreen[int | None]):
-    """Gives the number of the choice, or None."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        ("escape,q", "dismiss(None)", "close"),
-        ("j", "down", ""),
-        ("k", "up", ""),
-    ]
-    DEFAULT_CSS = """
-    PickScreen { align: center middle; }
-    PickScreen > Vertical { width: 90%; max-width: 110; height: auto; max-height: 80%;
-                            background: $surface; border: round $primary; padding: 0 1; }
-    PickScreen OptionList { border: none; background: $surface; height: auto; max-height: 100%; }
-    PickScreen OptionList:focus { border: none; }
-    """
-
-    def __init__(self, title: str, choices: Sequence[str]) -> None:
-        super().__init__()
-        self._title = title
-        self._choices = choices
-
-    def compose(self) -> ComposeResult:
-        """Make the list."""
-        with Vertical() as box:
-            box.border_title = Content(self._title)
-            box.border_subtitle = "Enter chooses, Esc closes"
-            yield OptionList(*(Option(Content(choice)) for choice in self._choices))
-
-    def action_down(self) -> None:
-        """Move down."""
-        self.query_one(OptionList).action_cursor_down()
-
-    def action_up(self) -> None:
-        """Move up."""
-        self.query_one(OptionList).action_cursor_up()
-
-    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        """Choose."""
-        self.dismiss(event.option_index)
-
+from rsltrace_viewer.terminal.screens.text import TextScreen
 
 _STYLES = {
     Style.TITLE: "bold $text-primary",
@@ -74,32 +23,20 @@ _STYLES = {
 }
 
 
-class ReportScreen(ModalScreen[None]):
-    """Any of its keys closes it."""
-
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,v,enter", "dismiss", "close")]
-    DEFAULT_CSS = """
-    ReportScreen { align: center middle; }
-    ReportScreen > VerticalScroll { width: 100%; max-width: 130; height: 100%; padding: 0 1;
-                                    background: $surface; border: round $primary; }
-    """
+class ReportScreen(TextScreen):
+    """The report on two runs or recordings."""
 
     def __init__(self, diff: Diff | BagDiff) -> None:
-        super().__init__()
+        super().__init__("why the runs diverge")
         self._diff = diff
 
-    def compose(self) -> ComposeResult:
-        """Make the text."""
-        width = min(self.app.size.width, 130) - 6
-        lines = report_lines(_without_view(self._diff), DiffOptions(), width=max(width, 40))
-        text = Content("\n").join(
+    def text(self) -> Content:
+        """Return the report."""
+        lines = report_lines(_without_view(self._diff), DiffOptions(), width=self.room)
+        return Content("\n").join(
             Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))
             for line in lines
         )
-        with VerticalScroll() as box:
-            box.border_title = "why the runs diverge"
-            box.border_subtitle = "Esc closes, ↓ scrolls"
-            yield Static(text)
 
 
 def _without_view(diff: Diff | BagDiff) -> Diff | BagDiff:

@@ -23,10 +23,6 @@ def background_of(style: Style) -> Style:
     return Style(bgcolor=style.bgcolor, bold=style.bold)
 
 
-FOCUSED = "▌"
-"""At the left of the title of the pane that has the focus, for screens without colours, too."""
-
-
 def node_style(widget: Widget, colour: int) -> Style:
     """Return the colour of a node, that of ``NODE_COLOURS`` for the widget's theme."""
     dark, light = NODE_COLOURS[colour]

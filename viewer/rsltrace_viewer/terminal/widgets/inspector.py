@@ -119,7 +119,8 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
 
     def on_click(self, event: events.Click) -> None:
         """Open, close or follow what was clicked."""
-        row = round(self.scroll_y) + event.y
+        place = event.get_content_offset(self)
+        row = round(self.scroll_y) + (place.y if place is not None else len(self._drawn))
         if row < len(self._drawn):
             self.cursor = row
             self.refresh()

@@ -18,7 +18,7 @@ from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.lanes import Lane, Lanes, axis_text
 from rsltrace_viewer.model.timeline.columns import ShortNames
 from rsltrace_viewer.model.view import cells, fit
-from rsltrace_viewer.terminal.widgets.bars import FOCUSED, node_style
+from rsltrace_viewer.terminal.widgets.bars import node_style
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"
 _LABEL_MAX = 28
@@ -236,9 +236,8 @@ class LanesView(Widget, can_focus=True):
         if y == self.size.height - 1:
             marks = self._divergences
             axis = axis_text(self.lanes, self._position, self.cursor, marks, self.base_ns)
-            style, mark = ("focused", FOCUSED) if self.has_focus else ("axis", " ")
-            text = fit(mark + " " * (self._before_lanes - 1) + axis, width)
-            return Strip([Piece(text, self._style(style))], width)
+            text = fit(" " * self._before_lanes + axis, width)
+            return Strip([Piece(text, self._style("focused" if self.has_focus else "axis"))], width)
         place = self._first_lane() + y
         if place >= len(self.lanes.lanes):
             return Strip([Piece(" " * width, self._style("empty"))], width)

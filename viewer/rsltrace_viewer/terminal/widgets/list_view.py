@@ -117,7 +117,8 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
 
     def on_click(self, event: events.Click) -> None:
         """Choose the line that was clicked."""
-        line = round(self.scroll_y) + event.y
+        place = event.get_content_offset(self)
+        line = round(self.scroll_y) + (place.y if place is not None else self.count)
         if line < self.count:
             self.go(line)
             self.post_message(self.Chosen(line))

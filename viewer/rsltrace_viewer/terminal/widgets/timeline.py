@@ -14,14 +14,9 @@ from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
 from rsltrace.diff.row_sign import RowSign
-from rsltrace_viewer.model.timeline.columns import GAP, ColumnLayout, EventRow
+from rsltrace_viewer.model.timeline.columns import ColumnLayout, EventRow
 from rsltrace_viewer.model.view import fit
-from rsltrace_viewer.terminal.widgets.bars import (
-    FOCUSED,
-    background_of,
-    node_style,
-    set_virtual_size,
-)
+from rsltrace_viewer.terminal.widgets.bars import background_of, node_style, set_virtual_size
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
@@ -229,9 +224,8 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         """Return line ``y`` of the widget: the header, or a row."""
         width = self.size.width
         if y == 0:
-            style, mark = ("focused", FOCUSED) if self.has_focus else ("header", " ")
-            text = fit(mark + self._columns.header()[GAP:], width)
-            return Strip([Piece(text, self._style(style))], width)
+            style = self._style("focused" if self.has_focus else "header")
+            return Strip([Piece(fit(self._columns.header(), width), style)], width)
         row = round(self.scroll_y) + y - 1
         if self._source is None or not 0 <= row < self._count:
             text = f"  {self.empty}" if y == 2 and not self._count else ""

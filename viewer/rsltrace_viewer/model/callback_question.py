@@ -1,0 +1,67 @@
+"""What `rsltrace why` is asked about the selected event, and what it answers."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from rsltrace.diff.row_sign import RowSign
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.texts import printable
+from rsltrace.trace.words.phrases import path_word, seconds_text
+from rsltrace.why.answer import answer_lines, why
+from rsltrace.why.question import WITH_CALLBACK
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.session import Session
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackQuestion:
+    """Why a callback of ``node`` did not run in ``run`` (run b: ``other``), or ran late: ``what``
+    names it, ``at_ns`` is the time asked about (None: the whole run)."""
+
+    run: Run
+    other: bool
+    node: str
+    what: str
+    at_ns: int | None = None
+
+    @property
+    def command(self) -> str:
+        """The command that asks it."""
+        names = (shlex.quote(self.node), shlex.quote(self.what))
+        at = ""
+        if self.at_ns is not None:
+            at = f" --at {seconds_text(self.at_ns - self.run.start_ns)}"
+        return printable(" ".join(("rsltrace why", path_word(self.run.trace.name), *names)) + at)
+
+    def answers(self) -> Iterator[tuple[list[str], int | None]]:
+        """Yield the lines of the answer, and the event to look at. Raises TraceError."""
+        reason = why(self.run.trace, self.node, self.what, self.at_ns)
+        yield [*answer_lines(reason)], reason.event
+
+
+def selected_callback(session: Session) -> CallbackQuestion | None:
+    """Return the question about the selected event; where only one run has it, why the other has
+    not. None: it is no callback of a subscription, timer, service or client."""
+    here = session.current()
+    if here is None:
+        return None
+    run, index = here
+    event = run.event(index)
+    entity = run.entities.get(event.entity)
+    if entity is None or entity.kind not in WITH_CALLBACK:
+        return None
+    is_b, node = run is session.b, run.trace.node_of(entity).name
+    if session.view.sign(session.place) in (RowSign.ONLY_A, RowSign.ONLY_B):
+        lacking = session.a if is_b else session.b
+        assert lacking is not None  # there are two runs
+        return CallbackQuestion(lacking, not is_b, node, entity.name, event.stamp_ns)
+    at_ns = event.stamp_ns
+    if entity.kind is EntityKind.TIMER:
+        at_ns -= 1  # what was before this call
+    elif event.kind is not EventKind.RESUME and 0 <= event.cause_event < index:
+        at_ns = run.stamp(event.cause_event)  # when what it received was sent
+    return CallbackQuestion(run, is_b, node, str(entity.id), at_ns)
