@@ -110,10 +110,10 @@ def _section(
             fields = [(key, field) for key, field in fields if key not in known]
             keys = ", ".join(f"`{key}`" for key, _ in file_fields(model))
             same = f"It has the keys of `{done[base]}`, and:"
-            out += [same if fields else f"Keys as in `{done[base]}`: {keys}.", ""]
+            out += [_wrapped(same if fields else f"Keys as in `{done[base]}`: {keys}."), ""]
     for key, field in fields:
         out += _entry(key, field)
-    return [*out, ""]
+    return [*out, ""] if fields else out
 
 
 def _extends(model: type[BaseModel], other: type[BaseModel]) -> bool:
@@ -175,11 +175,15 @@ def _words(schema: dict[str, Any], field: FieldInfo | None = None) -> str:
         least, most = schema.get("minimum"), schema.get("maximum")
         word = "integer" if kind == "integer" else "number"
         open_below = schema.get("exclusiveMinimum")
+        least = least if least is not None and least > -_LARGE else None
+        most = most if most is not None and most < _LARGE else None
+        if least is not None and most is not None:
+            return f"{word} {least} to {most}"
         if open_below is not None:
             word += f" > {open_below}"
-        if least is not None and least > -_LARGE:
+        if least is not None:
             word += f" ≥ {least}"
-        if most is not None and most < _LARGE:
+        if most is not None:
             word += f" ≤ {most}"
         return word
     return {"string": "text", "boolean": _BOOLEAN}.get(str(kind), "any value")
