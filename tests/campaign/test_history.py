@@ -9,7 +9,10 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import pytest
@@ -164,6 +167,22 @@ def test_a_folder_or_address_gets_a_file_for_each_run(command: Command, tmp_path
     read = command("diff", A, A, "--history", "no-such-scheme://user:secret@x")
     assert read.returncode == 2
     assert "secret" not in read.stderr
+
+
+def test_a_folder_of_a_web_server_is_read(command: Command, tmp_path: Path) -> None:
+    (tmp_path / "runs").mkdir()
+    for number in range(3):
+        (tmp_path / "runs" / f"{number}.jsonl").write_text(run(number))
+    handler = partial(SimpleHTTPRequestHandler, directory=tmp_path)
+    with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        address = f"http://127.0.0.1:{server.server_port}/runs"
+        done = command("history", f"{address}/", f"{address}/1.jsonl")
+        kept = command("diff", A, A, "--history", address)
+        server.shutdown()
+    assert done.stdout.startswith("4 runs of 1 job"), done.stderr
+    assert kept.returncode == 2
+    assert "cannot be written: 501" in kept.stderr
 
 
 def test_what_is_no_place_for_a_history_is_refused_before_the_run(

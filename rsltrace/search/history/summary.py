@@ -273,7 +273,7 @@ def _files_at(address: str) -> Iterator[tuple[str, Iterable[bytes]]]:
     name = public_address(address)
     try:
         found = filesystem.find(path, detail=True)
-        sizes = {one: about["size"] for one, about in found.items() if one.endswith(SUFFIX)}
+        sizes = {one: about["size"] or 0 for one, about in found.items() if one.endswith(SUFFIX)}
         if not sizes:
             raise TraceError(f"{name} has no {SUFFIX} files: it is no history")
         batch: list[str] = []
