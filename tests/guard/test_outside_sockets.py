@@ -378,17 +378,32 @@ def test_what_a_device_says_is_given_again_when_it_is_gone(
     assert again.digest == first.digest
 
 
-@pytest.mark.parametrize("guard", ["", "{}"])
+@pytest.mark.parametrize(
+    ("guard", "device", "read"),
+    [
+        ("", "far", "os.read(device, 99)"),
+        ("{}", "far", "os.read(device, 99)"),
+        ("", "far", "bytes(data[:os.readv(device, [data])])"),
+        ("", "os.fdopen(far, 'rb', 0)", "device.read(99)"),
+        ("", "os.fdopen(far)", "device.readline().encode()"),
+        ("", "open(os.ttyname(self.far), 'rb', 0)", "device.read(99)"),
+    ],
+)
 def test_a_device_that_a_thread_of_the_node_plays_stops_no_time(
-    go: Callable[..., Any], guard: str
+    go: Callable[..., Any], guard: str, device: str, read: str
 ) -> None:
     code = node_code(
-        "os.write(self.near, b'hello')",
+        "os.write(self.near, b'hello\\n')",
         imports="import os, pty, threading, tty",
-        module="def play(end, say):\n    while True:\n        say(os.read(end, 99).decode())\n",
+        module=(
+            "def play(device, say):\n    data = bytearray(99)\n"
+            f"    while True:\n        say({read}.decode().strip())\n"
+        ),
         init=(
             "far, self.near = pty.openpty()\n"
+            f"if 'self.far' in {device!r}:\n    self.near, self.far = far, self.near\n"
             "tty.setraw(self.near)\n"
+            f"far = {device}\n"
             "threading.Thread(target=play, args=(far, self.say), daemon=True).start()"
         ),
     )

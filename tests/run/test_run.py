@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 from collections.abc import Callable
@@ -431,3 +432,17 @@ def test_a_rule_that_counts_messages_takes_one_class(
     monkeypatch.setitem(STOP_RULES, "topic", CountRule)  # type: ignore[arg-type]
     result = record_job(f"{BOTH}stop: {{topic: /numbers}}\n")
     assert result.stop_reason == "3 is the third"
+
+
+def test_nodes_see_the_variables_of_a_sourced_ros(
+    record_job: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("ROS_VERSION", "ROS_PYTHON_VERSION"):
+        monkeypatch.delenv(name, raising=False)
+    code = (
+        "import os\n"
+        "assert os.environ['ROS_VERSION'] == '2' and os.environ['ROS_PYTHON_VERSION'] == '3'\n"
+        "assert os.environ['ROS_DISTRO'] in ('humble', 'jazzy', 'kilted')\n"
+    )
+    assert record_job(f"{TALKER}stop: {{events: 2}}\n", code).error is None
+    assert "ROS_VERSION" not in os.environ

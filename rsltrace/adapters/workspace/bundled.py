@@ -15,7 +15,10 @@ BUNDLED = {
     "control_msgs": "5.8.0",
     "example_interfaces": "0.12.0",
     "geographic_msgs": "1.0.5",
+    "moveit_msgs": "2.6.0",
     "nav2_msgs": "1.3.13",
+    "object_recognition_msgs": "2.0.0",
+    "octomap_msgs": "2.0.0",
     "tf2_msgs": "0.36.4",
     "vision_msgs": "4.1.1",
 }

@@ -158,14 +158,17 @@ def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
         found = recorded_descriptor(fd)
         if found is None:
-            frame = sys._getframe(1)
-            patient = waiting_guard(frame)
-            if patient is not None and _blocks(fd):
-                return wait_unrecorded(patient, wait_readable(fd, lambda: real(fd, size)), frame)
-            return real(fd, size)
+            return _read_unrecorded(fd, lambda: real(fd, size), sys._getframe(1))
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 
     return read
+
+
+def _read_unrecorded(fd: int, real: Callable[[], Any], frame: FrameType) -> Any:
+    patient = waiting_guard(frame)
+    if patient is not None and _blocks(fd):
+        return wait_unrecorded(patient, wait_readable(fd, real), frame)
+    return real()
 
 
 def _blocks(fd: int) -> bool:
@@ -183,7 +186,7 @@ def _reading_into(real: Callable[..., int]) -> Any:
     def readv(fd: int, buffers: Any, /) -> Any:
         found = recorded_descriptor(fd)
         if found is None:
-            return real(fd, buffers)
+            return _read_unrecorded(fd, lambda: real(fd, buffers), sys._getframe(1))
 
         def read() -> bytes:
             return b"".join(map(bytes, buffers))[: real(fd, buffers)]

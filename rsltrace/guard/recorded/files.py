@@ -34,6 +34,8 @@ from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
 
 _FILE = NondeterminismSource.FILE
 _RECORD, _ALLOW = GuardMode.RECORD, GuardMode.ALLOW
+_TERMINALS = "/dev/pts/"
+_isatty = copy_of(os.isatty)  # type: ignore[arg-type]
 BYTES_MAX = 64 << 20
 
 
@@ -68,16 +70,29 @@ def _opening(real: Callable[..., Any]) -> Any:
                 by_program = recording_guard(NondeterminismSource.PROCESS, frame)
                 if by_program is not None:
                     by_program.descriptors.add(file, NondeterminismSource.PROCESS)
-            if recorded_descriptor(file) is not None:
+            if recorded_descriptor(file) is not None or _is_read_terminal(file, mode):
                 raw = RawDescriptor(file, mode, name=file, closes=closefd)
                 return open_raw(raw, mode, *text)
         elif opener is None and isinstance(mode, str) and not set(mode) & set("wax"):
             guard = recording_guard(NondeterminismSource.FILE, frame)
             if guard is not None and ("+" not in mode or _is_device(file)):
                 return _recorded(guard, file, mode, text, real)
+            if isinstance(file, str) and file.startswith(_TERMINALS) and engaged() is not None:
+                number = os.open(file, _flags(mode))
+                return open_raw(RawDescriptor(number, mode, name=file), mode, *text)
         return real(file, mode, *text, closefd, opener)
 
     return open_
+
+
+def _is_read_terminal(fd: int, mode: str) -> bool:
+    """Whether a file object of a terminal has to read with ``os.read``, which lets others go on
+    meanwhile: a thread of the node may play the device at the other end."""
+    return "r" in mode and fd > 2 and engaged() is not None and _isatty(fd)
+
+
+def _flags(mode: str) -> int:
+    return (os.O_RDWR if "+" in mode else os.O_RDONLY) | os.O_CLOEXEC
 
 
 def _is_device(file: Any) -> bool:
@@ -95,8 +110,7 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
 
     def content() -> Any:
         if _is_device(file) and os.path.exists(file):
-            flags = os.O_RDWR if "+" in mode else os.O_RDONLY
-            fd.append(os.open(file, flags | os.O_CLOEXEC))
+            fd.append(os.open(file, _flags(mode)))
             return None
         with real(file, "rb") as plain:
             data: bytes = plain.read(BYTES_MAX + 1)
