@@ -131,8 +131,11 @@ def field_values(path: str, event: Event) -> list[str]:
     leaves = [leaf for message in event.messages for leaf in message.leaves or ()]
     values = [value for name, value in leaves if name == path]
     items = [value for name, value in leaves if re.fullmatch(rf"{re.escape(path)}\[\d+\]", name)]
-    few = f"[{', '.join(items[:4])}, … {len(items)} in all]"
-    return [*values, *(value.strip("[]") for value in values), f"[{', '.join(items)}]", few]
+    if items:
+        few = f"[{', '.join(items[:4])}, … {len(items)} in all]"
+        values += [f"[{', '.join(items)}]", few]
+    counts = [re.match(r"\[(\d+) item", value) for value in values]
+    return [*values, *(f"{count[1]} items" for count in counts if count)]
 
 
 def check_picture(text: str, rows: list[Row]) -> None:

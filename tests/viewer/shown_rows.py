@@ -173,9 +173,9 @@ def same_messages(x: Event, y: Event) -> bool:
 
 
 def _told(message: Message) -> str:
-    """Return what is compared of a message: of a log record not when it was written."""
-    is_log = message.name == "/rosout"
-    return repr([one for one in message.leaves or () if not (is_log and "stamp" in one[0])])
+    """Return what is compared of a message: of a log record not when and where."""
+    kept = {"level", "name", "msg"} if message.name == "/rosout" else None
+    return repr([leaf for leaf in message.leaves or () if kept is None or leaf[0] in kept])
 
 
 def check_names(row: Row, event: Event) -> None:
