@@ -178,7 +178,8 @@ class RunSession:
         self.stop: Stop | None = None
         self._stop_rules: list[StopRule] = []
         self._output = output
-        self._has_begun = False
+        self.has_begun = False
+        """Whether the nodes are constructed, and time stands at the start or beyond."""
         self._force = force
         self._echo = echo
         self._observer = observer or RunCallbacks()
@@ -196,11 +197,6 @@ class RunSession:
         self._samples: StateSamples | None = None
         self._faults: NodeFaults | None = None
         self.bag_faults: BagFaults | None = None
-
-    @property
-    def has_begun(self) -> bool:
-        """Whether the nodes are constructed, and time stands at the start or beyond."""
-        return self._has_begun
 
     def inner_pairs(self) -> list[tuple[int, int]]:
         """Return the pipes and socket pairs of which nodes hold both ends."""
@@ -425,7 +421,7 @@ class RunSession:
                 )
             if not self.ended:
                 self.world.jump(self.start_ns)
-                self._has_begun = not self.ended
+                self.has_begun = not self.ended
                 self.world.starts.begin(self.start_ns)
 
     def go_on(self) -> None:
@@ -544,7 +540,7 @@ class RunSession:
                     **encode_drops(queue_drops(outcome.drops)),
                     **self._late_numerics(),
                 },
-                replace=self._has_begun or exit_code == 0,
+                replace=self.has_begun or exit_code == 0,
             )
         digest = self.digest
         # What finalizers say from now on comes too late.

@@ -228,7 +228,7 @@ class NodeReplaySession(RunSession):
             if not self.ended:
                 self.script.perform_until(last)
                 world.jump(self.start_ns)
-                self._has_begun = not self.ended
+                self.has_begun = not self.ended
 
     def _starts_later(self, place: int) -> bool:
         """Whether an entry (its place among hooks and nodes) starts after the run does."""

@@ -120,7 +120,8 @@ class BlockedCall:
         self.since_ns = domain.loop.now_ns
         self.deadline_ns: int | None = None
         self.quiet = quiet
-        self._group = group
+        self.group = group
+        """The callback group that the wait keeps busy, or None."""
         self.stack = getcurrent()
         self.timed_out = False
         self.woken = False
@@ -138,11 +139,6 @@ class BlockedCall:
     def entity_id(self) -> int:
         """The entity whose callback waits."""
         return self.event[1]
-
-    @property
-    def group(self) -> object:
-        """The callback group that the wait keeps busy, or None."""
-        return self._group
 
     @property
     def waiting(self) -> bool:
@@ -239,7 +235,7 @@ class BlockedCall:
         own = [frame for frame in frames if is_user_or_library_file(frame.filename)]
         where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
         hint = ""
-        if self._group is not None and self._runners.groups.waiting_for(self._group):
+        if self.group is not None and self._runners.groups.waiting_for(self.group):
             hint = (
                 ", which may be one of the events that wait for its callback group: a blocked "
                 "callback keeps a mutually exclusive group busy, so give the client, timer or "
