@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 from rsltrace.errors import JobError, RunError, nearest
 from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.parts.stop import TopicStop
-from rsltrace.job.values.times import format_size
+from rsltrace.job.values.times import TimeInRun, format_size
 from rsltrace.run.plans.scheduling import load_target
 from rsltrace.simulation.loop.stop import Progress, Stop, StopCondition, stop_at
 from rsltrace.trace.model.texts import format_seconds
@@ -89,7 +89,8 @@ class DurationRule(_TimeRule):
 
     @classmethod
     def end_ns(cls, value: int, start_ns: int) -> int:
-        return start_ns + value
+        """Count from the start; a simulated time is an error, as everywhere."""
+        return TimeInRun(value).stamp_ns(start_ns)
 
     def _stop(self) -> Stop:
         return Stop(f"duration of {format_seconds(self.value)} s")

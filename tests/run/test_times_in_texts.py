@@ -121,6 +121,7 @@ def test_cat_takes_the_times_it_prints(text: Callable[..., str]) -> None:
 @pytest.mark.parametrize(
     "words",
     [
+        ("record", "one.yaml", "-o", "x.mcap", "--until", "1700000000.5"),
         ("cat", "one.mcap", "--from", "1700000000.5"),
         ("why", "one.mcap", "/logger", "/scaled", "--at", "1700000000.5"),
         ("replay", "one.mcap", "--until", "1700000000.5"),
