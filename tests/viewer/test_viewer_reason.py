@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
-from rsltrace_viewer.model.callback_question import selected_callback
 from rsltrace_viewer.terminal.screens.text import TextScreen
 
 from rsltrace.cli.why import why
@@ -52,7 +51,7 @@ def test_of_one_run_it_says_why_the_selected_callback_was_late(
         session = viewer.app.session
         for index in range(1, session.a.count):
             session.place = index
-            question = selected_callback(session)
+            question = session.question()
             if question is not None:
                 names = question.command.split()[3:]
                 assert next(question.answers())[0] == _printed("b.mcap", *names), question

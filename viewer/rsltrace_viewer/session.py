@@ -48,6 +48,7 @@ from rsltrace_viewer.model.view import OneRun, View
 if TYPE_CHECKING:
     from rsltrace.diff.alignment.aligned_rows import AlignedRow
     from rsltrace.diff.traces.aligned_runs import Block
+    from rsltrace_viewer.model.callback_question import CallbackQuestion
     from rsltrace_viewer.model.comparison import Comparison
     from rsltrace_viewer.model.plots.runs import RunPlots
     from rsltrace_viewer.model.timeline.pair_values import PairValues
@@ -216,6 +217,19 @@ class Session:
             assert run is not None  # it has an event
             return run, index
         return None
+
+    def question(self) -> CallbackQuestion | None:
+        """Return what `rsltrace why` is asked about the selected event; where one run lacks it,
+        about that run. None: nothing."""
+        from rsltrace_viewer.model.callback_question import question_about
+
+        here = self.current()
+        if here is None:
+            return None
+        of_b = here[0] is self.b
+        alone = self.view.sign(self.place) in (RowSign.ONLY_A, RowSign.ONLY_B)
+        lacking = self.a if of_b else self.b
+        return question_about(*here, other=of_b, lacking=lacking if alone else None)
 
     def stamp(self) -> int:
         """Return the time of the selected event (0: none)."""

@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from rsltrace.diff.row_sign import RowSign
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import printable
@@ -14,7 +13,6 @@ from rsltrace.trace.words.phrases import path_word, seconds_text
 from rsltrace.why.answer import answer_lines, why
 from rsltrace.why.question import WITH_CALLBACK
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.session import Session
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,25 +41,20 @@ class CallbackQuestion:
         yield [*answer_lines(reason)], reason.event
 
 
-def selected_callback(session: Session) -> CallbackQuestion | None:
-    """Return the question about the selected event; where only one run has it, why the other has
-    not. None: it is no callback of a subscription, timer, service or client."""
-    here = session.current()
-    if here is None:
-        return None
-    run, index = here
+def question_about(
+    run: Run, index: int, *, other: bool, lacking: Run | None
+) -> CallbackQuestion | None:
+    """Return the question about an event (``other``: of run b); if a run is ``lacking`` it, why it
+    did not come there. None: it is no callback of a subscription, timer, service or client."""
     event = run.event(index)
     entity = run.entities.get(event.entity)
     if entity is None or entity.kind not in WITH_CALLBACK:
         return None
-    is_b, node = run is session.b, run.trace.node_of(entity).name
-    if session.view.sign(session.place) in (RowSign.ONLY_A, RowSign.ONLY_B):
-        lacking = session.a if is_b else session.b
-        assert lacking is not None  # there are two runs
-        return CallbackQuestion(lacking, not is_b, node, entity.name, event.stamp_ns)
-    at_ns = event.stamp_ns
+    node, at_ns = run.trace.node_of(entity).name, event.stamp_ns
+    if lacking is not None:
+        return CallbackQuestion(lacking, not other, node, entity.name, at_ns)
     if entity.kind is EntityKind.TIMER:
         at_ns -= 1  # what was before this call
     elif event.kind is not EventKind.RESUME and 0 <= event.cause_event < index:
         at_ns = run.stamp(event.cause_event)  # when what it received was sent
-    return CallbackQuestion(run, is_b, node, str(entity.id), at_ns)
+    return CallbackQuestion(run, other, node, str(entity.id), at_ns)

@@ -383,9 +383,7 @@ class ViewerApp(Stepping):
 
     def action_reason(self) -> None:
         """Ask why the selected callback did not come, or came late."""
-        from rsltrace_viewer.model.callback_question import selected_callback
-
-        question = selected_callback(self.session)
+        question = self.session.question()
         if question is None:
             self._say("why is asked about callbacks: of subscriptions, timers, services, clients")
         else:
