@@ -204,9 +204,10 @@ def _threads() -> Iterator[tuple[int, str]]:
 def own_children() -> list[int]:
     """Return the processes that this one has started."""
     found = []
-    for task in os.listdir("/proc/self/task"):
-        with suppress(OSError), open(f"/proc/self/task/{task}/children") as file:
-            found += [int(word) for word in file.read().split()]
+    with suppress(OSError):  # without /proc
+        for task in os.listdir("/proc/self/task"):
+            with suppress(OSError), open(f"/proc/self/task/{task}/children") as file:
+                found += [int(word) for word in file.read().split()]
     return found
 
 

@@ -142,6 +142,7 @@ class Tolerance(_Type):
     help="Append a line on each B, as a run of the test with the golden trace A, to this history: "
     'see "rsltrace history".',
 )
+@click.option("--failed", default="", hidden=True)  # why B failed itself, for the history
 @click.option(
     "-o",
     "--output",
@@ -165,6 +166,7 @@ def diff(
     allow_truncated: bool,
     again: str | None,
     history: str | None,
+    failed: str,
     output: Path | None,
 ) -> int:
     """Compare two traces and show where they first diverge, and why.
@@ -192,7 +194,7 @@ def diff(
         by=by,
         allow_truncated=allow_truncated,
     )
-    return _diff(golden, others, form, options, output, history, check=check)
+    return _diff(golden, others, form, options, output, history, check=check, failed=failed)
 
 
 def _diff(
@@ -204,6 +206,7 @@ def _diff(
     history: str | None,
     *,
     check: bool,
+    failed: str,
 ) -> int:
     if output is not None:
         check_not_input(output, [Path(one) for one in (golden, *others) if "://" not in one])
@@ -222,10 +225,10 @@ def _diff(
             with recorded(history, "diff", file, lambda path: [str(path(golden))]) as run:
                 done.append(_compare(golden, other, options, check=check, check_a=check_a))
                 run.digest = getattr(done[-1].b, "digest", "")
-                if done[-1].failed:
-                    run.fails(done[-1].sentence)
+                if done[-1].failed or failed:
+                    run.fails(failed or done[-1].sentence)
         except RsltraceError as error:
-            if len(others) == 1:
+            if len(others) == 1 and not done:
                 raise
             # One unreadable file must not hide the results of the others.
             tell(f"rsltrace: error: {error}")

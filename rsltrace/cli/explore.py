@@ -241,12 +241,12 @@ def explore(
                     raise
         if minimize and not interrupted:
             end.make_small(job, timeout, quiet=quiet)
+        _set_result(record, search)
         end.report(job)
         if interrupted:
-            record.verdict, record.reason = "error", "interrupted"
+            record.runs *= record.verdict == "failed"  # one that is cut off says nothing else
             tell(f"interrupted: continue with --resume; the results are in {folder}")
             return _INTERRUPTED
-        _set_result(record, search)
         return 1 if search.tally.failures else 0
 
 
@@ -255,7 +255,7 @@ def _set_result(record: RunRecord, search: Explorer) -> None:
     tally = search.tally
     record.runs = search.runs_here
     record.failed = search.failed_here
-    record.digest = tally.plain.digest if tally.plain is not None else ""
+    record.digest = tally.plain.digest if search.has_run_plain and tally.plain else ""
     if tally.failures:
         ((cause, _),) = tally.failures.most_common(1)
         record.fails(cause)

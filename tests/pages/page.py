@@ -70,11 +70,18 @@ def contained(text: str) -> None:
         assert f"{tag}-src 'sha256-{digest}';" in policy
 
 
-_OWN = re.compile("/rosout$|/rsltrace/(?!request/|response/)")
+_OWN = re.compile("/rosout$|/parameter_events$|/rsltrace/(?!request/|response/)")
 
 
 def with_names(parts: list[mcap_parts.Part], extra: str) -> None:
-    """Put ``extra`` behind every name, of topics too, and the texts of the metadata."""
+    """Put ``extra`` behind every name, of topics too, and the texts of the metadata. Topics that
+    every node has keep theirs."""
+
+    def renamed(nth: int, text: bytes) -> bytes:
+        return (
+            text + extra.encode() if text and nth == 0 and not _OWN.match(text.decode()) else text
+        )
+
     for part in parts:
         record = part.record if part.opcode == Opcode.METADATA else None
         if isinstance(record, records.Metadata) and not record.name.startswith("rosbag2"):
@@ -91,9 +98,7 @@ def with_names(parts: list[mcap_parts.Part], extra: str) -> None:
         mcap_parts.change_messages(
             parts,
             topic,
-            lambda data, nth, topic=topic: with_strings(
-                data, topic, lambda n, text: text and text + extra.encode() if n == 0 else text
-            ),
+            lambda data, nth, topic=topic: with_strings(data, topic, renamed),
         )
 
 

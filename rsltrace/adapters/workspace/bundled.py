@@ -7,8 +7,10 @@ package that is installed, sourced or in the workspace comes first.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rsltrace.source_packages import SourcePackage
+if TYPE_CHECKING:
+    from rsltrace.source_packages import SourcePackage
 
 BUNDLED = {
     "ackermann_msgs": "2.0.2",
@@ -29,6 +31,8 @@ _FOLDER = Path(__file__).with_name("definitions")
 
 def bundled_packages() -> dict[str, SourcePackage]:
     """Return the packages by name."""
+    from rsltrace.source_packages import SourcePackage
+
     return {name: SourcePackage(name, _FOLDER / name) for name in BUNDLED}
 
 

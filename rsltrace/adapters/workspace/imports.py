@@ -59,12 +59,15 @@ class UnbuiltWorkspace:
     def interfaces(self, name: str) -> InterfaceMaker | None:
         """Return what makes the classes of a package; None if it has none."""
         package = self.packages.get(name)
-        if name not in BUNDLED and (package is None or not package.interfaces):
+        is_own = package is not None and bool(package.interfaces)
+        if name not in BUNDLED and not is_own:
             return None
         with engage(None):
-            if self._makers is None:
-                from rsltrace.adapters.workspace.interfaces import interface_makers
+            from rsltrace.adapters.workspace.interfaces import has_rosidl, interface_makers
 
+            if not is_own and not has_rosidl():
+                return None  # as where nothing has the package: code may do without it
+            if self._makers is None:
                 self._makers = interface_makers({**bundled_packages(), **self.packages})
             maker = self._makers.get(name)
             if maker is None:

@@ -280,14 +280,22 @@ def _versions() -> str:
     return " ".join(found)
 
 
+def _missing() -> list[str]:
+    return [module for module in _NEEDED if find_spec(module) is None]
+
+
+def has_rosidl() -> bool:
+    """Return whether classes can be made of interface files."""
+    return not _missing() and _templates() is not None
+
+
 def _generate(name: str, order: dict[str, Any], *, uses: int, bundled: Sequence[str] = ()) -> None:
     """Have rosidl make what the order says, in a process of its own; what is ready is kept.
 
     ``name`` is what somebody wants, ``uses`` how many interfaces more that takes, ``bundled`` the
     packages whose definitions are rsltrace's own.
     """
-    missing = [module for module in _NEEDED if find_spec(module) is None]
-    templates = _templates()
+    missing, templates = _missing(), _templates()
     if missing or templates is None:
         raise SetupError(
             f"{name} is not built, and making a class of it needs "

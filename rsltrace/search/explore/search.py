@@ -108,6 +108,8 @@ class Explorer:
         """How many runs have ended since ``began_s``, without those of a resumed search."""
         self.failed_here = 0
         """How many of them failed."""
+        self.has_run_plain = False
+        """Whether the plain run is one of them."""
         self.is_exhausted = False
         """Whether the strategy has nothing left to try."""
         self._table = table
@@ -188,6 +190,7 @@ class Explorer:
 
     def _run_plain(self, pool: TrialPool, on_result: Callable[[TrialResult], None]) -> None:
         """Run the job as it is."""
+        self.has_run_plain = True
         wants = replace(self._wants(), keep=True, strict=True)
         self._submit(pool, self._plain, wants)
         found: list[TrialResult] = []

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, TypeAdapter
 
@@ -62,7 +62,7 @@ class RunRecord:
     digest: _Digest = ""
     verdict: Literal["passed", "failed", "error"] = "passed"
     reason: str = ""
-    seconds: Annotated[float, Field(allow_inf_nan=False)] | None = None
+    seconds: Annotated[float, Field(ge=0, lt=1e12)] | None = None
     runs: _Count = 1
     failed: _Count = 0
 
@@ -93,7 +93,13 @@ def recorded(place: str | None, by: str, file: Path, arguments: Arguments) -> It
         return
     if "://" not in place and not _is_folder(place):
         _append(Path(place), b"")  # before the run, which may take long
-    commit, branch, top = _origin(file.parent)
+    elif "://" in place:
+        if place.endswith(SUFFIX):
+            name = public_address(place)
+            raise OutputError(f"the history {name} is no folder: each run gets a file there")
+        _filesystem(place)
+    folder = file.parent.absolute()
+    commit, branch, top = _origin(next(one for one in (folder, *folder.parents) if one.is_dir()))
 
     def relative(path: str) -> str:
         if "://" in path:
@@ -114,7 +120,8 @@ def recorded(place: str | None, by: str, file: Path, arguments: Arguments) -> It
         except OutputError as trouble:
             tell(f"rsltrace: warning: {trouble}")
         raise
-    _write(place, record, begin)
+    if record.runs:
+        _write(place, record, begin)
 
 
 def _write(place: str, record: RunRecord, begin: float) -> None:
@@ -160,15 +167,20 @@ def _append(path: Path, line: bytes) -> None:
 
 
 def _put(address: str, line: bytes) -> None:
+    filesystem, path = _filesystem(address)
     try:
-        filesystem, path = filesystem_of(address)
         filesystem.pipe_file(path, line)
-    except (SetupError, TraceError) as error:
-        raise OutputError(f"the history cannot be written: {error}") from None
     except Exception as error:  # whatever the storage's library raises: there are many
         reason = redacted(str(error) or type(error).__name__, address)
         name = public_address(address)
         raise OutputError(f"the history {name} cannot be written: {reason}") from None
+
+
+def _filesystem(address: str) -> tuple[Any, str]:
+    try:
+        return filesystem_of(address)
+    except (SetupError, TraceError) as error:
+        raise OutputError(f"the history cannot be written: {error}") from None
 
 
 def _origin(folder: Path) -> tuple[str, str, str]:
@@ -182,13 +194,16 @@ def _origin(folder: Path) -> tuple[str, str, str]:
     except (RsltraceError, OSError):
         status = []
     head: dict[str, str] = {}
+    is_dirty = False
     for line in status:
-        _, _, text = line.partition("# branch.")
-        key, _, value = text.partition(" ")
-        head[key] = value  # of a changed file "" is ""
+        if line.startswith("# "):  # "# stash 1" if status.showStash is set
+            key, _, value = line.removeprefix("# branch.").partition(" ")
+            head[key] = value
+        else:
+            is_dirty = True
     oid = head.get("oid", "(")
     if not oid.startswith("("):  # (initial)
-        commit = oid + DIRTY * ("" in head)
+        commit = oid + DIRTY * is_dirty
     if not head.get("head", "(").startswith("("):  # (detached)
         branch = head["head"]
     return commit, _variable(_BRANCHES) or branch, top

@@ -57,8 +57,8 @@ class DigestChange:
 @dataclass(slots=True)
 class JobHistory:
     """The runs of a job. ``orders`` were tried by searches, ``changes`` counts the changes of its
-    digest; the ``last_…`` are of the last run that failed. ``fails_now``: the last search failed,
-    or the last of the other runs."""
+    digest; the ``last_…`` are of the last run that failed. ``fails_now``: on a branch, the
+    last search failed, or the last of the other runs."""
 
     job: str
     runs: int = 0
@@ -76,7 +76,7 @@ class JobHistory:
         """Count a run."""
         self.runs += 1
         self.seconds += run.seconds or 0.0
-        if run.by == "explore":
+        if run.by == "explore" and run.verdict != "error":
             self.orders += run.runs
             self.orders_failed += run.failed
         if run.verdict != "passed":
@@ -108,6 +108,7 @@ class HistorySummary:
     failed: int
     orders: int
     jobs_count: int
+    jobs_failed: int
     jobs_failing_now: int
     commits_count: int
     changes_count: int
@@ -150,7 +151,7 @@ class _Table:
 
     def __init__(self) -> None:
         self._jobs: dict[str, JobHistory] = {}
-        self._newest: dict[tuple[str, bool], tuple[str, bool]] = {}
+        self._newest: dict[tuple[str, str, bool], tuple[str, bool]] = {}
         self._series: dict[tuple[str, str], int] = {}
         self._commits: dict[str, int] = {}
         self._times, self._digest_of = array("q"), array("Q")
@@ -162,7 +163,8 @@ class _Table:
         if job is None:
             job = self._jobs[run.job] = JobHistory(run.job)
         job.add(run)
-        kind, last = (run.job, run.by == "explore"), (run.time, run.verdict != "passed")
+        kind = run.job, run.branch, run.by == "explore"
+        last = run.time, run.verdict != "passed"
         self._newest[kind] = max(self._newest.get(kind, last), last)
         self._times.append(int(run.time.encode().translate(None, b"-:T.Z")))
         self._series_of.append(self._series.setdefault((run.job, run.branch), len(self._series)))
@@ -178,7 +180,7 @@ class _Table:
         changed = Counter((series[self._series_of[row]][0], self._commit_of[row]) for row in after)
         for (job, _), count in changed.items():
             self._jobs[job].changes += count
-        for (job, _), (_, fails) in self._newest.items():
+        for (job, _, _), (_, fails) in self._newest.items():
             self._jobs[job].fails_now |= fails
         seen, first = np.unique(commits[np.argsort(times, kind="stable")], return_index=True)
         in_time = [one for one in seen[np.argsort(first)].tolist() if names[one]]
@@ -203,6 +205,7 @@ class _Table:
             sum(self._fails),
             sum(one.orders for one in self._jobs.values()),
             len(self._jobs),
+            sum(one.failed > 0 for one in self._jobs.values()),
             sum(one.fails_now for one in self._jobs.values()),
             len(in_time),
             len(after),
@@ -296,7 +299,7 @@ def _files_at(address: str) -> Iterator[tuple[str, Iterable[bytes]]]:
 
 def _fetched(filesystem: Any, paths: list[str]) -> Iterator[tuple[str, Iterable[bytes]]]:
     for name, data in (filesystem.cat(paths) if paths else {}).items():
-        yield name, data.splitlines()
+        yield public_address(name), data.splitlines()
 
 
 def _lines(source: ByteSource) -> Iterator[bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -33,8 +34,8 @@ def as_text(found: HistorySummary) -> Iterator[str]:
     if failing:
         yield from ("", "failing:")
         yield from table([*map(job_cells, failing[:_JOBS_MAX])])
-        if len(failing) > _JOBS_MAX:
-            yield f"and {len(failing) - _JOBS_MAX} more jobs: --format json has them"
+        if found.jobs_failed > _JOBS_MAX:
+            yield f"and {found.jobs_failed - _JOBS_MAX:,} more jobs: see --job, --format json"
     if command := bisect_command(found):
         yield from ("", f"next: {command}")
 
@@ -97,7 +98,7 @@ def bisect_command(found: HistorySummary) -> str:
     for one in found.changes:
         commits = one.old_commit, one.commit
         is_range = commits[0] != commits[1] and all(map(_COMMIT.fullmatch, commits))
-        if is_range and Path(one.job).suffix in (".yaml", ".yml") and Path(one.job).is_file():
+        if is_range and Path(one.job).suffix in (".yaml", ".yml") and os.path.isfile(one.job):
             good, bad = map(commit_text, commits)
             return f"rsltrace bisect {path_word(one.job)} --good {good} --bad {bad}"
     return ""
