@@ -63,12 +63,13 @@ def _fork_after(
     context: click.Context, option: click.Parameter, text: str | None
 ) -> tuple[str, int] | None:
     """Read a simulated time since the start of a run."""
-    from rsltrace.job.values.times import parse_time
+    from rsltrace.job.values.times import format_time, parse_stamp
 
     if text is None:
         return None
     try:
-        return text, parse_time(text)
+        after_ns = parse_stamp(text)
+        return format_time(after_ns), after_ns
     except ValueError as error:
         raise click.BadParameter(str(error)) from None
 

@@ -187,7 +187,9 @@ class Silent(Reason):
         if sent and not question.is_silent(sent, until_ns):
             return None
         sender = history.trace.entity(sent[-1].sender if sent else question.senders[0].id)
-        ran = int(history.events["entity"][sent[-1].event]) if sent else _idle(history, sender.node)
+        # Nothing yet: what sends it later, if anything does.
+        by = sent[-1] if sent else next(iter(question.messages), None)
+        ran = int(history.events["entity"][by.event]) if by else _idle(history, sender.node)
         callback, cause = history.trace.entity(ran), None
         if callback.kind in WITH_CALLBACK:
             asked = Question(history, callback, question.at_ns, depth=question.depth + 1)
@@ -262,6 +264,10 @@ class AsExpected(Reason):
 
     def words(self) -> str:
         if not self.count:
+            runs = self.question.history.runs_of(self.question.entity.id)
+            if self.question.at_ns is not None and runs:
+                first = self.when(self.question.history.stamp(runs[0]))
+                return f"{self.question.name} did not run until then, as expected: first {first}"
             return f"{self.question.name} did not run, and nothing kept it from running"
         last = "" if self.at_ns is None else f", last {self.when(self.at_ns)}"
         times = "once" if self.count == 1 else f"{self.count} times"

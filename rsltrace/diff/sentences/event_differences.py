@@ -71,7 +71,8 @@ def _short(a: str, b: str, most: int) -> tuple[str, str]:
     for digits in range(4, 18):
         rounded = _rounded(a, digits), _rounded(b, digits)
         if rounded[0] != rounded[1] and not _exaggerates(rounded, (a, b)):
-            a, b = rounded
+            if max(map(len, rounded)) <= most:
+                a, b = rounded
             break
     pairs = enumerate(zip_longest(a, b, fillvalue="0"))  # 2.5 is 2.500
     alike = next((place for place, (x, y) in pairs if x != y), min(len(a), len(b))) - _ALIKE

@@ -25,10 +25,10 @@ def node_colours(names: Iterable[str]) -> dict[str, int]:
     It follows from the name; of two nodes with the same one, the later name takes the next that is
     free.
     """
-    count, found = len(NODE_COLOURS), dict[str, int]()
+    count, found, used = len(NODE_COLOURS), dict[str, int](), set[int]()
     for name in sorted(set(names)):
         wanted = crc32(name.encode(errors="replace")) % count
         order = [*range(wanted, count), *range(wanted)]
-        used = set(found.values())
         found[name] = next((one for one in order if one not in used), wanted)
+        used.add(found[name])
     return found

@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass
 
+from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import printable
@@ -36,8 +37,12 @@ class CallbackQuestion:
         return printable(" ".join(("rsltrace why", path_word(self.run.trace.name), *names)) + at)
 
     def answers(self) -> Iterator[tuple[list[str], int | None]]:
-        """Yield the lines of the answer, and the event to look at. Raises TraceError."""
-        reason = why(self.run.trace, self.node, self.what, self.at_ns)
+        """Yield the lines of the answer, and the event to look at."""
+        try:
+            reason = why(self.run.trace, self.node, self.what, self.at_ns)
+        except TraceError as error:
+            yield [printable(str(error))], None
+            return
         yield [*answer_lines(reason)], reason.event
 
 

@@ -198,4 +198,6 @@ def _wide(ends: tuple[float, float]) -> tuple[float, float]:
 
 def _share(value: float, low: float, high: float) -> float:
     """Return how far between two numbers one is, 0 to 1; halves do not overflow."""
+    if math.isfinite(high - low):
+        return (value - low) / (high - low)
     return (value / 2 - low / 2) / (high / 2 - low / 2)

@@ -329,6 +329,7 @@ def plot(series: list[Series], width: int, height: int, cursor_s: float | None =
     """
     width, height = max(width, 1), max(height, 1)
     low, high, start, end = _bounds(series)
+    scale = 1.0 if high / 2 - low / 2 < _MOST / 2 else 4.0  # differences do not overflow
     dots = np.zeros((2, height * 4, width * 2), dtype=np.bool_)
     for which, one in enumerate(series[:2]):
         finite = np.isfinite(one.values) & np.isfinite(one.times)
@@ -336,7 +337,7 @@ def plot(series: list[Series], width: int, height: int, cursor_s: float | None =
         if not len(times):
             continue
         x = (times - start) / (end - start) * (width * 2 - 1)
-        y = (high - values) / (high - low) * (height * 4 - 1)
+        y = (high / scale - values / scale) / (high / scale - low / scale) * (height * 4 - 1)
         _draw(dots[which], x, y)
         if which == 1:
             dots[1, :, 1::4] = False
@@ -357,6 +358,9 @@ def plot(series: list[Series], width: int, height: int, cursor_s: float | None =
     return Plot(rows, tuple(tuple(line) for line in owner.tolist()), low, high, start, end)
 
 
+_MOST = float(np.finfo(np.float64).max)
+
+
 def _bounds(series: list[Series]) -> tuple[float, float, float, float]:
     values = np.concatenate([s.values[np.isfinite(s.values)] for s in series] or [np.zeros(0)])
     times = np.concatenate([s.times for s in series] or [np.zeros(0)])
@@ -365,7 +369,7 @@ def _bounds(series: list[Series]) -> tuple[float, float, float, float]:
     if high == low:
         # A constant runs through the middle.
         margin = abs(high) * 0.1 or 1.0
-        low, high = low - margin, high + margin
+        low, high = max(low - margin, -_MOST), min(high + margin, _MOST)
     if end == start:
         end = start + 1.0
     return low, high, start, end

@@ -179,6 +179,7 @@ class RecordingApp(RecordingShell):
                 except TimeError as error:
                     self._say(str(error))
                 else:
+                    self._say("")
                     self._show_messages()
 
     def first_read(self) -> None:
