@@ -30,7 +30,7 @@ Attempt = Callable[[float], Any]
 
 _PROGRAM_S = 5.0
 """How many real seconds simulated time stands still for a started program."""
-_OF_A_PROGRAM = ("_communicate", "_try_wait")
+_OF_A_PROGRAM = ("communicate", "_communicate", "_try_wait")
 """The functions of ``subprocess`` that wait for a program's output and end."""
 
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
@@ -135,6 +135,8 @@ def initial_wait_s(frame: FrameType, timeout_s: float | None) -> float:
     Not 0 for programs of ``subprocess`` without an open stdin: those with one may wait for the run.
     Until a program has started, that does not matter.
     """
+    while frame.f_back is not None and _is_ours(frame):  # a file or a terminal that calls os.read
+        frame = frame.f_back
     if frame.f_globals.get("__name__") != "subprocess":
         return 0.0
     name = code_of(frame).co_name
@@ -143,6 +145,10 @@ def initial_wait_s(frame: FrameType, timeout_s: float | None) -> float:
         if name not in _OF_A_PROGRAM or (stdin is not None and not stdin.closed):
             return 0.0
     return _PROGRAM_S if timeout_s is None else min(timeout_s, _PROGRAM_S)
+
+
+def _is_ours(frame: FrameType) -> bool:
+    return str(frame.f_globals.get("__name__")).startswith("rsltrace.")
 
 
 def waiting_guard(frame: FrameType) -> Guard | None:

@@ -373,4 +373,6 @@ def test_a_program_that_ends_soon_takes_no_simulated_time(
     assert quick.digest == slow.digest
     with Trace.open(slow.path) as trace:
         texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
-    assert [json.loads(text)[:4] for text in texts] == [["done\n", 1, 3, 4]] * 2
+    said = [json.loads(text) for text in texts]
+    assert [one[:5] for one in said] == [["done\n", 1, 3, 4, 0]] * 2
+    assert all(one[5] < 1e-5 for one in said), "two looks at the clock at one instant"
