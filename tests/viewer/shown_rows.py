@@ -261,6 +261,8 @@ def names_of(path: str) -> set[str]:
     turned = _TURNS.get(parts[-1], parts[-1]) if "angular" in parts else parts[-1]
     last = turned.rstrip("_")
     names = {path, last, ".".join([*parts[-2:-1], last])}
+    if letter := {"linear": "v", "linear_acceleration": "a"}.get("".join(parts[-2:-1])):
+        names.add(letter + last)
     return names | {re.sub(r"\[\d+\]", "", one) for one in names} | {re.sub(r"^[^\[]*", "", path)}
 
 
