@@ -245,7 +245,8 @@ def explore(
         _set_result(record, search)
         end.report(job)
         if interrupted:
-            record.runs *= record.verdict == "failed"  # one that is cut off says nothing else
+            if record.verdict != "failed":
+                record.runs = 0  # one that is cut off says nothing else: no line
             tell(f"interrupted: continue with --resume; the results are in {folder}")
             return _INTERRUPTED
         return 1 if search.tally.failures else 0

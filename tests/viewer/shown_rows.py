@@ -290,6 +290,4 @@ def is_value(text: str, value: str) -> bool:
     if text == value or not NUMBER.fullmatch(value):
         return text == value
     digits = len(re.sub(r"e.*|[-.]", "", text).lstrip("0"))
-    return float(f"{float(value):.{max(digits, 3)}g}") == float(text) or (
-        float(f"{float(value):.{max(digits, 4)}g}") == float(text)
-    )
+    return float(f"{float(value):.{max(digits, 4)}g}") == float(text)

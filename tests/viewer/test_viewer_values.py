@@ -130,7 +130,7 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
         (odometry(0, 0.5), "vx=0.5 ω=-0.1"),
         (ros_message(f"{nav}/Odometry"), "x=0 y=0"),
         (ros_message(f"{sensor}/Imu"), "ω=0 a=0"),
-        (ros_message(f"{sensor}/Imu", linear_acceleration=vector(z=9.806)), "az=9.81"),
+        (ros_message(f"{sensor}/Imu", linear_acceleration=vector(z=9.806)), "az=9.806"),
         (ros_message(f"{sensor}/NavSatFix", latitude=47.1, longitude=-8), FIX),
         (
             ros_message(

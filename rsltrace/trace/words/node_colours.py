@@ -1,4 +1,4 @@
-"""A colour for each node, the same in the list, the lanes and the graph, and in every run."""
+"""A colour for each node: the same in list, lanes and graph, and in runs of the same nodes."""
 
 from __future__ import annotations
 

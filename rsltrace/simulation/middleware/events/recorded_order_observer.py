@@ -72,17 +72,16 @@ class RecordedOrderObserver(EventObserver):
             self._is_beyond = True
             return
         self._last = index, expected
-        now_ns = loop.stamp
         name = order.name_of(entity)
         if kind != expected.kind or name not in (None, expected.name):
             if handle is not None and (name is None or not entity):
                 name = handle.describe()
-            here = f"here it was {event_text(kind, name or 'something else', now_ns)}"
+            here = f"here it was {event_text(kind, name or 'something else', loop.stamp)}"
             error = order.cannot_follow(index, expected, here)
             outcome.error = error
             loop.stop(Stop("the recorded order cannot be followed", error.exit_code))
-        elif now_ns != expected.stamp_ns and self._other_time is None:
-            self._other_time = index, expected, now_ns
+        elif loop.now_ns != expected.stamp_ns and self._other_time is None:
+            self._other_time = index, expected, loop.stamp
 
     def notes(self) -> Iterator[str]:
         """Yield how the run differs from the recorded one."""

@@ -116,7 +116,7 @@ def _transform(one: Any) -> str:
 
 def _odometry(message: Any) -> str:
     pose, velocity = message.pose.pose, message.twist.twist
-    turned = number(_yaw(*(float(getattr(pose.orientation, axis)) for axis in "xyzw")), 3)
+    turned = number(_yaw(*(float(getattr(pose.orientation, axis)) for axis in "xyzw")))
     texts = [*_named("", pose.position), *([f"θ={turned}"] if turned != "0" else ())]
     texts += [*_named("v", velocity.linear), *_named("", velocity.angular, TURNS)]
     return " ".join(texts) or "x=0 y=0"
@@ -129,7 +129,7 @@ def _imu(message: Any) -> str:
 
 def _named(before: str, vector: Any, names: Mapping[str, str] = MappingProxyType({})) -> list[str]:
     """Return the parts of a vector that are not zero, each with its name."""
-    found = ((axis, number(float(getattr(vector, axis)), 3)) for axis in "xyz")
+    found = ((axis, number(float(getattr(vector, axis)))) for axis in "xyz")
     return [f"{before}{names.get(axis, axis)}={text}" for axis, text in found if text != "0"]
 
 
