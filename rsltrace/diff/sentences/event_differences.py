@@ -71,7 +71,8 @@ def _short(a: str, b: str, most: int) -> tuple[str, str]:
     for digits in range(4, 18):
         rounded = _rounded(a, digits), _rounded(b, digits)
         if rounded[0] != rounded[1] and not _exaggerates(rounded, (a, b)):
-            if max(map(len, rounded)) <= most:
+            # The end of a text that is too long is shown: of a large integer not its exponent.
+            if not any("e" in one and len(one) > most for one in rounded):
                 a, b = rounded
             break
     pairs = enumerate(zip_longest(a, b, fillvalue="0"))  # 2.5 is 2.500
