@@ -11,6 +11,7 @@ import click
 
 from rsltrace.cli.completion import complete_files
 from rsltrace.cli.output.text_file import write_text
+from rsltrace.errors import TraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.exports.output_file import check_not_input
 from rsltrace.trace.model.texts import printable
@@ -80,6 +81,10 @@ def history(
     found = summarize(places, job=job, branch=branch, since=day, on_bad=on_bad)
     if bad > _BAD_LINES_MAX:
         tell(f"rsltrace: warning: {bad - _BAD_LINES_MAX} more lines were skipped")
+    if bad and not found.runs and (job, branch, since) == ("*", "*", None):
+        raise TraceError(
+            f"{printable(' '.join(places))}: no line of a history; name what --history appends to"
+        )
     if form == "html":
         from rsltrace_viewer.pages.history_page import history_page
 

@@ -294,6 +294,9 @@ def test_digests_are_compared_on_each_branch_in_the_order_of_time(
     assert done.stdout.startswith("1 run of 1 job")
     done = command("history", "one.jsonl", "two.jsonl", "--since", "2026-11-02")
     assert done.stdout == "no runs\n"
+    (tmp_path / "job.yaml").write_text("nodes: []\n")
+    done = command("history", "job.yaml")
+    assert (done.returncode, "job.yaml: no line of a history" in done.stderr) == (2, True)
     done = command("history", "one.jsonl", "two.jsonl", "--job", "b*", "-o", "page.html")
     assert "no runs" in (tmp_path / "page.html").read_text()
 
