@@ -16,7 +16,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-all test-long test-native test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
+.PHONY: demo test test-all test-long test-native test-kilted test-arm truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -91,6 +91,11 @@ KILTED := VENV=.venv-kilted ROS=ros-kilted,dev-ros-kilted
 KILTED_TESTS ?=
 test-kilted:
 	@$(MAKE) --no-print-directory $(KILTED) unit PYTEST="$(KILTED_TESTS)"
+
+# The examples on an emulated ARM machine, as root: same digests? make test-arm ARM_JOBS="cart ping_pong"
+ARM_JOBS ?=
+test-arm: $(INSTALLED)
+	$(BIN)/python -m campaigns.arm $(ARM_JOBS)
 
 # docs/jobs.md is made from the models of rsltrace.job, the manual pages in man/ from the commands, the
 # drawings of docs/architecture.md and docs/concepts by scripts; a test fails when one is stale.

@@ -24,7 +24,7 @@ from rsltrace.trace.model.finding import NondeterminismSource
 
 _RECORDED = (NondeterminismSource.SOCKET, NondeterminismSource.PROCESS, NondeterminismSource.FILE)
 _ALL_EVENTS = select.POLLIN | select.POLLPRI | select.POLLOUT
-_real_epoll = select.epoll
+_real_epoll = getattr(select, "epoll", None)  # Linux has it
 
 
 def _recording(frame: FrameType) -> tuple[Guard, NondeterminismSource] | None:
@@ -172,6 +172,7 @@ def _polling(real: Callable[[], Any]) -> Any:
 
 
 def _epolling(sizehint: int = -1, flags: int = 0) -> Any:
+    assert _real_epoll is not None
     if engaged() is None:
         return _real_epoll(sizehint, flags)
     found = _recording(sys._getframe(1))
@@ -238,6 +239,8 @@ def recorded_polls() -> Iterator[None]:
     with ExitStack() as stack:
         redirect(stack, select.poll, _polling)
         redirect(stack, select.select, _selecting)
-        replace_attribute(stack, select, "epoll", _epolling)
-        replace_attribute(stack, selectors.EpollSelector, "_selector_cls", staticmethod(_epolling))
+        if _real_epoll is not None:
+            replace_attribute(stack, select, "epoll", _epolling)
+            selector = selectors.EpollSelector
+            replace_attribute(stack, selector, "_selector_cls", staticmethod(_epolling))
         yield

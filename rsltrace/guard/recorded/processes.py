@@ -190,7 +190,8 @@ def recorded_processes() -> Iterator[None]:
         redirect(stack, os.system, _running)
         redirect(stack, os.waitpid, _waiting)
         for name in ("kill", "pidfd_open"):
-            redirect(stack, getattr(os, name), partial(_of_process, name))
+            if hasattr(os, name):
+                redirect(stack, getattr(os, name), partial(_of_process, name))
         acquire: Any = _multiprocessing.SemLock.acquire
         replace_member(stack, _multiprocessing.SemLock, "acquire", _acquiring)
         replace_member(

@@ -91,7 +91,8 @@ def virtual_processors() -> Iterator[None]:
             ("sched_getaffinity", _affinity),
             ("sched_setaffinity", _setting),
         ):
-            redirect(stack, getattr(os, name), make)
+            if hasattr(os, name):
+                redirect(stack, getattr(os, name), make)
         yield
 
 

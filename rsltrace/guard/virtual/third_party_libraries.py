@@ -274,8 +274,11 @@ _SUFFIXES = tuple(EXTENSION_SUFFIXES)
 
 _dlopen: Callable[..., int] = copy_of(_ctypes.dlopen)  # type: ignore[arg-type]
 _dlsym: Callable[..., int] = copy_of(_ctypes.dlsym)  # type: ignore[arg-type]
-_may_use = copy_of(os.sched_getaffinity)  # type: ignore[arg-type]
-_use = copy_of(os.sched_setaffinity)  # type: ignore[arg-type]
+if hasattr(os, "sched_setaffinity"):
+    _may_use = copy_of(os.sched_getaffinity)  # type: ignore[arg-type]
+    _use = copy_of(os.sched_setaffinity)  # type: ignore[arg-type]
+else:  # not Linux
+    _may_use = _use = None
 
 _without: set[str] = set()
 """Files of this process that are known to have no TBB."""
@@ -342,6 +345,8 @@ class _TbbThreads:
 
 def _asked_on_one_processor(processors: Callable[[None], int]) -> int:
     """Let TBB ask for the number of processors; return the number it knows."""
+    if _use is None:
+        return processors(None)
     before = _may_use(0)
     try:
         _use(0, {min(before)})

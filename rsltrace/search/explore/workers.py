@@ -196,7 +196,9 @@ class Workers:
 
 def default_jobs() -> int:
     """Return how many workers make use of this machine."""
-    return len(os.sched_getaffinity(0))
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _named(trial: Mapping[str, Any]) -> str:
