@@ -59,23 +59,23 @@ _POLICIES = {
     "reliability": (
         (Reliability.BEST_EFFORT, Reliability.RELIABLE),
         "Best effort publisher and reliable subscription",
-        "Publisher reliability is {} and subscription reliability is {}",
-        "Reliable subscription, but publisher is {}",
-        "Best effort publisher, but subscription is {1}",
+        "Publisher reliability is %s and subscription reliability is %s",
+        "Reliable subscription, but publisher is %s",
+        "Best effort publisher, but subscription is %s",
     ),
     "durability": (
         (Durability.VOLATILE, Durability.TRANSIENT_LOCAL),
         "Volatile publisher and transient local subscription",
-        "Publisher durabilty is {} and subscription durability is {}",
-        "Transient local subscription, but publisher is {}",
-        "Volatile publisher, but subscription is {1}",
+        "Publisher durabilty is %s and subscription durability is %s",
+        "Transient local subscription, but publisher is %s",
+        "Volatile publisher, but subscription is %s",
     ),
     "liveliness": (
         (Liveliness.AUTOMATIC, Liveliness.MANUAL_BY_TOPIC),
         "Publisher's liveliness is automatic and subscription's is manual by topic",
-        "Publisher liveliness is {} and subscription liveliness is {}",
-        "Subscription's liveliness is manual by topic, but publisher's is {}",
-        "Publisher's liveliness is automatic, but subscription's is {1}",
+        "Publisher liveliness is %s and subscription liveliness is %s",
+        "Subscription's liveliness is manual by topic, but publisher's is %s",
+        "Publisher's liveliness is automatic, but subscription's is %s",
     ),
 }
 _LIMITS = {
@@ -117,11 +117,11 @@ def compatibility(publisher: dict[str, Any], subscription: dict[str, Any]) -> tu
         if pair == bad:
             errors.append(error)
         elif all(may_be_anything):
-            warnings.append(both.format(*words))
+            warnings.append(both % tuple(words))
         elif may_be_anything[0] and pair[1] == bad[1]:
-            warnings.append(of_publisher.format(*words))
+            warnings.append(of_publisher % words[0])
         elif may_be_anything[1] and pair[0] == bad[0]:
-            warnings.append(of_subscription.format(*words))
+            warnings.append(of_subscription % words[1])
         if policy in _LIMITS:
             name, without, less = _LIMITS[policy]
             limit, wanted = publisher[name].nanoseconds, subscription[name].nanoseconds
