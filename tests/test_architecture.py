@@ -221,6 +221,7 @@ _NO_METHODS_OF_OURS = {
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "register"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/mains.py", "unregister"): "of the module atexit",
     ("rsltrace/adapters/rclpy/concurrency/threads.py", "__init__"): "of the user's thread classes",
+    ("rsltrace/adapters/rclpy/concurrency/threads.py", "__hash__"): "of the user's thread classes",
     ("rsltrace/guard/virtual/user_modules.py", "exec_module"): "of Python's loaders",
     ("rsltrace/simulation/middleware/events/dispatcher.py", "entity"): "a field of Event",
 }
@@ -261,6 +262,7 @@ RUNS_CODE = {
     "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
     "rsltrace/adapters/rclpy/boundary/installation.py": "exec_module import_module",  # of rosidl
     "rsltrace/adapters/rclpy/executors/user_executors.py": "import_module",  # functions of rclpy
+    "rsltrace/adapters/rclpy/parameter_overrides.py": "yaml",  # its parser's events, no objects
     "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
     "rsltrace/adapters/workspace/build_files.py": "compile exec import_module",  # setup.py
     # What a run, and only a run, does with code that its job names.

@@ -18,9 +18,11 @@ def main() -> NoReturn:
     is_pythons = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if is_pythons:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from rsltrace.adapters.rclpy import boundary
     from rsltrace.guard.pin import pin_recording
 
     pin_recording(sys.argv[1:])
+    boundary.loads_extension = False
     gc.set_threshold(_ALLOCATIONS)
     from rsltrace.cli.main import main as run_command
 

@@ -8,7 +8,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from rsltrace.adapters.rclpy.boundary.installation import boundary, check_no_simulation
+from rsltrace.adapters.rclpy.boundary.installation import (
+    check_no_simulation,
+    native_extension,
+)
 from rsltrace.errors import JobError, NodeError, RunError
 from rsltrace.job import Job
 from rsltrace.native import support
@@ -90,7 +93,7 @@ class SingleProcessRun(NativeRun):
         number = stack.enter_context(domain(self.options.domain_id))
         stack.enter_context(rclpy_running(echo=echo))
         described = {
-            "middleware": boundary().real.rclpy_get_rmw_implementation_identifier(),
+            "middleware": native_extension().rclpy_get_rmw_implementation_identifier(),
             "executor": f"{EXECUTORS[self.options.executor]} per entry of the job",
             "processes": "1",
             "domain": str(number),
@@ -99,9 +102,9 @@ class SingleProcessRun(NativeRun):
         executors = CallbackObserver(
             self.recorder, self.entities, self.message_observer, self.nodes.meet
         )
-        stack.enter_context(self.message_observer.watched(boundary().real))
+        stack.enter_context(self.message_observer.watched(native_extension()))
         if self.priorities is not None:
-            stack.enter_context(self.priorities.watched(boundary().real))
+            stack.enter_context(self.priorities.watched(native_extension()))
         stack.enter_context(self.nodes.watched())
         stack.enter_context(executors.watched())
         self.watch_stop_topics(self.message_observer.on_message)

@@ -85,7 +85,6 @@ def test_a_node_describes_the_types_it_uses(simulate: Callable[..., Any]) -> Non
 
 
 def test_descriptions_hash_to_the_installed_type_hashes() -> None:
-    """What is read from the type support libraries is what the definition files say."""
     pytest.importorskip("test_msgs.action", reason="needs ros-jazzy-test-msgs")
     from sensor_msgs.msg import PointCloud2
     from test_msgs.action import Fibonacci

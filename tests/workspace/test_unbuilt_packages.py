@@ -221,17 +221,6 @@ def test_classes_and_hashes_are_those_that_a_build_makes(
         assert ours.read_text() == built.read_text()
 
 
-def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
-    from std_srvs.srv import SetBool
-
-    from rsltrace.adapters.rclpy.messages.type_descriptions import _from_file, type_description
-
-    built, read = type_description(SetBool), _from_file("std_srvs/srv/SetBool")
-    assert built is not None
-    assert read is not None
-    assert (read.type_hash, read.types) == (built.type_hash, built.types)
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -1,155 +1,23 @@
-"""ROS arguments (``--ros-args -r … -p … --params-file …``), parsed by rcl itself.
+"""ROS arguments (``--ros-args -r … -p … --params-file …``), parsed as rcl parses them.
 
-The rules are many: wildcards, precedence, the types of YAML scalars. rclpy reaches rcl's parser
-only through a Node, which opens a DDS participant, so the C functions are called directly here.
+The rules are those of ``rcl_parse_arguments`` and ``rcl_remap_*``; errors have rcl's texts.
 """
 
 from __future__ import annotations
 
-import ctypes
 import re
-from collections.abc import Sequence
-from ctypes import (
-    POINTER,
-    Structure,
-    byref,
-    c_bool,
-    c_char_p,
-    c_double,
-    c_int64,
-    c_size_t,
-    c_void_p,
-)
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
-from rsltrace.errors import SetupError
-
-_OK = 0
-_INVALID_ROS_ARGS = 1002
-
-
-class _Allocator(Structure):
-    _fields_ = (
-        ("allocate", c_void_p),
-        ("deallocate", c_void_p),
-        ("reallocate", c_void_p),
-        ("zero_allocate", c_void_p),
-        ("state", c_void_p),
-    )
-
-
-class _Arguments(Structure):
-    _fields_ = (("impl", c_void_p),)
-
-
-def _array_of(kind: Any) -> type[Structure]:
-    return type(
-        f"_Array_{kind.__name__}",
-        (Structure,),
-        {"_fields_": (("values", POINTER(kind)), ("size", c_size_t))},
-    )
-
-
-class _ErrorString(Structure):
-    _fields_ = (("text", ctypes.c_char * 1024),)
-
-
-class _StringArray(Structure):
-    _fields_ = (("size", c_size_t), ("data", POINTER(c_char_p)), ("allocator", _Allocator))
-
-
-_ByteArray = _array_of(ctypes.c_uint8)
-_BoolArray = _array_of(c_bool)
-_IntArray = _array_of(c_int64)
-_DoubleArray = _array_of(c_double)
-
-
-class _Variant(Structure):
-    _fields_ = (
-        ("bool_value", POINTER(c_bool)),
-        ("integer_value", POINTER(c_int64)),
-        ("double_value", POINTER(c_double)),
-        ("string_value", c_char_p),
-        ("byte_array_value", POINTER(_ByteArray)),
-        ("bool_array_value", POINTER(_BoolArray)),
-        ("integer_array_value", POINTER(_IntArray)),
-        ("double_array_value", POINTER(_DoubleArray)),
-        ("string_array_value", POINTER(_StringArray)),
-    )
-
-
-class _NodeParams(Structure):
-    _fields_ = (
-        ("names", POINTER(c_char_p)),
-        ("values", POINTER(_Variant)),
-        ("size", c_size_t),
-        ("capacity", c_size_t),
-    )
-
-
-class _Params(Structure):
-    _fields_ = (
-        ("node_names", POINTER(c_char_p)),
-        ("params", POINTER(_NodeParams)),
-        ("size", c_size_t),
-        ("capacity", c_size_t),
-        ("allocator", _Allocator),
-    )
-
-
-@lru_cache(maxsize=1)
-def _library() -> Any:
-    """Load the librcl that rclpy's extension has loaded into this process."""
-    paths = {
-        line.split()[-1]
-        for line in Path("/proc/self/maps").read_text().splitlines()
-        if re.search(r"/librcl(_yaml_param_parser)?\.so", line)
-    }
-    try:
-        rcl = ctypes.CDLL(next(p for p in sorted(paths) if "/librcl.so" in p))
-        yaml = ctypes.CDLL(next(p for p in sorted(paths) if "param_parser" in p))
-    except (StopIteration, OSError) as error:
-        raise SetupError(
-            "librcl was not found in this process: is rclpy installed properly?"
-        ) from error
-    rcl.rcutils_get_default_allocator.restype = _Allocator
-    rcl.rcl_get_zero_initialized_arguments.restype = _Arguments
-    rcl.rcl_parse_arguments.argtypes = (
-        ctypes.c_int,
-        POINTER(c_char_p),
-        _Allocator,
-        POINTER(_Arguments),
-    )
-    rcl.rcl_arguments_fini.argtypes = (POINTER(_Arguments),)
-    rcl.rcl_arguments_get_count_unparsed_ros.argtypes = (POINTER(_Arguments),)
-    rcl.rcl_arguments_get_unparsed_ros.argtypes = (
-        POINTER(_Arguments),
-        _Allocator,
-        POINTER(POINTER(ctypes.c_int)),
-    )
-    rcl.rcl_arguments_get_param_overrides.argtypes = (
-        POINTER(_Arguments),
-        POINTER(POINTER(_Params)),
-    )
-    two = (POINTER(_Arguments), POINTER(_Arguments))
-    for name, strings in (
-        ("rcl_remap_topic_name", 3),
-        ("rcl_remap_service_name", 3),
-        ("rcl_remap_node_name", 1),
-        ("rcl_remap_node_namespace", 1),
-    ):
-        getattr(rcl, name).argtypes = (
-            *two,
-            *(c_char_p,) * strings,
-            _Allocator,
-            POINTER(c_void_p),
-        )
-    rcl.rcutils_get_error_string.restype = _ErrorString
-    rcl.rcutils_error_is_set.restype = c_bool
-    yaml.rcl_yaml_node_struct_fini.argtypes = (POINTER(_Params),)
-    return rcl, yaml
+from rsltrace.adapters.rclpy.log_levels import LEVELS
+from rsltrace.adapters.rclpy.names import expand
+from rsltrace.adapters.rclpy.parameter_overrides import (
+    NO_TEXT,
+    ParameterFault,
+    ParameterOverrides,
+)
 
 
 class InvalidArgumentsError(ValueError):
@@ -160,6 +28,229 @@ class UnknownArgumentsError(InvalidArgumentsError):
     """rcl does not know some of the ROS arguments; the text lists them."""
 
 
+class _Lexeme(IntEnum):
+    """The kinds of words in rules, with rcl's numbers, which errors name."""
+
+    NONE = 0
+    EOF = 1
+    TILDE_SLASH = 2
+    URL_SERVICE = 3
+    URL_TOPIC = 4
+    COLON = 5
+    NODE = 6
+    NS = 7
+    SEPARATOR = 8
+    BACKREFERENCE = 9  # to 17, by the digit
+    TOKEN = 18
+    FORWARD_SLASH = 19
+    WILD_ONE = 20
+    WILD_MULTI = 21
+    DOT = 22
+
+
+_WORDS = re.compile(
+    r"(?P<TILDE_SLASH>~/)|(?P<URL_SERVICE>rosservice://)|(?P<URL_TOPIC>rostopic://)"
+    r"|(?P<SEPARATOR>:=)|(?P<COLON>:)|(?P<NODE>__node|__name)|(?P<NS>__ns)"
+    r"|(?P<BACKREFERENCE>\\[1-9])"
+    r"|(?P<TOKEN>[A-Za-z][A-Za-z0-9]*(?:_[A-Za-z0-9]+)*_?"
+    r"|_(?!_)(?:[A-Za-z0-9]+(?:_[A-Za-z0-9]+)*_?)?)"
+    r"|(?P<FORWARD_SLASH>/)|(?P<WILD_MULTI>\*\*)|(?P<WILD_ONE>\*)|(?P<DOT>\.)"
+    # What rcl has read when it finds that it is none of these.
+    r"|(?P<NONE>__n(?:o(?:d.?|.)?|a(?:m.?|.)?|.)?|__.?|\\.?|~.?|.)",
+    re.DOTALL,
+)
+_NAMES = (_Lexeme.TOKEN, _Lexeme.FORWARD_SLASH)
+
+
+class _Fault(Exception):
+    """A rule that rcl cannot parse, with its text."""
+
+
+class _Reader:
+    """Reads the words of a rule. Places are counted in bytes."""
+
+    def __init__(self, rule: str) -> None:
+        self._text = rule.encode().decode("latin-1")
+        self.at = 0
+
+    def peek(self, start: int | None = None) -> _Lexeme:
+        found = _WORDS.match(self._text, self.at if start is None else start)
+        return _Lexeme.EOF if found is None else _Lexeme[str(found.lastgroup)]
+
+    def begins_with(self, first: _Lexeme, second: _Lexeme) -> bool:
+        """Whether the next two words are these."""
+        found = _WORDS.match(self._text, self.at)
+        return found is not None and self.peek() is first and self.peek(found.end()) is second
+
+    def accept(self) -> str:
+        """Read a word."""
+        start = self.at
+        found = _WORDS.match(self._text, start)
+        if found is not None:
+            self.at = found.end()
+        return self.text(start, self.at)
+
+    def expect(self, wanted: _Lexeme) -> str:
+        """Read a word of this kind.
+
+        :raises _Fault: if it is another.
+        """
+        kind = self.peek()
+        if kind is wanted:
+            return self.accept()
+        if kind in (_Lexeme.NONE, _Lexeme.EOF):
+            raise _Fault(
+                f"Expected lexeme type ({wanted:d}) not found, search ended at index {self.at}"
+            )
+        number = int(kind)
+        if kind is _Lexeme.BACKREFERENCE:
+            number += int(self._text[self.at + 1]) - 1
+        raise _Fault(f"Expected lexeme type {wanted:d}, got {number} at index {self.at}")
+
+    def text(self, start: int, end: int | None = None) -> str:
+        return self._text[start:end].encode("latin-1").decode()
+
+    def path(self, token: Callable[[_Reader], None], end: _Lexeme) -> str:
+        """Read names between slashes up to ``end``; ``token`` reads one."""
+        start = self.at
+        if self.peek() in (_Lexeme.TILDE_SLASH, _Lexeme.FORWARD_SLASH):
+            self.accept()
+        token(self)
+        while self.peek() is not end:
+            self.expect(_Lexeme.FORWARD_SLASH)
+            token(self)
+        return self.text(start, self.at)
+
+
+def _check_match_token(reader: _Reader, allowed: Sequence[_Lexeme]) -> None:
+    kind = reader.peek()
+    if kind not in allowed:
+        if kind in (_Lexeme.WILD_ONE, _Lexeme.WILD_MULTI):
+            raise _Fault(f"Wildcard '{reader.accept()}' is not implemented")
+        raise _Fault("Expecting token or wildcard")
+
+
+def _match_token(reader: _Reader) -> None:
+    _check_match_token(reader, [_Lexeme.TOKEN])
+    reader.accept()
+
+
+def _replacement_token(reader: _Reader) -> None:
+    kind = reader.peek()
+    if kind is _Lexeme.BACKREFERENCE:
+        raise _Fault("Backreferences are not implemented")
+    if kind is not _Lexeme.TOKEN:
+        raise _Fault(NO_TEXT)
+    reader.accept()
+
+
+def _node_prefix(reader: _Reader) -> str | None:
+    """Read the ``node:`` before a rule, if there is one."""
+    if not reader.begins_with(_Lexeme.TOKEN, _Lexeme.COLON):
+        return None
+    node = reader.accept()
+    reader.accept()
+    return node
+
+
+_SERVICE, _TOPIC, _NODE, _NAMESPACE = "service", "topic", "node name", "namespace"
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """A remapping rule: for one node or for all, for names of these kinds."""
+
+    node: str | None
+    kinds: tuple[str, ...]
+    match: str
+    replacement: str
+
+
+def _remap_rule(text: str) -> _Rule:
+    reader = _Reader(text)
+    node = _node_prefix(reader)
+    kind = reader.peek()
+    kinds: tuple[str, ...]
+    match = ""
+    if kind is _Lexeme.NODE:
+        reader.accept()
+        reader.expect(_Lexeme.SEPARATOR)
+        kinds, replacement = (_NODE,), reader.expect(_Lexeme.TOKEN)
+    elif kind is _Lexeme.NS:
+        reader.accept()
+        reader.expect(_Lexeme.SEPARATOR)
+        kinds, replacement = (_NAMESPACE,), _namespace(reader)
+    else:
+        kinds = (_TOPIC, _SERVICE)
+        if kind in (_Lexeme.URL_SERVICE, _Lexeme.URL_TOPIC):
+            reader.accept()
+            kinds = (_SERVICE,) if kind is _Lexeme.URL_SERVICE else (_TOPIC,)
+        match = reader.path(_match_token, _Lexeme.SEPARATOR)
+        reader.expect(_Lexeme.SEPARATOR)
+        replacement = reader.path(_replacement_token, _Lexeme.EOF)
+    reader.expect(_Lexeme.EOF)
+    return _Rule(node, kinds, match, replacement)
+
+
+def _namespace(reader: _Reader) -> str:
+    start = reader.at
+    reader.expect(_Lexeme.FORWARD_SLASH)
+    while reader.peek() is _Lexeme.TOKEN:
+        reader.accept()
+        if reader.peek() is not _Lexeme.FORWARD_SLASH:
+            break
+        reader.accept()
+    return reader.text(start, reader.at)
+
+
+def _parameter(text: str, overrides: ParameterOverrides) -> None:
+    reader = _Reader(text)
+    node = _node_prefix(reader)
+    start = reader.at
+    while True:
+        _check_match_token(reader, _NAMES)
+        while reader.peek() in _NAMES:
+            reader.accept()
+        if reader.peek() is _Lexeme.SEPARATOR:
+            break
+        reader.expect(_Lexeme.DOT)
+    name = reader.text(start, reader.at)
+    reader.accept()
+    overrides.add_text(node or "/**", name, reader.text(reader.at))
+
+
+def _check_log_level(text: str) -> None:
+    reader = _Reader(text)
+    while reader.peek() not in (_Lexeme.SEPARATOR, _Lexeme.EOF):
+        reader.accept()
+    level = text
+    if reader.peek() is _Lexeme.SEPARATOR:
+        if reader.at == 0:
+            raise _Fault("Argument has an invalid logger item that name is empty")
+        reader.accept()
+        level = reader.expect(_Lexeme.TOKEN)
+        reader.expect(_Lexeme.EOF)
+    if level.upper() not in LEVELS:
+        raise _Fault("Argument does not use a valid severity level")
+
+
+_FLAGS = {
+    **dict.fromkeys(("-p", "--param"), ("parameter override rule", "parameter override rule")),
+    **dict.fromkeys(("-r", "--remap"), ("remap rule", "remap rule")),
+    "--params-file": ("params file", "file path provided"),
+    "--log-level": ("log level", ""),
+    "--log-file-name": ("log file name prefix", "string prefix provided"),
+    "--log-config-file": ("log configuration file", "file path provided"),
+    **dict.fromkeys(("-e", "--enclave"), ("enclave name", "enclave path provided")),
+}
+"""The flags with a value: what the value is, and what there is none of without it."""
+_SWITCHES = {
+    f"--{word}-{logs}-logs"
+    for word in ("enable", "disable")
+    for logs in ("stdout", "rosout", "external-lib")
+}
+
+
 class RosArguments:
     """A parsed argument list; ``RosArguments([])`` remaps nothing."""
 
@@ -168,45 +259,56 @@ class RosArguments:
 
         :raises InvalidArgumentsError: if rcl refuses them; the text is rcl's.
         """
-        self._rcl, self._yaml = _library()
         self.arguments = tuple(arguments)
-        self._allocator = self._rcl.rcutils_get_default_allocator()
-        self._parsed = self._rcl.rcl_get_zero_initialized_arguments()
-        encoded = [argument.encode() for argument in arguments]
-        array = (c_char_p * max(len(encoded), 1))(*encoded)
-        code = self._rcl.rcl_parse_arguments(
-            len(encoded), array if encoded else None, self._allocator, byref(self._parsed)
-        )
-        if code != _OK:
-            raise InvalidArgumentsError(self._error(f"rcl refuses the arguments (code {code})"))
-        if self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed)) > 0:
-            raise UnknownArgumentsError(f"unknown ROS arguments: {self._unknown()}")
+        self.others: list[str] = []
+        """Those that are not ROS's."""
+        self._rules: list[_Rule] = []
+        self._overrides = ParameterOverrides()
+        unknown = []
+        is_ros = False
+        words = iter(self.arguments)
+        for word in words:
+            if word == "--ros-args":
+                is_ros = True
+            elif not is_ros:
+                self._deprecated_rule(word)
+            elif word == "--":
+                is_ros = False
+            elif word in _FLAGS:
+                self._take(word, words)
+            elif word not in _SWITCHES:
+                unknown.append(word)
+        if unknown:
+            raise UnknownArgumentsError(f"unknown ROS arguments: {unknown}")
 
-    def _unknown(self) -> list[str]:
-        count = self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed))
-        places = POINTER(ctypes.c_int)()
-        self._rcl.rcl_arguments_get_unparsed_ros(
-            byref(self._parsed), self._allocator, byref(places)
-        )
-        words = [self.arguments[places[index]] for index in range(count)]
-        self._deallocate(ctypes.cast(places, c_void_p).value)
-        return words
+    def _deprecated_rule(self, word: str) -> None:
+        try:
+            self._rules.append(_remap_rule(word))
+        except _Fault:
+            self.others.append(word)
 
-    def _deallocate(self, address: int | None) -> None:
-        deallocate = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)(self._allocator.deallocate)
-        deallocate(address, self._allocator.state)
-
-    def __del__(self) -> None:
-        if getattr(self, "_parsed", None) is not None and self._parsed.impl:
-            self._rcl.rcl_arguments_fini(byref(self._parsed))
-
-    def _error(self, fallback: str) -> str:
-        if not self._rcl.rcutils_error_is_set():
-            return fallback
-        text: bytes = self._rcl.rcutils_get_error_string().text
-        self._rcl.rcutils_reset_error()
-        # rcl appends where in its own sources the error was raised.
-        return re.sub(r", at \S+:\d+", "", text.decode(errors="replace"))
+    def _take(self, flag: str, words: Iterator[str]) -> None:
+        what, missing = _FLAGS[flag]
+        value = next(words, None)
+        if value is None:
+            if flag == "--log-level":
+                text = f"Couldn't parse trailing log level flag: '{flag}'. No log level provided."
+            else:
+                found = "" if missing.endswith("provided") else " found"
+                text = f"Couldn't parse trailing {flag} flag. No {missing}{found}."
+            raise InvalidArgumentsError(text)
+        try:
+            if flag in ("-p", "--param"):
+                _parameter(value, self._overrides)
+            elif flag in ("-r", "--remap"):
+                self._rules.append(_remap_rule(value))
+            elif flag == "--params-file":
+                self._overrides.add_file(value)
+            elif flag == "--log-level":
+                _check_log_level(value)
+        except (_Fault, ParameterFault) as error:
+            text = f"Couldn't parse {what}: '{flag} {value}'. Error: {error}"
+            raise InvalidArgumentsError(text) from error
 
     def log_levels(self) -> dict[str, str]:
         """Return the levels of ``--log-level`` by logger, ``""`` for all."""
@@ -223,85 +325,34 @@ class RosArguments:
         return said[-1].startswith("--enable") if said else None
 
     def parameters(self, node_fqn: str) -> dict[str, Any]:
-        """Return the parameter overrides for a node, later ones over earlier ones.
+        """Return the parameter overrides for a node, later ones over earlier ones."""
+        return self._overrides.of_node(node_fqn)
 
-        The rule for wildcards is rclpy's: ``/*`` stands for one level of names, ``/**`` for any
-        number (rclpy/src/rclpy/node.cpp).
-        """
-        params = POINTER(_Params)()
-        code = self._rcl.rcl_arguments_get_param_overrides(byref(self._parsed), byref(params))
-        if code != _OK:
-            raise InvalidArgumentsError(self._error("cannot read parameter overrides"))
-        values: dict[str, Any] = {}
-        if not params:
-            return values
-        try:
-            for index in range(params.contents.size):
-                pattern = params.contents.node_names[index].decode()
-                if not pattern.startswith("/"):
-                    pattern = "/" + pattern
-                pattern = pattern.replace("/*", r"(/\w+)")
-                if not re.fullmatch(pattern, node_fqn):
-                    continue
-                node = params.contents.params[index]
-                for number in range(node.size):
-                    values[node.names[number].decode()] = _value(node.values[number])
-        finally:
-            self._yaml.rcl_yaml_node_struct_fini(params)
-        return values
-
-    def _remap(self, function: Any, outer: RosArguments | None, *names: str) -> str | None:
-        output = c_void_p()
-        outer_ref = byref(outer._parsed) if outer is not None else None
-        code = function(
-            byref(self._parsed),
-            outer_ref,
-            *(name.encode() for name in names),
-            self._allocator,
-            byref(output),
-        )
-        if code != _OK:
-            raise InvalidArgumentsError(self._error(f"cannot remap {names[0]}"))
-        if not output.value:
-            return None
-        try:
-            return ctypes.string_at(output.value).decode()
-        finally:
-            self._deallocate(output.value)
+    def _remap(
+        self, kind: str, outer: RosArguments | None, old: str, name: str, namespace: str
+    ) -> str:
+        for rule in self._rules + (outer._rules if outer is not None else []):
+            if kind not in rule.kinds or rule.node not in (None, name):
+                continue
+            if not rule.match:
+                return rule.replacement
+            try:
+                if expand(rule.match, name, namespace) == old:
+                    return expand(rule.replacement, name, namespace)
+            except ValueError:
+                raise InvalidArgumentsError(f"cannot remap {old}") from None
+        return old
 
     def remap_node_name(self, name: str, outer: RosArguments | None) -> str:
         """Return the name a node gets; these arguments go before ``outer`` (global) ones."""
-        return self._remap(self._rcl.rcl_remap_node_name, outer, name) or name
+        return self._remap(_NODE, outer, name, name, "")
 
     def remap_namespace(self, namespace: str, name: str, outer: RosArguments | None) -> str:
         """Return the namespace a node of ``name`` gets."""
-        return self._remap(self._rcl.rcl_remap_node_namespace, outer, name) or namespace
+        return self._remap(_NAMESPACE, outer, namespace, name, "")
 
     def remap_topic(
         self, topic: str, name: str, namespace: str, outer: RosArguments | None, *, service: bool
     ) -> str:
         """Return what a fully qualified topic or service name becomes."""
-        function = self._rcl.rcl_remap_service_name if service else self._rcl.rcl_remap_topic_name
-        return self._remap(function, outer, topic, name, namespace) or topic
-
-
-def _value(variant: Any) -> Any:
-    if variant.bool_value:
-        return bool(variant.bool_value.contents.value)
-    if variant.integer_value:
-        return int(variant.integer_value.contents.value)
-    if variant.double_value:
-        return float(variant.double_value.contents.value)
-    if variant.string_value is not None:
-        return variant.string_value.decode()
-    if variant.byte_array_value:
-        array = variant.byte_array_value.contents
-        return [bytes([array.values[i]]) for i in range(array.size)]
-    for name in ("bool_array_value", "integer_array_value", "double_array_value"):
-        pointer = getattr(variant, name)
-        if pointer:
-            return [pointer.contents.values[i] for i in range(pointer.contents.size)]
-    if variant.string_array_value:
-        strings = variant.string_array_value.contents
-        return [strings.data[i].decode() for i in range(strings.size)]
-    return None
+        return self._remap(_SERVICE if service else _TOPIC, outer, topic, name, namespace)

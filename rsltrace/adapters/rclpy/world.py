@@ -336,6 +336,5 @@ def _fresh_rclpy(boundary: RclpyBoundary) -> Iterator[None]:
         replace_attribute(stack, rclpy.context, "g_logging_ref_count", 0)
         replace_attribute(stack, rclpy, "__executor", None)
         boundary.ros_clocks.clear()
-        boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
-        boundary.real.rclpy_logging_initialize()
+        boundary.rclpy_logging_shutdown()  # forget the log levels of an earlier run
         yield

@@ -34,6 +34,9 @@ def run_native(
     begins: Callable[[], None],
 ) -> NativeResult:
     """Run a job natively; ``shows``: with progress. ``begins`` is called first."""
+    from rsltrace.adapters.rclpy.boundary.installation import native_extension
+
+    native_extension()  # before the session's modules, which bind it
     from rsltrace.native.session import run_natively
     from rsltrace.run import RunCallbacks
 

@@ -20,7 +20,7 @@ from functools import wraps
 from types import ModuleType
 from typing import Any
 
-from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.callback_errors import exit_status
 from rsltrace.adapters.rclpy.entry import JobEntry
 from rsltrace.errors import JobError, RsltraceError
@@ -166,7 +166,7 @@ class _EntryProcess:
     def __init__(self, order: EntryOrder, link: Link) -> None:
         self._order = order
         self._link = link
-        self._observers = ProcessObservers(boundary().real)
+        self._observers = ProcessObservers(native_extension())
         self._sender: SpanSender | None = None
         self._entry: RunningEntry | None = None
         self._priorities: Priorities | None = None
@@ -190,7 +190,7 @@ class _EntryProcess:
             return 0
         if order.policy is not None and entry.argv is None:
             self._priorities = Priorities(self._observers.entities, order.rules)
-            stack.enter_context(self._priorities.watched(boundary().real))
+            stack.enter_context(self._priorities.watched(native_extension()))
         self._observers.watch()
         return self._run_node(entry) if entry.argv is None else self._run_main(entry)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace import errors
-from rsltrace.adapters.rclpy.boundary.installation import boundary
+from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.child_processes import how_ended
@@ -227,7 +227,7 @@ class MultiProcessRun(NativeRun):
             self._start(start)
         self._wait_until_ready()
         described = {
-            "middleware": boundary().real.rclpy_get_rmw_implementation_identifier(),
+            "middleware": native_extension().rclpy_get_rmw_implementation_identifier(),
             "executor": f"{EXECUTORS[self.options.executor]} per entry of the job",
             "processes": str(len(starts)),
             "domain": str(number),

@@ -1,11 +1,12 @@
 """The object that replaces rclpy's C extension during a run (``installation`` puts it there).
 
-Whatever has no side effect on the machine is passed through to the real extension: enums,
-exceptions, name validation, QoS structures, time points, log levels.
+Its enums, exceptions and structures are those of the extension if that is loaded, so that they are
+what other code in the process has, and else those in ``extension``.
 """
 
 from __future__ import annotations
 
+import os
 import weakref
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -14,7 +15,12 @@ from typing import Any
 
 from rsltrace.adapters.rclpy.actions.action_handle import ActionClientHandle, GoalHandle
 from rsltrace.adapters.rclpy.actions.server import ActionServerHandle
-from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
+from rsltrace.adapters.rclpy.arguments import (
+    InvalidArgumentsError,
+    RosArguments,
+    UnknownArgumentsError,
+)
+from rsltrace.adapters.rclpy.boundary import extension
 from rsltrace.adapters.rclpy.concurrency.runtime import Runtime
 from rsltrace.adapters.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
@@ -24,7 +30,7 @@ from rsltrace.adapters.rclpy.handles.logs import RosoutLogs
 from rsltrace.adapters.rclpy.handles.node import NodeHandle, topic_types
 from rsltrace.adapters.rclpy.handles.node_state import NodeStates
 from rsltrace.adapters.rclpy.handles.pubsub import EventHandle, PublisherHandle, SubscriptionHandle
-from rsltrace.adapters.rclpy.handles.qos_profiles import profile_of
+from rsltrace.adapters.rclpy.handles.qos_profiles import QosResult, compatibility, profile_of
 from rsltrace.adapters.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
@@ -32,11 +38,20 @@ from rsltrace.adapters.rclpy.handles.services import (
 )
 from rsltrace.adapters.rclpy.handles.timers import GuardConditionHandle, RosTimerHandle, TimerHandle
 from rsltrace.adapters.rclpy.handles.wait_set import WaitSetHandle
+from rsltrace.adapters.rclpy.log_levels import LEVELS, LogLevels
 from rsltrace.adapters.rclpy.messages.codec import codec_for
+from rsltrace.adapters.rclpy.names import (
+    expand,
+    full_topic_fault,
+    namespace_fault,
+    node_name_fault,
+    topic_fault,
+)
 from rsltrace.adapters.rclpy.node_clocks import NodeClocks
 from rsltrace.errors import UnsupportedError
 from rsltrace.simulation.middleware.graph import names_and_types
 from rsltrace.simulation.middleware.publisher import Publisher
+from rsltrace.simulation.middleware.qos.policies import Durability
 from rsltrace.simulation.middleware.qos.timing import (
     CountStatus,
     IncompatibleQosStatus,
@@ -89,9 +104,9 @@ def check_process() -> None:
         raise NeedsItsProcess
 
 
-_PASSED_THROUGH = (
+_TYPES = (
     # enums and structures
-    "ClockChange ClockType GoalEvent QoSCheckCompatibleResult QoSCompatibility "
+    "ClockChange ClockType GoalEvent QoSCompatibility "
     "RCUTILS_LOG_SEVERITY SignalHandlerOptions TransitionCallbackReturnType rcl_duration_t "
     "rcl_publisher_event_type_t rcl_subscription_event_type_t rcl_time_point_t "
     "rmw_incompatible_type_status_t rmw_qos_policy_kind_t rmw_qos_profile_t service_introspection "
@@ -99,18 +114,7 @@ _PASSED_THROUGH = (
     "RMW_QOS_LIVELINESS_LEASE_DURATION_BEST_AVAILABLE "
     # exceptions
     "InvalidHandle NodeNameNonExistentError NotImplementedError RCLError RCLInvalidROSArgsError "
-    "RCUtilsError RMWError UnknownROSArgsError UnsupportedEventTypeError TimerCancelledError "
-    # pure functions
-    "rclpy_expand_topic_name rclpy_get_validation_error_for_full_topic_name "
-    "rclpy_get_validation_error_for_namespace rclpy_get_validation_error_for_node_name "
-    "rclpy_get_validation_error_for_topic_name rclpy_remove_ros_args rclpy_qos_check_compatible "
-    "rclpy_action_get_rmw_qos_profile "
-    # log levels (rcutils keeps them per process; a run starts with fresh ones)
-    "rclpy_logging_get_logger_effective_level rclpy_logging_get_logger_level "
-    "rclpy_logging_get_logging_directory rclpy_logging_get_separator_string "
-    "rclpy_logging_initialize rclpy_logging_logger_is_enabled_for "
-    "rclpy_logging_set_logger_level rclpy_logging_severity_level_from_string "
-    "rclpy_logging_shutdown"
+    "RCUtilsError RMWError UnknownROSArgsError UnsupportedEventTypeError TimerCancelledError"
 ).split()
 
 
@@ -127,16 +131,26 @@ class BoundaryContext:
 class RclpyBoundary:
     """Stands in for the module ``rclpy._rclpy_pybind11``."""
 
-    def __init__(self, real: Any) -> None:
+    RCLError: type[Exception]
+    RCLInvalidROSArgsError: type[Exception]
+    UnknownROSArgsError: type[Exception]
+    QoSCompatibility: Any
+    InvalidHandle: type[Exception]
+    SignalHandlerOptions: Any
+    rmw_qos_profile_t: Any
+
+    def __init__(self, real: Any | None) -> None:
         self.real = real
+        """rclpy's C extension; None if it is not loaded."""
         self._world: BoundaryContext | None = None
         self._last_now_ns = 0
-        self._signals = real.SignalHandlerOptions.NO
+        self._levels = LogLevels()
         self.ros_clocks: list[weakref.ref[ClockHandle]] = []
-        for name in _PASSED_THROUGH:
-            if hasattr(real, name):
-                setattr(self, name, getattr(real, name))
-        set_invalid_handle(real.InvalidHandle)
+        for name in _TYPES:
+            if hasattr(real or extension, name):
+                setattr(self, name, getattr(real or extension, name))
+        self._signals = self.SignalHandlerOptions.NO
+        set_invalid_handle(self.InvalidHandle)
         self.Destroyable = Destroyable
         self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
         self.ClockEvent = type("ClockEvent", (ClockEventHandle,), {"boundary": self})
@@ -217,12 +231,8 @@ class RclpyBoundary:
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         check_process()
-        try:
-            context = ContextHandle(self.real, self.runtime, arguments, domain_id)
-        except UnknownArgumentsError as error:
-            raise self.real.UnknownROSArgsError(str(error)) from error
-        except InvalidArgumentsError as error:
-            raise self.real.RCLInvalidROSArgsError(str(error)) from error
+        with self._argument_errors():
+            context = ContextHandle(self, self.runtime, arguments, domain_id)
         programs = self.runtime.programs
         if programs.main_context is None:
             programs.main_context = context
@@ -240,7 +250,7 @@ class RclpyBoundary:
     ) -> NodeHandle:
         world = self.world
         return NodeHandle(
-            self.real,
+            self,
             world.runtime,
             world.logs,
             world.states,
@@ -277,8 +287,8 @@ class RclpyBoundary:
     ) -> TimerHandle:
         context.require("failed to create timer")
         if clock.follows:
-            return RosTimerHandle(self.real, context.runtime, clock, period_ns, autostart)
-        return TimerHandle(self.real, context.runtime, period_ns, autostart)
+            return RosTimerHandle(self, context.runtime, clock, period_ns, autostart)
+        return TimerHandle(self, context.runtime, period_ns, autostart)
 
     def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
         context.require("failed to create guard_condition")
@@ -292,7 +302,7 @@ class RclpyBoundary:
         return ActionServerHandle(node, *arguments)
 
     def ActionGoalHandle(self, server: ActionServerHandle, info: Any) -> GoalHandle:  # noqa: N802
-        return GoalHandle(self.real, server.goals, info)
+        return GoalHandle(self, server.goals, info)
 
     def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
         node.require_up("failed to create action client")
@@ -320,7 +330,7 @@ class RclpyBoundary:
         try:
             return node.resolve(name, service=is_service, only_expand=only_expand)
         except ValueError as error:
-            raise self.real.RCLError(str(error)) from error
+            raise self.RCLError(str(error)) from error
 
     def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
         return node.resolve(topic, service=False)
@@ -363,6 +373,38 @@ class RclpyBoundary:
     ) -> list[dict[str, Any]]:
         return [_endpoint_info(s, _SUBSCRIPTION) for s in node.usable_graph.subscriptions(topic)]
 
+    rclpy_expand_topic_name = staticmethod(expand)
+    rclpy_get_validation_error_for_full_topic_name = staticmethod(full_topic_fault)
+    rclpy_get_validation_error_for_namespace = staticmethod(namespace_fault)
+    rclpy_get_validation_error_for_node_name = staticmethod(node_name_fault)
+    rclpy_get_validation_error_for_topic_name = staticmethod(topic_fault)
+
+    def rclpy_remove_ros_args(self, arguments: list[str] | None) -> list[str]:
+        with self._argument_errors("Failed to parse ROS arguments: "):
+            return RosArguments(arguments or []).others
+
+    @contextmanager
+    def _argument_errors(self, prefix: str = "") -> Iterator[None]:
+        """Raise rclpy's exceptions for arguments that rcl would refuse."""
+        try:
+            yield
+        except UnknownArgumentsError as error:
+            raise self.UnknownROSArgsError(str(error)) from error
+        except InvalidArgumentsError as error:
+            raise self.RCLInvalidROSArgsError(f"{prefix}{error}") from error
+
+    # -- QoS ---------------------------------------------------------------------------------------
+
+    def rclpy_qos_check_compatible(self, publisher: Any, subscription: Any) -> QosResult:
+        number, reason = compatibility(publisher.to_dict(), subscription.to_dict())
+        return QosResult(self.QoSCompatibility(number), reason)
+
+    def rclpy_action_get_rmw_qos_profile(self, name: str) -> dict[str, Any]:
+        if name != "rcl_action_qos_profile_status_default":
+            raise RuntimeError(f"Requested unknown rmw_qos_profile: {name}")
+        profile: dict[str, Any] = self.rmw_qos_profile_t.predefined("qos_profile_default").to_dict()
+        return profile | {"depth": 1, "durability": int(Durability.TRANSIENT_LOCAL)}
+
     # -- messages ----------------------------------------------------------------------------------
 
     def rclpy_serialize(self, message: Any, message_type: Any) -> bytes:
@@ -391,6 +433,45 @@ class RclpyBoundary:
     def rclpy_logging_rosout_remove_sublogger(self, name: str, child: str) -> None:
         pass
 
+    def rclpy_logging_initialize(self) -> None:
+        pass
+
+    def rclpy_logging_shutdown(self) -> None:
+        self._levels.reset()
+
+    def rclpy_logging_set_logger_level(
+        self, name: str, level: int, detailed_error: bool = False
+    ) -> None:
+        try:
+            self._levels.set(name, int(level))
+        except ValueError as error:
+            reason = f"Failed reason: {error}"
+            text = reason if detailed_error else "Failed to set level for logger"
+            raise RuntimeError(text) from error
+
+    def rclpy_logging_get_logger_level(self, name: str) -> int:
+        return self._levels.get(name)
+
+    def rclpy_logging_get_logger_effective_level(self, name: str) -> int:
+        return self._levels.effective(name)
+
+    def rclpy_logging_logger_is_enabled_for(self, name: str, severity: int) -> bool:
+        return int(severity) >= self._levels.effective(name)
+
+    def rclpy_logging_severity_level_from_string(self, level: str) -> int:
+        try:
+            return LEVELS[level.upper()]
+        except KeyError:
+            raise RuntimeError("Failed to get severity name") from None
+
+    def rclpy_logging_get_separator_string(self) -> str:
+        return "."
+
+    def rclpy_logging_get_logging_directory(self) -> str:
+        home = os.environ.get("ROS_HOME") or os.path.join("~", ".ros")
+        folder = os.environ.get("ROS_LOG_DIR") or os.path.join(home, "log")
+        return os.path.expanduser(folder)
+
     def rclpy_logging_rcutils_log(
         self, severity: int, name: str, message: str, function: str, file: str, line: int
     ) -> None:
@@ -403,7 +484,7 @@ class RclpyBoundary:
         self._signals = options
 
     def uninstall_signal_handlers(self) -> None:
-        self._signals = self.real.SignalHandlerOptions.NO
+        self._signals = self.SignalHandlerOptions.NO
 
     def get_current_signal_handlers_options(self) -> Any:
         return self._signals
@@ -414,27 +495,6 @@ class RclpyBoundary:
     def unregister_sigint_guard_condition(self, guard: Any) -> None:
         pass
 
-
-HANDLES: dict[str, type] = {
-    "ActionClient": ActionClientHandle,
-    "ActionGoalHandle": GoalHandle,
-    "ActionServer": ActionServerHandle,
-    "Client": ClientHandle,
-    "Clock": ClockHandle,
-    "ClockEvent": ClockEventHandle,
-    "Context": ContextHandle,
-    "EventHandle": EventHandle,
-    "GuardCondition": GuardConditionHandle,
-    "LifecycleStateMachine": StateMachineHandle,
-    "Node": NodeHandle,
-    "Publisher": PublisherHandle,
-    "Service": ServiceHandle,
-    "Subscription": SubscriptionHandle,
-    "Timer": TimerHandle,
-    "TypeDescriptionService": TypeDescriptionServiceHandle,
-    "WaitSet": WaitSetHandle,
-}
-"""The classes of the objects that the boundary makes, by their names in rclpy's extension."""
 
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
 

@@ -19,11 +19,13 @@ from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
 from pathlib import Path
 from types import FrameType, ModuleType
-from typing import Any
+from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from rsltrace.adapters.rclpy.boundary.boundary import HANDLES, RclpyBoundary
+from rsltrace.adapters.rclpy import boundary as package
+from rsltrace.adapters.rclpy.boundary.boundary import RclpyBoundary
+from rsltrace.adapters.rclpy.boundary.extension import NAME
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.guard.guard import engage
 from rsltrace.guard.redirect import replace_attribute
@@ -145,8 +147,11 @@ _PACKAGE = "rosidl_generator_py"
 _LOADER = "import_type_support"
 
 
-def load_type_support() -> None:
-    """Load what messages need, before the run; it may be missing where nothing needs it."""
+def load_type_support(*, compiled: bool = True) -> None:
+    """Load what messages need, before the run; it may be missing where nothing needs it.
+
+    Without ``compiled`` type support, messages get a stand-in for it, which nothing calls.
+    """
     with warnings.catch_warnings(), suppress(ImportError):
         warnings.simplefilter("ignore")
         importlib.import_module("rosidl_parser")
@@ -154,6 +159,23 @@ def load_type_support() -> None:
             spec = find_spec(_PACKAGE)
             if spec is not None and spec.submodule_search_locations:
                 _load_in_part(spec)
+        if not compiled:
+            setattr(sys.modules[_PACKAGE], _LOADER, NotCompiled)
+
+
+class NotCompiled:
+    """Stands in for the compiled type support of a package."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __getattr__(self, name: str) -> NotCompiled:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return NotCompiled(f"{self._name}.{name}")
+
+    def __call__(self, *arguments: object) -> NoReturn:
+        raise RuntimeError(f"{self._name} is not compiled, or a simulation does not load it")
 
 
 def _load_in_part(spec: ModuleSpec) -> None:
@@ -234,16 +256,16 @@ def _quick(real: Callable[[Any, Any], None]) -> Any:
 # missing here, the run is refused before it starts.
 
 KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
-_UNUSED = {"add_to_waitset"}  # executors get no wait set here
+_USED = re.compile(rb"_rclpy\.([A-Za-z]\w*)")
+_IN_A_COMMENT = {b"rclpy_init", b"rclpy_ok"}
 
 
-def check_release(real: Any, replacement: Any, handles: dict[str, type], package: Path) -> None:
-    """Raise SetupError if rclpy uses a name of the extension that is missing here.
+def check_release(replacement: Any, package: Path) -> None:
+    """Raise SetupError if rclpy uses a name of its extension that is missing in ``replacement``.
 
-    ``real`` is the extension, ``replacement`` the object in its place, ``handles`` are the classes
-    of the objects it makes by their names, ``package`` is the folder of rclpy's sources.
+    ``package`` is the folder of rclpy's sources.
     """
-    missing = missing_parts(real, replacement, handles, package)
+    missing = missing_parts(replacement, package)
     if missing:
         raise SetupError(
             f"this version of rsltrace cannot simulate the rclpy in {package}: it uses "
@@ -253,50 +275,73 @@ def check_release(real: Any, replacement: Any, handles: dict[str, type], package
         )
 
 
-def missing_parts(
-    real: Any, replacement: Any, handles: dict[str, type], package: Path
-) -> list[str]:
+def missing_parts(replacement: Any, package: Path) -> list[str]:
     """Return the names of the extension that rclpy's sources use and that are missing, sorted."""
-    # Sources also mention names for type checkers; the extension has none of those.
-    lacking = [
-        (rf"\b_rclpy\.{name}\b", name)
-        for name in dir(real)
-        if name[0].isalpha() and not hasattr(replacement, name)
-    ]
-    for name, handle in handles.items():
-        for method in vars(getattr(real, name, object)):
-            if method[0].isalpha() and method not in _UNUSED and not hasattr(handle, method):
-                lacking.append((rf"\.{method}\(", f"{name}.{method}"))
-    if not lacking:
-        return []
-    sources = "\n".join(path.read_text("utf-8", "replace") for path in package.rglob("*.py"))
-    return sorted(name for use, name in lacking if re.search(use, sources))
+    used = set()
+    for path in package.rglob("*.py"):
+        source = path.read_bytes()
+        for found in _USED.finditer(source):
+            if source[found.start() - 1] not in b"'\"[":  # else: in a text for type checkers
+                used.add(found[1])
+    names = map(bytes.decode, used - _IN_A_COMMENT)
+    return sorted(name for name in names if not hasattr(replacement, name))
 
 
 _installed: RclpyBoundary | None = None
 
 
 def boundary() -> RclpyBoundary:
-    """Return the boundary, loading rclpy's extension (but no rclpy module that binds it).
+    """Return the boundary; rclpy's modules bind it, or its extension if that is loaded.
 
-    :raises SetupError: if rclpy is not installed or cannot be loaded.
+    :raises SetupError: if rclpy is not installed or cannot be simulated.
     """
     global _installed
     if _installed is None:
+        ours = RclpyBoundary(_extension())
+        if ours.real is None:
+            sys.modules[NAME] = cast(ModuleType, ours)
         try:
             from rclpy.impl import implementation_singleton as singleton
         except ImportError as error:
+            del sys.modules[NAME]
             raise SetupError(
                 "rclpy is not installed for this Python: install the ROS wheels with "
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
                 f"({error})"
             ) from error
-        load_type_support()
-        real = singleton.rclpy_implementation
-        ours = RclpyBoundary(real)
-        check_release(real, ours, HANDLES, Path(singleton.__file__).parents[1])
+        load_type_support(compiled=ours.real is not None)
+        check_release(ours, Path(singleton.__file__).parents[1])
         _installed = ours
     return _installed
+
+
+def _extension() -> Any | None:
+    """Return rclpy's C extension; None if nothing needs it, or it cannot be loaded."""
+    if not (package.loads_extension or NAME in sys.modules):
+        return None
+    try:
+        from rclpy.impl.implementation_singleton import rclpy_implementation
+    except ImportError:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "rclpy"]:
+            del sys.modules[name]
+        return None
+    return rclpy_implementation
+
+
+def native_extension() -> Any:
+    """Return rclpy's C extension, for a native run.
+
+    :raises SetupError: if it is absent.
+    """
+    package.loads_extension = True
+    real = boundary().real
+    if real is None:
+        raise SetupError(
+            "a native run needs the compiled parts of ROS 2, which are not installed for this "
+            "Python: install the ROS wheels with `pip install 'rsltrace[ros]'`, or source a ROS 2 "
+            "installation"
+        )
+    return real
 
 
 def check_no_simulation() -> None:
@@ -315,16 +360,19 @@ def check_no_simulation() -> None:
 def installed() -> Iterator[RclpyBoundary]:
     """Let rclpy use the simulated middleware within the ``with`` block."""
     ours = boundary()
-    _swap_extension(ours.real, ours)
+    _bind(ours)
     try:
         with quick_log_callers(), quick_id_texts(), quick_publish():
             yield ours
     finally:
-        _swap_extension(ours, ours.real)
+        _bind(ours.real or ours)
 
 
-def _swap_extension(old: Any, new: Any) -> None:
-    for module in list(sys.modules.values()):
+def _bind(new: Any) -> None:
+    """Let rclpy's modules use the boundary, or its extension."""
+    ours = boundary()
+    old = ours if new is ours.real else ours.real
+    for module in list(sys.modules.values()) if ours.real is not None else ():
         names = getattr(module, "__dict__", None)
         if not isinstance(names, dict) or module is sys.modules[__name__]:
             continue

@@ -78,9 +78,10 @@ def installed_type_hash(name: str) -> str | None:
 
 
 def installed_description(name: str) -> Any:
-    """Return the type description in an interface's JSON file, as attributes, or None."""
+    """Return the type description in the JSON file of an interface, which has its parts, too, as
+    attributes, or None."""
     package, kind, type_ = name.split("/")
-    path = _installed_file(package, kind, f"{type_}.json")
+    path = _installed_file(package, kind, f"{type_.partition('_')[0]}.json")
     if path is None:
         return None
     return json.loads(path.read_text("utf-8"), object_hook=lambda item: SimpleNamespace(**item))
