@@ -274,11 +274,10 @@ _SUFFIXES = tuple(EXTENSION_SUFFIXES)
 
 _dlopen: Callable[..., int] = copy_of(_ctypes.dlopen)  # type: ignore[arg-type]
 _dlsym: Callable[..., int] = copy_of(_ctypes.dlsym)  # type: ignore[arg-type]
-if hasattr(os, "sched_setaffinity"):
+_HAS_AFFINITY = hasattr(os, "sched_setaffinity")
+if _HAS_AFFINITY:
     _may_use = copy_of(os.sched_getaffinity)  # type: ignore[arg-type]
     _use = copy_of(os.sched_setaffinity)  # type: ignore[arg-type]
-else:  # not Linux
-    _may_use = _use = None
 
 _without: set[str] = set()
 """Files of this process that are known to have no TBB."""
@@ -345,7 +344,7 @@ class _TbbThreads:
 
 def _asked_on_one_processor(processors: Callable[[None], int]) -> int:
     """Let TBB ask for the number of processors; return the number it knows."""
-    if _use is None:
+    if not _HAS_AFFINITY:
         return processors(None)
     before = _may_use(0)
     try:
