@@ -69,7 +69,8 @@ def _killed_by_third() -> Iterator[None]:
 
     reading, writing = map(PrivateDescriptor, os.pipe())
     os.set_blocking(writing.number, False)
-    read, wake_up = copy_of(os.read), copy_of(_signal.set_wakeup_fd)  # not those of nodes
+    wake_up = copy_of(_signal.set_wakeup_fd)  # not that of nodes
+    read = copy_of(os.read)  # type: ignore[arg-type]
 
     def count() -> None:
         came = 0
