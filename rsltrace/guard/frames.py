@@ -22,6 +22,7 @@ from rsltrace.guard.redirect import method_of
 _WORDS_BEFORE = {"__repr__": 11, "__iter__": 27, "__init__": 37, "__new__": 39, "vectorcall": 50}
 """The offsets of a CPython type's slots, in words, at least since 3.9; checked."""
 _WORD = ctypes.sizeof(ctypes.c_void_p)
+_New = ctypes.PYFUNCTYPE(*(ctypes.py_object,) * 4)
 
 
 class _HasNone:
@@ -80,7 +81,7 @@ def replace_special_method(
     if by_name is None or slot is None or slot == by_name:
         return
     if name == "__new__":  # the member itself calls what is in the slot
-        new = ctypes.PYFUNCTYPE(*(ctypes.py_object,) * 4)(slot)
+        new = _New(slot)
         made = make(lambda kind, *arguments, **options: new(kind, arguments, options))
         replace_member(stack, kind, name, lambda member: staticmethod(made))
     else:
