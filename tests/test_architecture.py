@@ -366,6 +366,131 @@ def test_text_becomes_code_only_where_that_is_meant() -> None:
     assert RUNS_CODE.keys() <= found.keys(), "what no module does any more goes from the list"
 
 
+_WRITES_FILES = {
+    *("write_text", "write_bytes", "unlink", "rename", "mkdir", "makedirs", "touch", "rmdir"),
+    *("symlink_to", "hardlink_to", "rmtree", "copyfile", "copy2", "copytree", "mkfifo"),
+    *("os.replace", "os.remove", "os.symlink", "os.link", "os.truncate", "shutil.move"),
+}
+_OPENS_PORTS = {
+    *("socket.socket", "create_server", "create_connection", "start_server", "open_connection"),
+    *("TCPServer", "HTTPServer", "ThreadingHTTPServer", "debugpy.listen"),
+}
+
+
+def _opens_for_others(source: str) -> set[str]:
+    """Return what a module uses that changes files, or opens sockets."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        called = node.func
+        name = getattr(called, "attr", getattr(called, "id", ""))
+        if isinstance(called, ast.Attribute) or name.endswith("Server"):
+            found |= {name, ast.unparse(called)} & (_WRITES_FILES | _OPENS_PORTS)
+        modes = [*node.args[:2], *(w.value for w in node.keywords if w.arg in ("mode", "flags"))]
+        if name in ("open", "fdopen") and any(map(_is_for_writing, modes)):
+            found.add("open")
+    return found
+
+
+def _is_for_writing(mode: ast.expr) -> bool:
+    if isinstance(mode, ast.Constant):
+        return isinstance(mode.value, str) and bool(re.fullmatch("[rbt+]*[wax+][bt+]*", mode.value))
+    return bool(re.search("O_WRONLY|O_RDWR|O_CREAT|FLAGS", ast.unparse(mode)))
+
+
+WRITES = {
+    # Files that the command line, or the call of an API, names.
+    "rsltrace/cli/fit.py": "mkdir unlink write_bytes",
+    "rsltrace/cli/explore.py": "write_text",
+    "rsltrace/cli/output/text_file.py": "open write_text",
+    "rsltrace/cli/verify.py": "mkdir shutil.move unlink",
+    "rsltrace/debug/client.py": "copyfile unlink",  # a branch; a copy in a folder of our own
+    "rsltrace/search/explore/table.py": "mkdir os.truncate rmtree unlink write_text",
+    "rsltrace/search/history/run_record.py": "mkdir open",
+    "rsltrace/testing/golden.py": "copyfile mkdir unlink",
+    "rsltrace/trace/exports/layout.py": "open",
+    "rsltrace/trace/exports/perfetto.py": "open",
+    "rsltrace/trace/mcap/sink.py": "os.replace os.truncate unlink",
+    "rsltrace/trace/model/regular_file.py": "unlink",  # what was begun of such a file
+    "rsltrace/trace/recordings/export.py": "mkdir open rename rmtree write_text",
+    "viewer/rsltrace_viewer/rerun_export/export.py": "open",
+    # Files in folders of our own, and of the cache; traces there have numbers.
+    "rsltrace/adapters/launch/expand.py": "open rename write_bytes",
+    "rsltrace/adapters/launch/ros_launch.py": "unlink",
+    "rsltrace/adapters/processes/build.py": "rmtree write_text",
+    "rsltrace/adapters/workspace/cache.py": "mkdir rename rmtree",
+    "rsltrace/adapters/workspace/generate.py": "mkdir os.replace rmtree write_bytes write_text",
+    "rsltrace/adapters/workspace/installs.py": "mkdir symlink_to touch",
+    "rsltrace/adapters/workspace/interfaces.py": "mkdir touch write_text",
+    "rsltrace/cli/bisect.py": "copyfile mkdir",
+    "rsltrace/replay/replaying.py": "unlink",
+    "rsltrace/search/bisect/repository.py": "mkdir symlink_to",  # names in a commit of git
+    "rsltrace/search/bisect/runs.py": "mkdir",
+    "rsltrace/search/explore/cluster.py": "mkdir rmtree symlink_to unlink write_bytes",
+    "rsltrace/search/explore/outcome.py": "unlink",
+    "rsltrace/search/explore/search.py": "unlink",
+    "rsltrace/search/explore/small/causes.py": "mkdir unlink write_text",
+    "rsltrace/search/explore/small/reduction.py": "unlink",
+    "rsltrace/search/perturb.py": "mkdir symlink_to",
+    "rsltrace/search/verify.py": "unlink",
+    "rsltrace/trace/recordings/files.py": "open",  # an unpacked file of a bag
+    # Nowhere.
+    "rsltrace/adapters/rclpy/terminals/calls.py": "open",
+    "rsltrace/cli/output/exit_status.py": "open",
+    "rsltrace/search/explore/prefix.py": "open",
+    # Sockets between processes of one command, or only on this machine.
+    "rsltrace/debug/callback_pdb.py": "socket.socket",
+    "rsltrace/debug/debuggers.py": "debugpy.listen",
+    "rsltrace/debug/prompt/command_table.py": "socket.socket",
+    "rsltrace/debug/simulation.py": "socket.socket",
+    "rsltrace/debug/supervisor.py": "socket.socket",
+    "rsltrace/debug/tree.py": "socket.socket",
+    "rsltrace/forking.py": "socket.socket",
+    "rsltrace/line_protocol.py": "socket.socket",
+    "rsltrace/native/processes/child.py": "socket.socket",
+    "rsltrace/native/support.py": "socket.socket",  # is a DDS domain in use?
+    "rsltrace/search/explore/worker.py": "open socket.socket",
+    "viewer/rsltrace_viewer/rerun_export/control.py": "create_connection socket.socket",
+    "viewer/rsltrace_viewer/rerun_export/show.py": "create_connection",
+}
+"""The modules that change files or open sockets, with what they use and who names the file.
+
+No text of a trace, a bag or a server is the name of a file or an address (docs/trust.md). Before
+you add one: write a file that the user names by ``cli.output.text_file``, a trace by its writer.
+"""
+
+
+def test_files_are_written_and_ports_opened_only_where_that_is_meant() -> None:
+    """A trace, a bag or a job may come from anybody: what they say names no file to be written."""
+    root = Path(__file__).parents[1]
+    found = {}
+    for folder in ("rsltrace", "viewer"):
+        for path in (root / folder).rglob("*.py"):
+            if used := _opens_for_others(path.read_text(encoding="utf-8")):
+                found[str(path.relative_to(root))] = used
+    new = {file: used - set(WRITES.get(file, "").split()) for file, used in found.items()}
+    assert not any(new.values()), f"these write files or open ports: mend them, or list them: {new}"
+    assert WRITES.keys() <= found.keys(), "what no module does any more goes from the list"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "open(name, 'w')",
+        "path.open(mode='ab')",
+        "os.open(name, os.O_RDWR | os.O_CREAT)",
+        "path.write_text(text)",
+        "shutil.rmtree(name)",
+        "socket.socket()",
+        "asyncio.start_server(handle, host, port)",
+        "ThreadingHTTPServer(address, Handler)",
+    ],
+)
+def test_what_writes_files_or_opens_ports_is_found(source: str) -> None:
+    assert _opens_for_others(source)
+
+
 _MARKUP = {"from_markup", "Template"}
 
 

@@ -28,9 +28,9 @@ def content(path: Path) -> bytes:
     Raises whatever the mcap package raises of a file that it cannot read.
     """
     schemas: dict[int, str] = {}
-    channels: dict[int, tuple[str, str]] = {}
+    channels: dict[int, tuple[str, int]] = {}
     events: list[list[object]] = []
-    by_topic: dict[tuple[str, str], xxhash.xxh3_64] = {}
+    by_topic: dict[tuple[str, int], xxhash.xxh3_64] = {}
     with path.open("rb") as file:
         for record in StreamReader(file, validate_crcs=True).records:
             if isinstance(record, Schema):
@@ -38,7 +38,7 @@ def content(path: Path) -> bytes:
             elif isinstance(record, DataEnd):
                 break
             elif isinstance(record, Channel):
-                channels[record.id] = (record.topic, schemas.get(record.schema_id, ""))
+                channels[record.id] = (record.topic, record.schema_id)  # its schema may follow
             elif isinstance(record, Message):
                 key = channels[record.channel_id]
                 if key[0] in _FOR_PEOPLE:
@@ -49,7 +49,10 @@ def content(path: Path) -> bytes:
                 if key[0] == "/rsltrace/events":
                     row = _EVENT.unpack_from(record.data, 4)
                     events.append([row[1], row[2], row[7], f"{row[4]:016x}", f"{row[5]:016x}"])
-    topics = sorted((*key, one.hexdigest()) for key, one in by_topic.items())
+    topics = sorted(
+        (topic, schemas.get(schema, ""), one.hexdigest())
+        for (topic, schema), one in by_topic.items()
+    )
     return json.dumps({"events": events, "messages": topics}).encode()
 
 

@@ -66,7 +66,7 @@ def history(
     from rsltrace.search.history.words import as_text
 
     if output is not None:
-        check_not_input(output, [Path(one) for one in places if "://" not in one])
+        check_not_input(output, [Path(one) for one in places if "://" not in one], "history")
         form = "html" if (form, output.suffix) == ("text", ".html") else form
     bad = 0
 

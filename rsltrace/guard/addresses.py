@@ -40,10 +40,17 @@ def _report_hash(obj: object, value: int, frame: FrameType) -> int:
     if guard is not None and has_address_hash(obj):
         if code_of(frame).co_name == "__hash__":
             note_address_hash(frame)  # matters when a set of such objects is iterated
-        elif guard.is_user(frame):
+        elif guard.is_user(frame) or was_passed("hash", frame):
             kind = type(obj).__qualname__
             guard.report_user_call(NondeterminismSource.ADDRESS, f"hash() of {kind}", value, frame)
     return value
+
+
+def was_passed(name: str, frame: FrameType) -> bool:
+    """Return whether the code of a frame calls a built-in function without naming it: a caller has
+    passed the function (``heapq.nlargest(2, nodes, key=id)``)."""
+    code = code_of(frame)
+    return not any(name in names for names in (code.co_names, code.co_varnames, code.co_freevars))
 
 
 def _hashing(real: Callable[[Any], int]) -> Any:

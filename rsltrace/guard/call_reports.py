@@ -18,6 +18,7 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.addresses import was_passed
 from rsltrace.guard.callers import is_python_frame, module_of, user_frame
 from rsltrace.guard.file_report_filter import (
     SOURCE_READERS,
@@ -300,7 +301,8 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
         return
     frame: Any = caller()
     if event in _ADDRESSES:
-        if not guard.is_user(frame) and code_of(frame).co_name not in _SHOWING:
+        shows = code_of(frame).co_name in _SHOWING or was_passed(event.partition(".")[2], frame)
+        if not (shows or guard.is_user(frame)):
             return  # libraries use id() for bookkeeping
     elif user_frame(frame, guard.packages) is None:
         return

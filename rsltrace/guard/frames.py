@@ -19,9 +19,10 @@ from rsltrace.guard.redirect import method_of
 
 # Replace members of types of extension modules, which Python itself refuses.
 
-_WORDS_BEFORE = {"__repr__": 11, "__iter__": 27, "__init__": 37, "vectorcall": 50}
+_WORDS_BEFORE = {"__repr__": 11, "__iter__": 27, "__init__": 37, "__new__": 39, "vectorcall": 50}
 """The offsets of a CPython type's slots, in words, at least since 3.9; checked."""
 _WORD = ctypes.sizeof(ctypes.c_void_p)
+_New = ctypes.PYFUNCTYPE(*(ctypes.py_object,) * 4)
 
 
 class _HasNone:
@@ -29,6 +30,9 @@ class _HasNone:
 
 
 class _HasAll:
+    def __new__(cls) -> _HasAll:
+        return super().__new__(cls)
+
     def __init__(self) -> None:
         pass
 
@@ -45,7 +49,7 @@ def _slot(kind: type, name: str) -> ctypes.c_void_p:
 
 _BY_NAME = {
     name: _slot(_HasAll, name).value
-    for name in ("__repr__", "__iter__", "__init__")
+    for name in ("__repr__", "__iter__", "__init__", "__new__")
     if _slot(object, name).value == _slot(_HasNone, name).value != _slot(_HasAll, name).value
 }
 """What a slot holds if the type looks the method up by name."""
@@ -74,9 +78,14 @@ def replace_special_method(
     The type and all subclasses that inherit it are changed to look it up.
     """
     slot, by_name = _slot(kind, name).value, _BY_NAME.get(name)
-    if by_name is None or slot == by_name:
+    if by_name is None or slot is None or slot == by_name:
         return
-    replace_member(stack, kind, name, make)
+    if name == "__new__":  # the member itself calls what is in the slot
+        new = _New(slot)
+        made = make(lambda kind, *arguments, **options: new(kind, arguments, options))
+        replace_member(stack, kind, name, lambda member: staticmethod(made))
+    else:
+        replace_member(stack, kind, name, make)
     for one in _subclasses_of(kind):
         if _slot(one, name).value == slot:
             _set_slot(stack, one, name, by_name)

@@ -305,16 +305,17 @@ _SHOWING_ADDRESSES = (
     *(BuiltinMethodType, MethodWrapperType, CodeType, CellType, FrameType),
     *(ReferenceType, ProxyType, CallableProxyType, memoryview),
     *(ContextVar, Token, type(datetime.datetime_CAPI), Element),
+    *(type(hashlib.sha256()), type(ctypes.byref(ctypes.c_int()))),
     ctypes._CFuncPtr,  # type: ignore[attr-defined]
 )
-_SHOWN_ADDRESS = re.compile(r"(?<=\bat )0x[0-9a-f]{6,}")
+_SHOWN_ADDRESS = re.compile(r"(?:\bat |@ |\()(0x[0-9a-f]{6,})")
 
 
 def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     def __repr__(self: Any, /) -> str:  # noqa: N807
         text = real(self)
         guard = engaged()
-        if guard is None or " at 0x" not in text or present_import() is not None:
+        if guard is None or not _SHOWN_ADDRESS.search(text) or present_import() is not None:
             return text  # an import takes no numbers of a node: the next run may need none
         frame = caller()
         if guard.mode(NondeterminismSource.ADDRESS, frame) is GuardMode.ALLOW:
@@ -322,9 +323,9 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
         with engage(None):
             for obj in _shown_by(self):
                 address = f"0x{id(obj):x}"
-                if f"at {address}" in text:
+                if address in text:
                     text = text.replace(address, _address_text(guard, obj) or address)
-            left = next((n[0] for n in _SHOWN_ADDRESS.finditer(text) if n[0][:4] != "0x52"), None)
+            left = next((n for n in _SHOWN_ADDRESS.findall(text) if n[:4] != "0x52"), None)
         if left is not None:
             guard.shown.reported = left
             guard.report_user_call(

@@ -494,7 +494,7 @@ RULES: dict[str, Rule] = {
     **_calls(_MACHINE, "os", "sysconf", when=_of_machine),
     **_calls(_MACHINE, "_thread", "get_native_id"),
     **_calls(ENVIRONMENT, "threading", "get_native_id"),
-    **_calls(_INTERPRETER, "gc", "get_stats get_objects get_referrers"),
+    **_calls(_INTERPRETER, "gc", "get_stats get_objects get_referrers get_freeze_count"),
     **_calls(_INTERPRETER, "gc", "get_count", restore=lambda answer: answer),
     **_calls(_INTERPRETER, "tracemalloc", "get_traced_memory take_snapshot"),
     **_calls(_INTERPRETER, "sys", "getallocatedblocks getrefcount"),
@@ -598,7 +598,7 @@ C_FUNCTIONS: dict[str, NondeterminismSource] = {
         ),
         NondeterminismSource.RANDOM: (
             "rand random drand48 lrand48 mrand48 getrandom getentropy arc4random arc4random_buf "
-            "arc4random_uniform"
+            "arc4random_uniform tmpnam tempnam tmpfile mktemp mkstemp mkdtemp"
         ),
         NondeterminismSource.PID: "getpid",
         NondeterminismSource.ENVIRONMENT: (

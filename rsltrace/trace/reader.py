@@ -134,7 +134,10 @@ def check_hashes(source: ByteSource, segments: SegmentReader) -> None:
             )
         previous = int(events["chain_hash"][-1])
         outputs = segments.outputs(segment)
-        if not np.array_equal(outputs["event"], np.repeat(events["index"], events["outputs"])):
+        counts = events["outputs"]
+        if sum(counts.tolist()) != len(outputs) or not np.array_equal(
+            outputs["event"], np.repeat(events["index"], counts)
+        ):
             raise TraceError(
                 f"{source.name}: the outputs of the events from {events[0]['index']} on are not "
                 "as many as the events say; the trace was changed after it was recorded"

@@ -183,6 +183,8 @@ def test_a_folder_of_a_web_server_is_read(command: Command, tmp_path: Path) -> N
     assert done.stdout.startswith("4 runs of 1 job"), done.stderr
     assert kept.returncode == 2
     assert "cannot be written: 501" in kept.stderr
+    gone = command("history", f"{address}/").stderr
+    assert f"{address}/ cannot be read: Cannot connect" in gone
 
 
 def test_what_is_no_place_for_a_history_is_refused_before_the_run(

@@ -53,7 +53,7 @@ class Busy(Node):
     def __init__(self):
         super().__init__("busy")
         self.out = self.create_publisher(UInt64, "/done", 5)
-        free = os.environ.get("KIND") == "free"
+        free = self.declare_parameter("free", False).value or os.environ.get("KIND") == "free"
         self.group = ReentrantCallbackGroup() if free else MutuallyExclusiveCallbackGroup()
         group = {"own": self.group, "free": ReentrantCallbackGroup()}.get(os.environ.get("GROUP"))
         self.create_timer(0.1, self.work, callback_group=self.group)
@@ -235,3 +235,15 @@ def test_members_of_a_callback_group_of_another_kind(
     )
     both = "timer Busy.work and timer Busy.more with a different callback group: "
     assert f"/busy created {both}mutually exclusive 1 → reentrant 1" in rsltrace.diff(a, b).sentence
+
+
+def test_a_callback_group_that_depends_on_a_parameter(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_it = BUSY.replace(":Busy", ":Busy\n    parameters: {free: true}")
+    a = recorded(tmp_path, "a.mcap", monkeypatch, BUSY, GROUP="own")
+    b = recorded(tmp_path, "b.mcap", monkeypatch, with_it, GROUP="own")
+    sentence = rsltrace.diff(a, b).sentence
+    assert "arameter" in sentence.partition("; first effect: timer Busy.more of /busy ran")[0]
+    cause = "timer Busy.work and timer Busy.more with a different callback group: "
+    assert f"likely cause: /busy created {cause}mutually exclusive 1 → reentrant 1" in sentence

@@ -253,6 +253,10 @@ def test_a_page_does_not_replace_what_it_is_made_of(tmp_path: Path) -> None:
         assert done.exit_code == 2
         assert "is the trace itself; choose another name" in str(done.output) + done.stderr
     assert Path(b).read_bytes() == before
+    kept = tmp_path / "runs.jsonl"
+    kept.touch()
+    done = CliRunner().invoke(cli, ["history", str(kept), "-o", str(kept)])
+    assert "is the history itself; choose another name" in str(done.output) + done.stderr
 
 
 def test_numbers_too_large_for_a_half_are_drawn() -> None:

@@ -329,6 +329,32 @@ def test_a_third_interrupt_ends_a_process_that_swallows_the_second(
 
 
 @pytest.mark.long
+def test_a_third_interrupt_ends_a_recursion_that_leaves_no_room_for_handlers(
+    job_file: Any, tmp_path: Path
+) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Stuck}]\n",
+        "def f():\n"
+        "    try: f()\n"
+        "    except RecursionError: f()\n"
+        "class Stuck(Talker):\n"
+        "    def tick(self):\n"
+        "        print('stuck', flush=True)\n"
+        "        f()\n",
+    )
+    process = _start(tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "stuck\n"
+    for _ in range(3):
+        time.sleep(0.2)  # signals of one kind that wait are one
+        process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode in (130, -signal.SIGINT)  # by the thread, or by the kernel
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert not trace.complete
+
+
+@pytest.mark.long
 def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
     job_file: Any, tmp_path: Path
 ) -> None:

@@ -112,6 +112,19 @@ def test_definitions_that_the_summary_has_otherwise_are_found(
         _checked(path)
 
 
+def test_a_number_of_outputs_that_no_memory_holds_is_refused(tmp_path: Path) -> None:
+    parts = mcap_parts.take_apart(SAMPLE.read_bytes())
+    huge = struct.pack("<I", (1 << 32) - 1)
+    mcap_parts.change_messages(
+        parts, "/rsltrace/events", lambda data, nth: data[:68] + huge + data[72:]
+    )
+    mcap_parts.rehash(parts)
+    path = tmp_path / "forged.mcap"
+    path.write_bytes(mcap_parts.put_together(parts))
+    with pytest.raises(TraceError, match="not as many as the events say"):
+        _checked(path)
+
+
 def test_forging_nothing_passes(tmp_path: Path) -> None:
     _checked(_forged(tmp_path, "/push", lambda data, nth: data))
 

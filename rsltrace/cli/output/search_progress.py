@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import time
+from _thread import start_new_thread
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
@@ -38,29 +39,67 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
         if not ends:
             # By the kernel: Python runs no handler while it unwinds a very deep recursion.
             for caught in old:
-                set_handler(int(caught), int(signal.SIG_DFL))
+                set_handler(caught, _DEFAULT)
             raise KeyboardInterrupt(128 + number)
-        end, name = ends.pop(), _ENDS[signal.Signals(number)]
+        ends[-1](Stop(_ENDS[number], 128 + number))
+        ends.clear()  # not before: any of these calls may be one too many in a recursion
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):
-            what = f"{name}, closing the trace (repeat to force, twice to kill)"
+            what = f"{_ENDS[number]}, closing the trace (repeat to force, twice to kill)"
             os.write(2, f"\nrsltrace: {what}\n".encode())
-        end(Stop(name, 128 + number))
 
     for caught in _ENDS:
         if caught != signal.SIGHUP or signal.getsignal(caught) != signal.SIG_IGN:  # nohup
             old[caught] = signal.signal(caught, handle)
     try:
-        yield ends.append
+        with _killed_by_third():
+            yield ends.append
     finally:
         for caught_before, handler in old.items():
             signal.signal(caught_before, handler)
 
 
+@contextmanager
+def _killed_by_third() -> Iterator[None]:
+    """End the process at the third signal. A thread counts them, because a recursion at its limit
+    leaves no room for a handler, and may swallow what that raises."""
+    from rsltrace.forking import end_process
+    from rsltrace.guard.redirect import copy_of
+    from rsltrace.trace.mcap.descriptor import PrivateDescriptor
+
+    reading, writing = map(PrivateDescriptor, os.pipe())
+    os.set_blocking(writing.number, False)
+    wake_up = copy_of(_signal.set_wakeup_fd)  # not that of nodes
+    read = copy_of(os.read)  # type: ignore[arg-type]
+
+    def count() -> None:
+        came = 0
+        with suppress(OSError):  # a node has closed it
+            while data := read(reading.number, 1):
+                came += data[0] in _ENDS
+                if came == _KILLED_BY:
+                    end_process(128 + data[0])
+        reading.close()
+
+    before = wake_up(writing.number, warn_on_full_buffer=False)
+    _after_fork.append(lambda: wake_up(-1))  # else this process counts its child's signals
+    start_new_thread(count, ())
+    try:
+        yield
+    finally:
+        wake_up(before)
+        _after_fork.clear()
+        writing.close()
+
+
+_after_fork: list[Callable[[], object]] = []
+os.register_at_fork(after_in_child=lambda: [each() for each in _after_fork])
+_KILLED_BY = 3
+_DEFAULT = int(signal.SIG_DFL)
 _ENDS = {
-    signal.SIGINT: "interrupted",
-    signal.SIGTERM: "terminated",
-    signal.SIGHUP: "hung up",
+    int(signal.SIGINT): "interrupted",
+    int(signal.SIGTERM): "terminated",
+    int(signal.SIGHUP): "hung up",
 }
 
 

@@ -24,7 +24,7 @@ from rsltrace.diff.causes.delivery import (
     topics_of,
 )
 from rsltrace.diff.causes.event_views import EventViews
-from rsltrace.diff.causes.likely_cause import likely_cause, suppressed_exception
+from rsltrace.diff.causes.likely_cause import changed_properties, likely_cause, suppressed_exception
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.causes.propagation import (
     BUSY,
@@ -103,13 +103,13 @@ class Explainer:
 
     def explain_effect(self, found: FoundDivergence, first: Divergence) -> Divergence:
         """Return everything about the first effect of a node that was set up differently."""
-        effect = self.explain(found)
+        effect, runs = self.explain(found), (self.run_a, self.run_b)
         root = self._root_judgement(found.origin.root)
         return replace(
             effect,
             root=ROOT_OF.get(root.verdict, root.root),
             why=SameCause(first),
-            likely=suppressed_exception(effect, (self.run_a, self.run_b)),
+            likely=suppressed_exception(effect, runs) or changed_properties(effect, runs),
             settings=root.settings,
             reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
             next_step=first.next_step,

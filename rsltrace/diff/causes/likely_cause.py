@@ -33,6 +33,7 @@ from rsltrace.diff.facts.causes import (
 )
 from rsltrace.diff.facts.evidence import (
     CallDifference,
+    EntityChanges,
     EventSummary,
     MessageDifference,
     OutputOrder,
@@ -78,15 +79,8 @@ def likely_cause(
         return ExternalAnswers(subject, telling_calls(calls, judgement.messages))
     if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
         return found
-    if judgement.verdict in _OF_ORDER and judgement.changed is None:
-        nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
-        topics = topics_of(view, judgement.messages)
-        what = judgement.what  # a history of another depth: other messages are kept for later
-        lost = isinstance(what, EventInOneRun) and what.loss is None
-        with_depth = lost or what is DivergenceKind.OTHER_SENDER
-        changed = entity_changes(run_a, run_b, topics, nodes - {""}, with_depth=with_depth)
-        if changed is not None:
-            return changed
+    if (properties := changed_properties(judgement, runs)) is not None:
+        return properties
     if not judgement.is_unexplained:
         return None
     if relevance.guard_is_off:
@@ -110,6 +104,21 @@ def suppressed_exception(
         if one is not None and error_a != error_b:
             return ErrorInTransition(one.node, one.callback, one.place, error_a, error_b)
     return None
+
+
+def changed_properties(
+    judgement: Judgement, runs: tuple[ComparedTrace, ComparedTrace]
+) -> EntityChanges | None:
+    """Return the QoS and callback groups that can be behind another order of events, or time."""
+    view = judgement.one
+    if view is None or judgement.verdict not in _OF_ORDER or judgement.changed is not None:
+        return None
+    nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
+    what = judgement.what  # a history of another depth: other messages are kept for later
+    lost = isinstance(what, EventInOneRun) and what.loss is None
+    with_depth = lost or what is DivergenceKind.OTHER_SENDER
+    topics = topics_of(view, judgement.messages)
+    return entity_changes(*runs, topics, nodes - {""}, with_depth=with_depth)
 
 
 def telling_calls(

@@ -1,7 +1,7 @@
 """User modules, compiled with calls of the guard where Python offers no other hook.
 
-These are ``np.datetime64("now")``, arrays of uninitialised memory, the method ``__hash__`` and,
-from Python 3.13 on, ``[*s]`` and ``r += s`` (``set_order`` handles all other iterations over sets).
+These are ``np.datetime64("now")``, functions with ``where=``, the method ``__hash__`` and, from
+Python 3.13 on, ``[*s]`` and ``r += s`` (``set_order`` handles all other iterations over sets).
 Line numbers stay.
 """
 
@@ -21,7 +21,7 @@ from rsltrace.guard.addresses import hash_method
 from rsltrace.guard.call_reports import REPORTED_MODULES, report_functions
 from rsltrace.guard.callers import is_installed, is_rsltrace_module, is_user_file
 from rsltrace.guard.libraries import importing, is_library
-from rsltrace.guard.virtual.arrays import NEW_ARRAYS, filled
+from rsltrace.guard.virtual.arrays import filled
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.original_code import keep_source
 from rsltrace.guard.virtual.set_order import LISTS_READ_SETS, in_set_order
@@ -30,7 +30,7 @@ _ORDERED = "__rsltrace_ordered__"
 _HASH = "__rsltrace_hash__"
 _NOW = "__rsltrace_now__"
 _FILLED = "__rsltrace_filled__"
-_WORDS = (b"datetime64", b"__hash__", b"where", *map(str.encode, NEW_ARRAYS))
+_WORDS = (b"datetime64", b"__hash__", b"where")
 """A module without these words stays unchanged (before Python 3.13)."""
 _NEVER_SETS = (
     *(ast.Constant, ast.JoinedStr, ast.Compare, ast.Lambda),
@@ -47,7 +47,7 @@ class _Rewriter(ast.NodeTransformer):
         instead = ""
         if name == "datetime64" and node.args and _says_now(node.args[0]):
             instead = _NOW
-        elif (name in NEW_ARRAYS and (node.args or node.keywords)) or _leaves_some(node):
+        elif any(word.arg == "where" for word in node.keywords):
             instead = _FILLED
         if instead:
             node.args.insert(0, function)
@@ -98,11 +98,6 @@ def _in_order(node: ast.expr) -> ast.expr:
 
 def _says_now(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and node.value in ("now", "today")
-
-
-def _leaves_some(call: ast.Call) -> bool:
-    """Return whether a function of numpy may leave elements as they were."""
-    return any(word.arg == "where" for word in call.keywords)
 
 
 def rewrite(tree: ast.Module) -> None:

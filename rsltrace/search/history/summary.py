@@ -10,7 +10,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -278,6 +278,8 @@ def _files_at(address: str) -> Iterator[tuple[str, Iterable[bytes]]]:
         found = filesystem.find(path, detail=True)
         sizes = {one: about["size"] or 0 for one, about in found.items() if one.endswith(SUFFIX)}
         if not sizes:
+            with suppress(FileNotFoundError):
+                filesystem.ls(path)  # "find" is silent about a server that cannot be reached
             raise TraceError(f"{name} has no {SUFFIX} files: it is no history")
         batch: list[str] = []
         for one, size in sorted(sizes.items()):

@@ -25,7 +25,7 @@ def check_output_file(output: Path, traces: Sequence[Path], *, force: bool, exam
         raise OutputError(f"the folder {output.parent} does not exist")
 
 
-def check_not_input(output: Path, inputs: Iterable[Path]) -> None:
-    """Raise OutputError if a file that is to be written is one of those that are read."""
+def check_not_input(output: Path, inputs: Iterable[Path], what: str = "trace") -> None:
+    """Raise OutputError if a file that is to be written is one of those that are read: ``what``."""
     if output.exists() and any(one.exists() and output.samefile(one) for one in inputs):
-        raise OutputError(f"{output} is the trace itself; choose another name")
+        raise OutputError(f"{output} is the {what} itself; choose another name")

@@ -38,9 +38,9 @@ class SimExecutor(Executor):  # type: ignore[misc]
     def add_node(self, node: Any) -> bool:
         if node in self._sim_nodes:
             return False
+        handle = node.handle  # which a node that is not constructed yet does not have
         self._sim_nodes[node] = None
         node.executor = self
-        handle = node.handle
         mailbox, handle.mailbox = handle.mailbox, None
         handle.wrapper = node
         activate_node(handle)
