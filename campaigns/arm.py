@@ -67,10 +67,8 @@ def _unpack(system: Path) -> None:
         subprocess.run(["dpkg-deb", "-x", str(package), str(system)], check=True)
     shutil.rmtree(first)
     (system / "tmp").mkdir(exist_ok=True)
-    asked = [*(metadata.requires("rsltrace") or ())]
-    for distribution in _ros_wheels():
-        asked += [one for one in distribution.requires or () if not one.startswith("ros-")]
-    needed = sorted({one for one in asked if "extra ==" not in one})
+    needed = [one for one in metadata.requires("rsltrace") or () if "extra ==" not in one]
+    needed.append("pyyaml")  # rclpy's
     wheels = ROOT / "wheels"
     platforms = [f"--platform=manylinux_2_{minor}_aarch64" for minor in GLIBC]
     command = [sys.executable, "-m", "pip", "download", "-qq", "--only-binary=:all:"]
@@ -87,15 +85,13 @@ def _unpack(system: Path) -> None:
 
 def _ros_files() -> Iterator[tuple[str, Path]]:
     """Yield the files of ROS's wheels that are not compiled: path in site-packages, file here."""
-    for distribution in _ros_wheels():
+    for distribution in metadata.distributions():
+        if not distribution.metadata["Name"].startswith("ros-"):
+            continue
         for path in distribution.files or ():
             source = Path(str(distribution.locate_file(path)))
             if ".so" not in path.name and ".." not in path.parts and source.is_file():
                 yield str(path), source
-
-
-def _ros_wheels() -> list[metadata.Distribution]:
-    return [one for one in metadata.distributions() if one.metadata["Name"].startswith("ros-")]
 
 
 def _copy_project(target: Path) -> None:

@@ -71,7 +71,8 @@ def _disengage_in_child() -> None:
         guard.thread = 0  # in charge of no thread of a child
 
 
-os.register_at_fork(after_in_child=_disengage_in_child)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_disengage_in_child)
 
 
 def reporting_mode(mode: GuardMode) -> GuardMode:

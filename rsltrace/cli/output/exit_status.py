@@ -85,6 +85,13 @@ def _open_devnull(number: int) -> None:
         os.close(devnull)
 
 
+_OF_UNIX = frozenset({"fcntl", "pty", "resource", "termios"})
+"""Modules of Python that Windows has not."""
+_NEEDS_UNIX = (
+    "running nodes needs Linux or macOS (on Windows: WSL); diff, view and the like work here"
+)
+
+
 def status_of(command: Callable[[], object]) -> int:
     """Run a command, print its error and return its exit status."""
     try:
@@ -106,10 +113,13 @@ def status_of(command: Callable[[], object]) -> int:
         status = _interrupted(end)
     except OSError as error:
         status = status_without_output(error)
-    except Exception:
+    except Exception as error:
         # Python's own status would be 1, which means of some commands that runs differ.
-        tell(traceback.format_exc(), end="")
-        status = EXIT_USAGE
+        if isinstance(error, ModuleNotFoundError) and error.name in _OF_UNIX:
+            status = _failed(_NEEDS_UNIX, EXIT_USAGE)
+        else:
+            tell(traceback.format_exc(), end="")
+            status = EXIT_USAGE
     status = status if isinstance(status, int) else EXIT_USAGE if status else 0
     try:
         sys.stdout.flush()

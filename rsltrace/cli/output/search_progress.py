@@ -49,7 +49,7 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
             os.write(2, f"\nrsltrace: {what}\n".encode())
 
     for caught in _ENDS:
-        if caught != signal.SIGHUP or signal.getsignal(caught) != signal.SIG_IGN:  # nohup
+        if caught != _HANG_UP or signal.getsignal(caught) != signal.SIG_IGN:  # nohup
             old[caught] = signal.signal(caught, handle)
     try:
         with _killed_by_third():
@@ -93,14 +93,14 @@ def _killed_by_third() -> Iterator[None]:
 
 
 _after_fork: list[Callable[[], object]] = []
-os.register_at_fork(after_in_child=lambda: [each() for each in _after_fork])
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=lambda: [each() for each in _after_fork])
 _KILLED_BY = 3
 _DEFAULT = int(signal.SIG_DFL)
-_ENDS = {
-    int(signal.SIGINT): "interrupted",
-    int(signal.SIGTERM): "terminated",
-    int(signal.SIGHUP): "hung up",
-}
+_HANG_UP = getattr(signal, "SIGHUP", None)  # which Windows has not
+_ENDS = {int(signal.SIGINT): "interrupted", int(signal.SIGTERM): "terminated"}
+if _HANG_UP is not None:
+    _ENDS[int(_HANG_UP)] = "hung up"
 
 
 @contextmanager
