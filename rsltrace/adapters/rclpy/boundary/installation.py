@@ -2,6 +2,7 @@
 
 The reference ``_rclpy`` is replaced in every loaded rclpy module and in
 ``rclpy.impl.implementation_singleton`` (for modules that load later), and afterwards put back.
+Where rclpy's extension is not loaded, its modules have the boundary from the beginning.
 """
 
 from __future__ import annotations
