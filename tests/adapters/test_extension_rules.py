@@ -305,6 +305,8 @@ def test_enums_exceptions_and_profiles_are_those_of_the_extension() -> None:
     for name in [*extension._PROFILES, "qos_profile_none"]:
         profile = text_of(extension.rmw_qos_profile_t.predefined, name)
         reference = text_of(theirs.rmw_qos_profile_t.predefined, name)
+        if name == "qos_profile_rosout_default" and isinstance(reference, str):
+            continue  # from ROS 2 Kilted on
         if not isinstance(profile, str):
             profile, reference = profile.to_dict(), reference.to_dict()
         assert profile == reference

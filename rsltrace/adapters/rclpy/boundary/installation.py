@@ -304,7 +304,7 @@ def boundary() -> RclpyBoundary:
         try:
             from rclpy.impl import implementation_singleton as singleton
         except ImportError as error:
-            del sys.modules[NAME]
+            sys.modules.pop(NAME, None)
             raise SetupError(
                 "rclpy is not installed for this Python: install the ROS wheels with "
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
