@@ -14,6 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.adapters.rclpy import arguments, names
+from rsltrace.adapters.rclpy.boundary import extension
+from rsltrace.adapters.rclpy.boundary.boundary import _TYPES
+from rsltrace.adapters.rclpy.boundary.installation import boundary
 from rsltrace.adapters.rclpy.handles.qos_profiles import compatibility
 from rsltrace.adapters.rclpy.log_levels import LEVELS, LogLevels
 from tests.adapters import rcl_arguments
@@ -267,3 +270,49 @@ def test_loggers_have_the_levels_that_ros_gives_them(steps: list[tuple[str, int 
 def test_levels_have_ros_names() -> None:
     for name, level in LEVELS.items():
         assert real().rclpy_logging_severity_level_from_string(name.lower()) == level
+
+
+# -- what rclpy's modules find at import -----------------------------------------------------------
+
+
+def looks(value: Any) -> Any:
+    """Describe an enum, an exception, a structure or a constant."""
+    members = getattr(value, "__members__", None)
+    if members is not None:
+        return [
+            (name, int(one), repr(one), str(one), hash(one), one == int(one))
+            for name, one in sorted(members.items())
+        ]
+    if isinstance(value, type) and issubclass(value, Exception):
+        return [cls.__name__ for cls in value.__mro__]
+    return type(value) if isinstance(value, type) or not isinstance(value, int) else value
+
+
+def test_enums_exceptions_and_profiles_are_those_of_the_extension() -> None:
+    theirs = real()
+    for name in set(_TYPES) & set(dir(theirs)) - {"service_introspection"}:
+        ours = getattr(extension, name)
+        if "__members__" in dir(ours) or not name.islower():
+            assert looks(ours) == looks(getattr(theirs, name)), name
+        assert getattr(ours, "__module__", extension.NAME) == extension.NAME
+    states = "ServiceIntrospectionState"
+    introspection = extension.service_introspection
+    assert looks(getattr(introspection, states)) == looks(
+        getattr(theirs.service_introspection, states)
+    )
+    for code in extension.TransitionCallbackReturnType:
+        assert code.to_label() == theirs.TransitionCallbackReturnType(code.value).to_label()
+    for name in [*extension._PROFILES, "qos_profile_none"]:
+        profile = text_of(extension.rmw_qos_profile_t.predefined, name)
+        reference = text_of(theirs.rmw_qos_profile_t.predefined, name)
+        if name == "qos_profile_rosout_default" and isinstance(reference, str):
+            continue  # from ROS 2 Kilted on
+        if not isinstance(profile, str):
+            profile, reference = profile.to_dict(), reference.to_dict()
+        assert profile == reference
+    status = boundary().rclpy_action_get_rmw_qos_profile("rcl_action_qos_profile_status_default")
+    assert status == theirs.rclpy_action_get_rmw_qos_profile(
+        "rcl_action_qos_profile_status_default"
+    )
+    point = extension.rcl_time_point_t(5, theirs.ClockType.STEADY_TIME)
+    assert (point.nanoseconds, point.clock_type.name) == (5, "STEADY_TIME")

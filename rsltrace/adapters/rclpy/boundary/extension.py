@@ -211,9 +211,9 @@ class rmw_qos_profile_t:  # noqa: N801
         if name not in _PROFILES:
             raise ValueError(f"Requested unknown rmw_qos_profile: {name}")
         history, depth, reliability, durability, liveliness, limit_ns = _PROFILES[name]
-        limit, forever = rcl_duration_t(limit_ns), rcl_duration_t(0)
+        limit, lifespan = rcl_duration_t(limit_ns), rcl_duration_t(_LIFESPANS_NS.get(name, 0))
         return rmw_qos_profile_t(
-            *(history, depth, reliability, durability, forever, limit, liveliness, limit), False
+            *(history, depth, reliability, durability, lifespan, limit, liveliness, limit), False
         )
 
 
@@ -224,11 +224,13 @@ _PROFILES = {
     "qos_profile_services_default": (1, 10, _RELIABLE, _VOLATILE, 0, 0),
     "qos_profile_parameters": (1, 1000, _RELIABLE, _VOLATILE, 0, 0),
     "qos_profile_parameter_events": (1, 1000, _RELIABLE, _VOLATILE, 0, 0),
+    "qos_profile_rosout_default": (1, 1000, _RELIABLE, Durability.TRANSIENT_LOCAL, 0, 0),
     "qos_profile_system_default": (0, 0, 0, 0, 0, 0),
     "qos_profile_unknown": (3, 0, 3, 3, 4, 0),
     "qos_profile_best_available": (1, 10, 4, 4, 5, RMW_QOS_DEADLINE_BEST_AVAILABLE),
 }
 """History, depth, reliability, durability, liveliness and limit of each profile of rmw."""
+_LIFESPANS_NS = {"qos_profile_rosout_default": 10 * 10**9}
 
 for _type in [each for each in globals().values() if isinstance(each, type)]:
     if _type.__module__ == __name__:

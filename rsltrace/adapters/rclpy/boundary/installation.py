@@ -2,6 +2,7 @@
 
 The reference ``_rclpy`` is replaced in every loaded rclpy module and in
 ``rclpy.impl.implementation_singleton`` (for modules that load later), and afterwards put back.
+Where rclpy's extension is not loaded, its modules have the boundary from the beginning.
 """
 
 from __future__ import annotations
@@ -303,7 +304,7 @@ def boundary() -> RclpyBoundary:
         try:
             from rclpy.impl import implementation_singleton as singleton
         except ImportError as error:
-            del sys.modules[NAME]
+            sys.modules.pop(NAME, None)
             raise SetupError(
                 "rclpy is not installed for this Python: install the ROS wheels with "
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
