@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import bisect_right
 from collections.abc import Iterator
 from functools import lru_cache
+from itertools import chain
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +26,7 @@ from rsltrace.trace.index import (
     read_chunk,
 )
 from rsltrace.trace.mcap.chunk import message_at
-from rsltrace.trace.mcap.records import DamageError, RecordFields, RecordSpan
+from rsltrace.trace.mcap.records import RECORD_HEAD, DamageError, RecordFields, RecordSpan
 from rsltrace.trace.mcap.source import ByteSource
 
 _CHUNKS_CACHED = 4
@@ -87,6 +88,22 @@ class PayloadReader:
                     yield channel_id, log_time, sequence, records[start:end]
             except DamageError as error:
                 raise damage_error(self._source, entry.span.offset, "the chunk", error) from error
+
+    def check(self) -> None:
+        """Raise TraceError unless each chunk has the messages of its indexes and nothing between:
+        other tools walk through it."""
+        for entry in self._chunks_with(frozenset(self._index.channels)):
+            records, at = self._read_records(entry.span), 0
+            found = [self._read_offsets(entry.span, entry.indexes.get(c), c) for c in entry.counts]
+            for offset in sorted(chain.from_iterable(found)):
+                if offset != at or at + RECORD_HEAD.size > len(records):
+                    break
+                at += RECORD_HEAD.size + RECORD_HEAD.unpack_from(records, at)[1]
+            else:
+                if at == len(records):
+                    continue
+            why = "its records are not those of its indexes"
+            raise damage_error(self._source, entry.span.offset, "the chunk", why)
 
     def messages_with_text(
         self, channel_id: int, first: int, last: int, text: bytes

@@ -341,6 +341,7 @@ class Trace:
             check_data_section(self._source, self._index.summary_start)
             check_records(self._source, self._index)
         check_hashes(self._source, self._segments)
+        self._payloads.check()
 
     @cached_property
     def entities(self) -> dict[int, Entity]:

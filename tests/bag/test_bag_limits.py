@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +52,20 @@ def test_a_compressed_message_that_takes_all_memory_is_refused(
     path = bag_maker(tmp_path / "bag", samples, compression="message", storage="sqlite3")
     monkeypatch.setattr(reader_module, "MESSAGE_BYTES_MAX", 8)
     assert "it has more than 8 bytes" in message(path)
+
+
+def test_messages_that_are_a_view_without_an_end_are_refused(
+    bag_maker: Maker, samples: Any, tmp_path: Path
+) -> None:
+    path = bag_maker(tmp_path / "bag", samples, storage="sqlite3")
+    with closing(sqlite3.connect(next(path.glob("*.db3")))) as base:
+        base.execute("ALTER TABLE messages RENAME TO m")
+        base.execute(
+            "CREATE VIEW messages AS WITH RECURSIVE c(topic_id, timestamp, data) AS "
+            "(SELECT 1, 1, x'00' UNION ALL SELECT 1, timestamp, x'00' FROM c) SELECT * FROM c"
+        )
+        base.commit()
+    assert "a database with views" in message(path)
 
 
 def test_a_metadata_file_of_any_size_is_not_parsed(

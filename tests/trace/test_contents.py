@@ -176,6 +176,20 @@ def test_a_record_that_lies_about_its_length_under_right_checksums_is_found(
         trace.check()
 
 
+def test_a_message_that_lies_about_its_length_is_found_in_every_chunk(tmp_path: Path) -> None:
+    for number, of_sample in enumerate(mcap_parts.take_apart(SAMPLE.read_bytes())):
+        if of_sample.opcode != Opcode.CHUNK:
+            continue
+        parts = mcap_parts.take_apart(SAMPLE.read_bytes())
+        data = bytearray(mcap_parts.chunk_data(parts[number]))
+        data[1] ^= 1
+        mcap_parts.set_chunk_data(parts[number], bytes(data))
+        path = tmp_path / "lies.mcap"
+        path.write_bytes(mcap_parts.put_together(parts))
+        with pytest.raises(TraceError, match="damaged"):
+            _checked(path)
+
+
 def test_a_kind_that_nobody_knows_is_told_with_the_file(tmp_path: Path) -> None:
     parts = mcap_parts.take_apart(SAMPLE.read_bytes())
     mcap_parts.change_messages(

@@ -16,6 +16,7 @@ from functools import cache
 from types import BuiltinFunctionType
 from typing import Any
 
+from rsltrace.errors import SetupError
 from rsltrace.guard.callers import module_of
 from rsltrace.guard.frames import caller, replace_special_method
 from rsltrace.guard.guard import engaged
@@ -38,19 +39,28 @@ class _Handler(ctypes.Structure):
     )
 
 
+_address_of = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
+    ("PyCapsule_GetPointer", ctypes.pythonapi)
+)
 _calloc = ctypes.cast(ctypes.CDLL(None).calloc, ctypes.c_void_p).value
 
 
 @cache
 def _handler() -> _Handler:
-    address_of = ctypes.PYFUNCTYPE(ctypes.c_void_p, ctypes.py_object, ctypes.c_char_p)(
-        ("PyCapsule_GetPointer", ctypes.pythonapi)
-    )
     core = sys.modules.get("numpy._core._multiarray_umath")
     core = core or sys.modules["numpy.core._multiarray_umath"]  # before numpy 2
-    api = (ctypes.c_void_p * (_DEFAULT_HANDLER + 1)).from_address(address_of(core._ARRAY_API, None))
+    api = (ctypes.c_void_p * (_DEFAULT_HANDLER + 1)).from_address(
+        _address_of(core._ARRAY_API, None)
+    )
     capsule = ctypes.py_object.from_address(api[_DEFAULT_HANDLER] or 0).value
-    return _Handler.from_address(address_of(capsule, b"mem_handler"))
+    handler = _Handler.from_address(_address_of(capsule, b"mem_handler"))
+    if (handler.name, handler.version) != (b"default_allocator", 1):
+        version = sys.modules["numpy"].__version__
+        raise SetupError(
+            f"numpy {version} takes memory in a way that the guard does not know; "
+            "write 'guard: false' in the job to record without it"
+        )
+    return handler
 
 
 def _zeroed(function: Callable[..., Any], /, *arguments: Any, **options: Any) -> Any:
@@ -79,8 +89,8 @@ def filled(function: Any, /, *arguments: Any, **options: Any) -> Any:
     of = getattr(function, "__self__", function)  # "outer" and "reduce" are methods
     if numpy is None or engaged() is None or not isinstance(of, numpy.ufunc):
         return function(*arguments, **options)
-    if len(arguments) <= of.nin:
-        options.setdefault("out", None)  # else numpy warns of memory that is not initialised
+    if function.__name__ != "reduce" and len(arguments) <= of.nin:
+        options.setdefault("out", (None,) * of.nout)  # else numpy warns of such memory
     return _zeroed(function, *arguments, **options)
 
 
@@ -91,6 +101,7 @@ def zeroed_arrays() -> Iterator[None]:
         if "numpy" in sys.modules:
             import numpy as np
 
+            _handler()  # now: looking for it in a callback would be a finding
             redirect(stack, np.empty, _zeroing)
             like = getattr(np.empty_like, "_implementation", None)
             if isinstance(like, BuiltinFunctionType):

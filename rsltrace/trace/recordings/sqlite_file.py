@@ -107,6 +107,8 @@ class SqliteFile:
             {"topic_id", "timestamp", "data"} <= stored
         ):
             raise BagError(f"{self.name}: a database, but not one of rosbag2 (tables are missing)")
+        if self._rows("SELECT 1 FROM sqlite_master WHERE type = 'view'"):  # it may have no end
+            raise BagError(f"{self.name}: a database with views, which rosbag2 does not make")
         counts = dict(self._rows("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
         ((self.start_ns,),) = self._rows("SELECT IFNULL(MIN(timestamp), 0) FROM messages")
         ((self.end_ns,),) = self._rows("SELECT IFNULL(MAX(timestamp), 0) FROM messages")
