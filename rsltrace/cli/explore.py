@@ -17,6 +17,7 @@ from rsltrace.cli.job_source import (
     job_options,
     job_words,
     ros_arguments_given,
+    source_name,
 )
 from rsltrace.cli.options import history_option
 from rsltrace.cli.record import default_output
@@ -205,7 +206,7 @@ def explore(
         )
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
-    source = JobSource(str(named), labelled, text, str(named.parent))
+    source = JobSource(source_name(named, launch, text), labelled, text, str(named.parent))
     given = JobArguments(words, launch, skip, overrides, None, until, False, ros_arguments_given())
     with given.recorded(history, "explore") as record:
         job = source.job()

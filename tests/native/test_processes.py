@@ -187,7 +187,10 @@ stop: {timeout: 120s}
 
 def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:
     made = "nodes: [{node: robot:Talker}]\nstop: {duration: 1s}\n"
-    assert command("record", job(tmp_path, made), "-o", "x.mcap", "--bag", "bag").returncode == 0
+    assert (
+        command("record", job(tmp_path, made), "-o", "x.mcap", "--export-bag", "bag").returncode
+        == 0
+    )
     text = "nodes: [{node: robot:Listener}]\nbags: [{path: bag, topics: [/numbers, /same]}]\n"
     simulated = command("record", job(tmp_path, text), "-o", "simulated.mcap")
     assert simulated.returncode == 0, simulated.stderr

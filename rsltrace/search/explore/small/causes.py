@@ -167,7 +167,10 @@ def moved_job(source: JobSource, parts: OverlayParts, folder: Path) -> Job:
     trial = Trial(0, parts.overlay())
     own = [*source.overrides, *overrides_of(trial)]
     name = str(folder / JOB)
-    if source.text is not None:  # there is no file: the overrides have everything
+    if source.text is not None:  # there is no file: the overrides have everything else
+        before = source.job()
+        paths = [os.path.relpath(before.resolve(path)) for path in before.search_path]
+        own.append(("--set", f"search_path={json.dumps(paths)}"))
         return job_from_text(source.text, name, folder, overrides=own)
     original = os.path.abspath(source.path)
     base = json.dumps({"base": os.path.relpath(original, folder)})
