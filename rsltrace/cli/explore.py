@@ -75,6 +75,32 @@ def _fork_after(
         raise click.BadParameter(str(error)) from None
 
 
+def budget_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the option of how long to search."""
+    return click.option(
+        "--budget",
+        default=default,
+        show_default=True,
+        metavar="N|TIME",
+        callback=_budget,
+        help="Try N runs, or search for this long (10min).",
+    )
+
+
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    metavar="W",
+    help="Run W runs in parallel (default: one per CPU).",
+)
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Write results and traces to this folder (default: the job's name with .explore).",
+)
+
+
 @click.command(cls=RosArgsCommand)
 @job_options
 @click.option(
@@ -84,29 +110,12 @@ def _fork_after(
     show_default=True,
     help="How the search chooses runs: see docs/exploring.md.",
 )
-@click.option(
-    "--budget",
-    default="1000",
-    show_default=True,
-    metavar="N|TIME",
-    callback=_budget,
-    help="Try N runs, or search for this long (10min).",
-)
+@budget_option("1000")
 @click.option("--stop-at-first", is_flag=True, help="Stop at the first run that fails.")
 @click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
 @click.option("--force", is_flag=True, help="Replace the search in the output folder.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(min=1),
-    metavar="W",
-    help="Run W runs in parallel (default: one per CPU).",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Write results and traces to this folder (default: the job's name with .explore).",
-)
+@jobs_option
+@output_option
 @click.option(
     "--depth",
     type=click.IntRange(1, 100),
@@ -366,7 +375,7 @@ class _SearchReport:
         """Write the page and the table, and print the result."""
         from rsltrace_viewer.pages.search_page import exploration_page
 
-        from rsltrace.cli.output.search_text import search_lines
+        from rsltrace.cli.output.search_text import flaky_lines, search_lines
         from rsltrace.search.explore.report.exploration import Exploration, ReducedRun
         from rsltrace.search.explore.report.formats import (
             github_text,
@@ -406,6 +415,9 @@ class _SearchReport:
             for line in search_lines(search, source, self._folder, caution=explored.caution):
                 say(line)
             self._say_small()
+        elif self._form == "flaky":
+            for line in flaky_lines(search, self._folder, self._small):
+                say(printable(line))
         else:
             texts = {"json": json_text, "junit": junit_text, "github": github_text}
             say(texts[self._form](explored))

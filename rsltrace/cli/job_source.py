@@ -42,7 +42,7 @@ class RosArgsCommand(click.Command):
             params.update(launch=launch, words=tuple(words))
         entries = [("bags", {"path": str(path)}) for path in ctx.meta.get(_BAGS, ())]
         if programs is not None:
-            from rsltrace.cli.programs import program_entry, program_name
+            from rsltrace.cli.programs import program_entries, program_name
 
             if params["launch"] is not None or params["words"]:
                 given = params["words"][0] if params["words"] else "--launch"
@@ -50,8 +50,9 @@ class RosArgsCommand(click.Command):
                     f"give {given} or programs after '--', not both (--bag, --set and --until go "
                     "with programs, too)"
                 )
-            entries = [*map(program_entry, programs), *entries]
-            ctx.meta[_PROGRAMS] = program_name(entries[0])
+            named = program_entries(programs)
+            ctx.meta[_PROGRAMS] = program_name(named[0])
+            entries = [*named, *entries]
         more = (f"{key}.+={json.dumps(entry, ensure_ascii=False)}" for key, entry in entries)
         params["overrides"] = (*more, *params["overrides"])
         return left

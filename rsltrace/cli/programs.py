@@ -18,6 +18,10 @@ from rsltrace.job.values.mappings import split_ros_arguments
 Entry = tuple[str, dict[str, Any]]
 """The key of a job (``nodes`` or ``launch``), and what is added to its list."""
 
+_PYTEST = ("pytest", "py.test")
+_RUN_PYTEST = {"main": "rsltrace.testing.plugin:run_pytest"}
+"""Pytest as a main whose failure is that of the test; alone it ends with an exit status."""
+
 _PYTHON = re.compile(r"python(3(\.\d+)?)?$")
 _FORMS = (
     "write 'ros2 run PACKAGE EXECUTABLE', 'ros2 launch PACKAGE FILE', 'python3 FILE', or the path "
@@ -25,12 +29,19 @@ _FORMS = (
 )
 
 
-def program_entry(words: Sequence[str]) -> Entry:
-    """Return the entry of a job that runs the words of a command.
+def program_entries(programs: Sequence[Sequence[str]]) -> list[Entry]:
+    """Return the entries of a job that runs commands. It ends with pytest, if that is one of them.
 
     :raises click.UsageError: they are no command that a job can run.
     :raises JobError: there is no such launch file or parameter file.
     """
+    entries = [_entry(words) for words in programs]
+    for _, values in entries if len(entries) > 1 else ():
+        values.update({"required": True} if "main" in values else {})
+    return entries
+
+
+def _entry(words: Sequence[str]) -> Entry:
     if not words:
         raise click.UsageError(f"there is no program after '--': {_FORMS}")
     if words[:2] == ["ros2", "launch"]:
@@ -44,7 +55,10 @@ def program_entry(words: Sequence[str]) -> Entry:
 
 def program_name(entry: Entry) -> str:
     """Return the name of an entry's program, for the files of its run."""
-    (_, target), *_ = entry[1].items()
+    (kind, target), *_ = entry[1].items()
+    if kind == "main":
+        words = filter(_is_python_file, entry[1].get("arguments", ()))
+        target = next(words, _PYTEST[0]).partition("::")[0]
     name = str(target).rpartition("/")[2]
     return name if entry[0] == "launch" else name.removesuffix(".py")
 
@@ -72,7 +86,7 @@ def _target(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         return {"executable": f"{rest[1]}/{rest[2]}"}, rest[3:]
     if _PYTHON.match(Path(first).name):
         if rest[:1] == ["-m"] and len(rest) > 1:
-            return {"module": rest[1]}, rest[2:]
+            return _target(rest[1:]) if rest[1] in _PYTEST else ({"module": rest[1]}, rest[2:])
         if not rest or rest[0].startswith("-"):
             raise click.UsageError(
                 f"{shlex.join(words)}: write 'python3 FILE' or 'python3 -m MODULE'"
@@ -80,6 +94,15 @@ def _target(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         return {"script": _file(rest[0])}, rest[1:]
     if Path(first).suffix in (".yaml", ".yml"):
         raise click.UsageError(f"{first} is a job, not a program: leave out the '--' before it")
+    if first == "launch_test" or any(map(_is_launch_test, words)):
+        raise click.UsageError(
+            f"{shlex.join(words)}: a launch_testing file cannot run in simulated time; name its "
+            "nodes and a pytest file with its tests: -- ros2 launch PACKAGE FILE -- pytest FILE"
+        )
+    if first in _PYTEST:
+        for word in filter(_is_python_file, rest):
+            _file(word.partition("::")[0])
+        return _RUN_PYTEST, rest
     if "/" not in first and (package := _console_script(first)):
         return {"executable": f"{package}/{first}"}, rest
     found = first if "/" in first or Path(first).is_file() else shutil.which(first)
@@ -92,6 +115,16 @@ def _target(words: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     from rsltrace.adapters.processes.build import is_python
 
     return {"script" if path.endswith(".py") or is_python(Path(path)) else "program": path}, rest
+
+
+def _is_python_file(word: str) -> bool:
+    return word.partition("::")[0].endswith(".py")
+
+
+def _is_launch_test(word: str) -> bool:
+    path = Path(word.partition("::")[0])
+    is_there = _is_python_file(word) and path.is_file()
+    return is_there and b"def generate_test_description" in path.read_bytes()
 
 
 def _file(path: str) -> str:
