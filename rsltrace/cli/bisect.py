@@ -160,8 +160,8 @@ def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
     files = [Path(word) for word in given.words if ":=" not in word]
     files += [given.launch] if given.launch is not None else []
-    if not files:
-        raise click.UsageError("Missing argument 'JOB' (or --launch FILE).")
+    if not files:  # programs
+        files = [Path("run")]
     ros = given.ros
     files += [Path(ros[at + 1]) for at, word in enumerate(ros[:-1]) if word == "--params-file"]
     return [file.parent.resolve() / file.name for file in files]

@@ -17,6 +17,7 @@ from rsltrace.cli.job_source import (
     job_options,
     job_words,
     ros_arguments_given,
+    source_name,
 )
 from rsltrace.cli.options import history_option
 from rsltrace.cli.record import default_output
@@ -74,6 +75,32 @@ def _fork_after(
         raise click.BadParameter(str(error)) from None
 
 
+def budget_option(default: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Return the option of how long to search."""
+    return click.option(
+        "--budget",
+        default=default,
+        show_default=True,
+        metavar="N|TIME",
+        callback=_budget,
+        help="Try N runs, or search for this long (10min).",
+    )
+
+
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    metavar="W",
+    help="Run W runs in parallel (default: one per CPU).",
+)
+output_option = click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Write results and traces to this folder (default: the job's name with .explore).",
+)
+
+
 @click.command(cls=RosArgsCommand)
 @job_options
 @click.option(
@@ -83,29 +110,12 @@ def _fork_after(
     show_default=True,
     help="How the search chooses runs: see docs/exploring.md.",
 )
-@click.option(
-    "--budget",
-    default="1000",
-    show_default=True,
-    metavar="N|TIME",
-    callback=_budget,
-    help="Try N runs, or search for this long (10min).",
-)
+@budget_option("1000")
 @click.option("--stop-at-first", is_flag=True, help="Stop at the first run that fails.")
 @click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
 @click.option("--force", is_flag=True, help="Replace the search in the output folder.")
-@click.option(
-    "--jobs",
-    type=click.IntRange(min=1),
-    metavar="W",
-    help="Run W runs in parallel (default: one per CPU).",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=click.Path(path_type=Path, file_okay=False),
-    help="Write results and traces to this folder (default: the job's name with .explore).",
-)
+@jobs_option
+@output_option
 @click.option(
     "--depth",
     type=click.IntRange(1, 100),
@@ -205,7 +215,7 @@ def explore(
         )
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
-    source = JobSource(str(named), labelled, text, str(named.parent))
+    source = JobSource(source_name(named, launch, text), labelled, text, str(named.parent))
     given = JobArguments(words, launch, skip, overrides, None, until, False, ros_arguments_given())
     with given.recorded(history, "explore") as record:
         job = source.job()
@@ -365,7 +375,7 @@ class _SearchReport:
         """Write the page and the table, and print the result."""
         from rsltrace_viewer.pages.search_page import exploration_page
 
-        from rsltrace.cli.output.search_text import search_lines
+        from rsltrace.cli.output.search_text import flaky_lines, search_lines
         from rsltrace.search.explore.report.exploration import Exploration, ReducedRun
         from rsltrace.search.explore.report.formats import (
             github_text,
@@ -405,6 +415,9 @@ class _SearchReport:
             for line in search_lines(search, source, self._folder, caution=explored.caution):
                 say(line)
             self._say_small()
+        elif self._form == "flaky":
+            for line in flaky_lines(search, self._folder, self._small):
+                say(printable(line))
         else:
             texts = {"json": json_text, "junit": junit_text, "github": github_text}
             say(texts[self._form](explored))

@@ -150,7 +150,7 @@ def _job_file(trace: Trace, given: Path | None) -> Path:
         return given
     name = Path(trace.job.get("name", "")).name
     for folder in (Path(trace.name).parent, Path()):
-        if name and name != "<python>" and (folder / name).is_file():
+        if name and name[0] != "<" and (folder / name).is_file():
             return folder / name
     raise TraceError(
         f"the job of {trace.name} ({name or 'without a file'}) is neither beside it nor in the "

@@ -1,4 +1,4 @@
-"""The job of a command line: a job file, a launch file, ``--set``, ``--ros-args``."""
+"""The job of a command line: a job file, a launch file, programs, ``--set``, ``--ros-args``."""
 
 from __future__ import annotations
 
@@ -18,21 +18,74 @@ if TYPE_CHECKING:
     from rsltrace.job import Job
 
 _META = "rsltrace.ros_args"
+_PROGRAMS = "rsltrace.programs"
+_BAGS = "rsltrace.bags"
+_FOLDER = "rsltrace.override_folder"
 
 
 class RosArgsCommand(click.Command):
-    """A command that takes ``--ros-args … [--]`` anywhere, as ROS programs do."""
+    """A command that takes ``--ros-args … [--]`` anywhere, as ROS programs do, and whose last words
+    may be programs, each after a ``--``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Remove the ROS arguments before click parses the others."""
+        """Remove the ROS arguments and the programs before click parses the others."""
+        args, programs = split_programs(args)
         own, ctx.meta[_META] = split_ros_arguments(args)
         left = super().parse_args(ctx, own)
-        if ctx.params.get("launch") is not None and not ctx.resilient_parsing:
+        if ctx.resilient_parsing:
+            return left
+        params = ctx.params
+        if params.get("launch") is not None:
             from rsltrace.adapters.launch.file_lookup import launch_file
 
-            launch, words = launch_file(ctx.params["launch"], ctx.params["words"])
-            ctx.params.update(launch=launch, words=tuple(words))
+            launch, words = launch_file(params["launch"], params["words"])
+            params.update(launch=launch, words=tuple(words))
+        entries = [("bags", {"path": str(path)}) for path in ctx.meta.get(_BAGS, ())]
+        if programs is not None:
+            from rsltrace.cli.programs import program_entries, program_name
+
+            if params["launch"] is not None or params["words"]:
+                given = params["words"][0] if params["words"] else "--launch"
+                raise click.UsageError(
+                    f"give {given} or programs after '--', not both (--bag, --set and --until go "
+                    "with programs, too)"
+                )
+            named = program_entries(programs)
+            ctx.meta[_PROGRAMS] = program_name(named[0])
+            entries = [*named, *entries]
+        more = (f"{key}.+={json.dumps(entry, ensure_ascii=False)}" for key, entry in entries)
+        params["overrides"] = (*more, *params["overrides"])
         return left
+
+
+def split_programs(words: Sequence[str]) -> tuple[list[str], list[list[str]] | None]:
+    """Return a command's own words, and those of the programs that follow, each after a ``--``.
+
+    The ``--`` that ends the ROS arguments of the command itself begins no program.
+    """
+    inside = False
+    for index, word in enumerate(words):
+        if word == "--" and not inside:
+            programs: list[list[str]] = []
+            for one in words[index:]:
+                if one == "--":
+                    programs.append([])
+                else:
+                    programs[-1].append(one)
+            return list(words[:index]), programs
+        inside = word != "--" and (inside or word == "--ros-args")
+    return list(words), None
+
+
+def _keep_bags(context: click.Context, option: click.Parameter, bags: Sequence[Path]) -> None:
+    for bag in bags:
+        if not bag.exists() and not context.resilient_parsing:
+            raise click.BadParameter(f"there is no bag {bag} (record --export-bag writes one)")
+    context.meta[_BAGS] = bags
+
+
+def _keep_folder(context: click.Context, option: click.Parameter, folder: Path | None) -> None:
+    context.meta[_FOLDER] = folder or Path()
 
 
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -42,7 +95,7 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
             click.argument(
                 "words",
                 nargs=-1,
-                metavar="[JOB] [NAME:=VALUE]...",
+                metavar="[JOB] [NAME:=VALUE]... [-- PROGRAM...]...",
                 shell_complete=complete_files,
             ),
             click.option(
@@ -59,6 +112,22 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
             ),
             set_option,
             click.option(
+                "--bag",
+                multiple=True,
+                type=click.Path(path_type=Path),
+                metavar="BAG",
+                expose_value=False,
+                callback=_keep_bags,
+                help="Play this recording into the run, as bags: in a job does. Repeatable.",
+            ),
+            click.option(  # of child processes, whose working directory may be another one
+                "--override-folder",
+                hidden=True,
+                type=click.Path(path_type=Path),
+                expose_value=False,
+                callback=_keep_folder,
+            ),
+            click.option(
                 "--ros-args",
                 is_flag=True,
                 expose_value=False,
@@ -69,6 +138,28 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
     ):
         function = decorate(function)
     return function
+
+
+def programs_given() -> bool:
+    """Return whether this command line names programs in place of a job."""
+    return _PROGRAMS in click.get_current_context().meta
+
+
+def bags_given() -> bool:
+    """Return whether this command line names a bag."""
+    return bool(click.get_current_context().meta[_BAGS])
+
+
+def override_folder() -> Path:
+    """Return where the paths of a command line start."""
+    return Path(click.get_current_context().meta[_FOLDER])
+
+
+def source_name(named: Path, launch: Path | None, text: str | None) -> str:
+    """Return what messages and traces call a job of ``job_words``."""
+    from rsltrace.job.fields import COMMAND_LINE
+
+    return COMMAND_LINE if text is not None and launch is None else str(named)
 
 
 def ros_arguments_given() -> tuple[str, ...]:
@@ -90,9 +181,12 @@ def job_of(
     from rsltrace.job import job_from_text, load_job
 
     named, changes, text = job_words(words, launch, skip, overrides)
+    folder = override_folder()
     if text is None:
-        return load_job(named, overrides=changes), named
-    return job_from_text(text, str(named), named.parent, overrides=changes), named
+        return load_job(named, overrides=changes, given_in=folder), named
+    return job_from_text(
+        text, source_name(named, launch, text), named.parent, overrides=changes, given_in=folder
+    ), named
 
 
 def job_words(
@@ -110,15 +204,15 @@ def job_words(
     given = dict(word.split(":=", 1) for word in words if ":=" in word)
     if len(files) > 1:
         raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
-    if not files and launch is None:
-        raise click.UsageError("Missing argument 'JOB' (or --launch FILE).")
+    if not files and launch is None and not overrides:
+        raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
     if launch is None and (given or skip):
         what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
         raise click.UsageError(f"{what}: give the launch file with --launch FILE")
     if launch is not None and launch.suffix == ".mcap":
         raise click.UsageError(f"{launch} is a trace, not a launch file")
-    named = Path(files[0]) if files else launch
-    assert named is not None
+    name = click.get_current_context().meta.get(_PROGRAMS, "run")
+    named = Path(files[0]) if files else launch or override_folder() / name
     changes = list(overrides)
     if launch is not None:
         spec: dict[str, Any] = {"file": str(launch), "arguments": given}

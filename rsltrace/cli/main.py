@@ -25,6 +25,7 @@ _COMMANDS = {
     "init": "Write a first job file from bags and nodes.",
     "verify": "Run a job many times under perturbed environments and compare.",
     "explore": "Search the callback orders of a job for runs that fail.",
+    "flaky": "Search for the callback order or delay with which a test fails.",
     "bisect": "Find the commit that changed a job's behaviour.",
     "history": "Say which jobs of a suite changed at which commit, and which fail.",
     "audit": "Scan the sources of nodes for nondeterminism.",

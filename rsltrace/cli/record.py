@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, all_overrides, job_of, job_options
+from rsltrace.cli.job_source import (
+    RosArgsCommand,
+    all_overrides,
+    bags_given,
+    job_of,
+    job_options,
+    programs_given,
+)
 from rsltrace.cli.options import json_option, no_pin_option, seed_option, until_option
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.output.search_progress import interruptible, progress
@@ -23,7 +30,7 @@ from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import READ_BY, NondeterminismSource
 from rsltrace.trace.model.texts import printable
-from rsltrace.trace.words.logs import missing_servers, silent_topics
+from rsltrace.trace.words.logs import missing_servers, silent_topics, unheard_topics
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import CheckReport
@@ -43,7 +50,7 @@ if TYPE_CHECKING:
     ".mcap).",
 )
 @click.option(
-    "--bag",
+    "--export-bag",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     help="Also write the messages to a rosbag2 bag.",
@@ -102,7 +109,7 @@ def record(
     launch: Path | None,
     skip: bool,
     output: Path | None,
-    bag: Path | None,
+    export_bag: Path | None,
     force: bool,
     seed: int | None,
     until: str | None,
@@ -149,13 +156,15 @@ def record(
     if print_job:
         _print_job(loaded)
         return
+    if programs_given() and not (quiet or as_json):
+        tell(f"the job (--print-job before '--' prints it alone):\n{loaded.to_yaml()}", end="")
     path = output or default_output(named)
-    _check_first(loaded, bag, force=force)
+    _check_first(loaded, export_bag, force=force)
     if native:
         from rsltrace.native.native_run import NativeOptions
 
         options = NativeOptions(executor or "single", processes, domain, policy)
-        _record_native(loaded, path, bag, options, force=force, quiet=quiet, as_json=as_json)
+        _record_native(loaded, path, export_bag, options, force=force, quiet=quiet, as_json=as_json)
         return
     shown_notes: list[str] = []
     result = _recorded(
@@ -174,8 +183,8 @@ def record(
         checked, checks_status = _checked(loaded, result.path)
         status = status or checks_status
         _report(result, shown_notes, checked, as_json=as_json)
-        if bag is not None:
-            _export(result.path or path, bag, force=force)
+        if export_bag is not None:
+            _export(result.path or path, export_bag, force=force)
     except OSError as error:
         status = status_without_output(error, status)
     sys.exit(status)
@@ -336,8 +345,12 @@ def _silent_topics(result: RunResult) -> list[str]:
 
     try:
         with Trace.open(result.path) as trace:
-            entities = trace.entities.values()
+            entities = list(trace.entities.values())
             found = [silent_topics(entities), missing_servers(entities)]
+            if bags_given():  # a job says itself which topics of a bag it plays
+                from rsltrace.run.plans.bags import PLAYER
+
+                found.append(unheard_topics(entities, f"/{PLAYER}"))
     except RsltraceError:
         return []  # the trace is gone
     return [f"{text}; rsltrace check shows the graph" for text in found if text]

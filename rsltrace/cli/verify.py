@@ -16,7 +16,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
+from rsltrace.cli.job_source import (
+    RosArgsCommand,
+    job_of,
+    job_options,
+    override_folder,
+    ros_arguments_given,
+)
 from rsltrace.cli.options import (
     history_option,
     json_option,
@@ -49,6 +55,9 @@ class JobArguments:
     def arguments(self, path: Callable[[str], object] = str) -> list[str]:
         """Return the arguments; ``path`` converts each path for the process that uses them."""
         found = [word if ":=" in word else str(path(word)) for word in self.words]
+        start = str(path(str(override_folder())))
+        if os.path.isabs(start):  # a child process may have another working directory
+            found += ["--override-folder", start]
         if self.launch is not None:
             found += ["--launch", str(path(str(self.launch)))]
         found += ["--skip-unsupported"] * self.skip

@@ -63,6 +63,9 @@ def _word(value: object) -> str:
 
 attach(_word, schema={"type": ["string", "number"]})
 
+COMMAND_LINE = "<command line>"
+"""The ``source_name`` of a job of programs on a command line."""
+
 
 class JobFields(JobPart):
     """The keys of a job, each by itself; ``Job`` adds what must hold between them."""

@@ -12,6 +12,7 @@ from typing import Any
 from rsltrace.adapters.launch import ros_launch
 from rsltrace.errors import JobError, ReplayError
 from rsltrace.job import Job, job_from_text, load_job
+from rsltrace.job.fields import COMMAND_LINE
 from rsltrace.job.reading.resolved import job_from_resolved
 from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
@@ -87,9 +88,9 @@ def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) ->
 
 
 def job_name(trace: Trace) -> str:
-    """Return the file name of a trace's job, or ""."""
+    """Return the file name of a trace's job, or "" if it had no file."""
     name = Path(trace.job.get("name", "")).name
-    return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
+    return "" if name[:1] == "<" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
 
 
 def job_folder_of(trace: Trace, given: Path | None) -> Path:
@@ -101,6 +102,8 @@ def job_folder_of(trace: Trace, given: Path | None) -> Path:
         if not given.is_dir():
             raise ReplayError(f"--job-folder {given}: there is no such folder")
         return given
+    if trace.job.get("name") == COMMAND_LINE:
+        return Path()
     beside = [] if "://" in trace.name else [Path(trace.name).parent]
     places = list(dict.fromkeys([*beside, Path()]))
     wanted = _folder_markers(trace)
@@ -180,7 +183,8 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     if not named and folder.resolve() != Path.cwd():
         return f"its job is in {folder}, which is not the working directory"
     if not name:
-        return "its job was made in Python, so there is no job file here that says the same"
+        made = "of a command line" if trace.job.get("name") == COMMAND_LINE else "made in Python"
+        return f"its job was {made}, so there is no job file here that says the same"
     try:
         own = _own_job(folder / name, bags=bags)
     except (JobError, OSError, RecursionError):

@@ -6,10 +6,13 @@ Loaded in every pytest run of every environment with rsltrace in it, so it impor
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -23,6 +26,7 @@ if TYPE_CHECKING:
     from rsltrace.run import RunResult
 
 _PROPERTY = "rsltrace_golden_written"
+_INTERNAL = ("_pytest.", "pluggy.")
 _NOT_IN_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
 
 
@@ -175,3 +179,35 @@ def _written(terminalreporter: Any) -> Iterator[str]:
             for name, value in getattr(report, "user_properties", ()):
                 if name == _PROPERTY:
                     yield str(value)
+
+
+class _FirstFailure:
+    """Keeps the exception of the first test that fails."""
+
+    def __init__(self) -> None:
+        self.error: BaseException | None = None
+
+    def pytest_exception_interact(self, call: pytest.CallInfo[Any]) -> None:
+        if self.error is None and call.excinfo is not None:
+            self.error = call.excinfo.value
+
+
+def _below_pytest(frames: TracebackType | None) -> TracebackType | None:
+    """Leave out the frames of pytest itself, up to the test."""
+    left = frames
+    while left is not None and left.tb_frame.f_globals.get("__name__", "").startswith(_INTERNAL):
+        left = left.tb_next
+    return left or frames
+
+
+def run_pytest() -> int:
+    """Run pytest with the words of the command line as a main of a job, all tests in this process;
+    the exception of the first test that fails is raised again, and so ends the run."""
+    words = ["-p", "no:cacheprovider", *sys.argv[1:]]
+    if importlib.util.find_spec("xdist") is not None:
+        words += ["-n", "0"]
+    first = _FirstFailure()
+    status = pytest.main(words, plugins=[first])
+    if first.error is not None:
+        raise first.error.with_traceback(_below_pytest(first.error.__traceback__))
+    return int(status)

@@ -183,16 +183,18 @@ def test_the_commands(trace: Path, tmp_path: Path) -> None:
             check=False,
         )  # fmt: skip
 
-    done = call("record", "job.yaml", "-o", "t.mcap", "--bag", "bag")
+    done = call("record", "job.yaml", "-o", "t.mcap", "--export-bag", "bag")
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "t.mcap") as opened:
         assert opened.complete
     with open_bag(tmp_path / "bag", topics=["/chatter"]) as bag:
         assert bag.topics[0].message_count == 4
-    refused = call("record", "job.yaml", "-o", "u.mcap", "--bag", "bag")
+    refused = call("record", "job.yaml", "-o", "u.mcap", "--export-bag", "bag")
     assert (refused.returncode, (tmp_path / "u.mcap").exists()) == (2, False)
     assert "cannot write the bag bag: it exists" in refused.stderr
-    assert call("record", "job.yaml", "-o", "t.mcap", "--bag", "bag", "--force").returncode == 0
+    assert (
+        call("record", "job.yaml", "-o", "t.mcap", "--export-bag", "bag", "--force").returncode == 0
+    )
     assert call("export", "t.mcap", "--bag", "other", "--topic", "/chatter").returncode == 0
     whole = (tmp_path / "t.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) - 300])

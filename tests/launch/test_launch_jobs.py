@@ -140,7 +140,7 @@ def test_words_that_do_not_fit_together(
     rsltrace: Command,
 ) -> None:
     for arguments, message in [
-        ((), "Missing argument 'JOB' (or --launch FILE)"),
+        ((), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),
         (("a.yaml", "b.yaml"), "give one JOB, not a.yaml and b.yaml"),
         (("job.yaml", "a:=1"), "a:=… is a launch argument: give the launch file with --launch"),
         (("job.yaml", "--skip-unsupported"), "--skip-unsupported: give the launch file"),

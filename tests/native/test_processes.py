@@ -185,9 +185,21 @@ stop: {timeout: 120s}
         assert made["/server"] + 200_000_000 <= made["/talk"] < made["/last"]
 
 
+def test_a_program_that_fails_is_an_error(tmp_path: Path, command: Any) -> None:
+    program = tmp_path / "fails.sh"
+    program.write_text("#!/bin/sh\necho no such symbol >&2\nexit 127\n")
+    program.chmod(0o755)
+    done = command("record", "--native", "-o", "x.mcap", "--", "./fails.sh")
+    assert done.returncode == 3
+    assert "./fails.sh ended with exit status 127, " in done.stderr
+
+
 def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:
     made = "nodes: [{node: robot:Talker}]\nstop: {duration: 1s}\n"
-    assert command("record", job(tmp_path, made), "-o", "x.mcap", "--bag", "bag").returncode == 0
+    assert (
+        command("record", job(tmp_path, made), "-o", "x.mcap", "--export-bag", "bag").returncode
+        == 0
+    )
     text = "nodes: [{node: robot:Listener}]\nbags: [{path: bag, topics: [/numbers, /same]}]\n"
     simulated = command("record", job(tmp_path, text), "-o", "simulated.mcap")
     assert simulated.returncode == 0, simulated.stderr

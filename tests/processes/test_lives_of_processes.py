@@ -129,3 +129,13 @@ def test_a_process_crashes_and_starts_again_where_the_job_says(
     entry = "    arguments: ['100']\nfaults: [{hang: /counter, at: 350ms}]"
     result = _run(tmp_path, compiled("counter.c"), entry, "hang.mcap")
     assert "job.yaml:4:10: /counter cannot hang: it is in a process of its own" in str(result.error)
+
+
+def test_the_library_of_a_message_that_was_looked_for_is_named(
+    tmp_path: Path, compiled: Callable[[str], Path], capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert _run(tmp_path, compiled("no_typesupport.c"), "").exit_code == 3
+    said = capfd.readouterr().err
+    assert "has no type support for Fast DDS: Could not load library libnosuch_msgs__" in said
+    assert "source the workspace that has its package. LD_LIBRARY_PATH is " in said
+    assert "truncated" not in said

@@ -198,7 +198,7 @@ def test_a_main_that_spins_waits_for_nothing(command: Any, job_file: Callable[..
 @pytest.mark.long
 def test_a_topic_that_is_played_and_published(command: Any, job_file: Callable[..., Path]) -> None:
     job_file(FINE)
-    done = command("record", "job.yaml", "--set", "stop.duration=3s", "--bag", "numbers")
+    done = command("record", "job.yaml", "--set", "stop.duration=3s", "--export-bag", "numbers")
     assert done.returncode == 0, done.stderr
     job_file(FINE + "bags: [numbers]\n")
     done = command("check", "job.yaml")

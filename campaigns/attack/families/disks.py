@@ -27,7 +27,7 @@ _LIMITS = Limits(cpu_s=12, rss_mib=700)
 
 _WRITING: tuple[tuple[str, ...], ...] = (
     ("record", "job.yaml", "-o", "out.mcap"),
-    ("record", "job.yaml", "-o", "out.mcap", "--bag", "bag"),
+    ("record", "job.yaml", "-o", "out.mcap", "--export-bag", "bag"),
     ("record", "job.yaml", "-o", "out.mcap", "--force"),
     ("export", "a.mcap", "-o", "bag"),
     ("diff", "a.mcap", "b.mcap", "-o", "report.txt"),
@@ -101,7 +101,7 @@ def _outputs_whole(case: Case, ran: Ran) -> list[Complaint]:
     if ran.status not in (0, 1) or (ran.status == 1 and ran.command.words[0] != "diff"):
         return []
     found = []
-    for option in ("-o", "--bag", "--export", "--graph"):
+    for option in ("-o", "--export-bag", "--export", "--graph"):
         if option in ran.command.words:
             place = case.folder / ran.command.words[ran.command.words.index(option) + 1]
             if not place.exists() or (place.is_file() and not place.stat().st_size):
@@ -196,7 +196,7 @@ def _strange_outputs(rng: Random, case: Case, corpus: Corpus) -> None:
         (
             ("record", "job.yaml", "-o", place, "--force"),
             ("record", "job.yaml", "-o", place),
-            ("record", "job.yaml", "-o", "out.mcap", "--bag", place),
+            ("record", "job.yaml", "-o", "out.mcap", "--export-bag", place),
             ("export", "a.mcap", "-o", place),
             ("export", "a.mcap", "-o", place, "--force"),
             ("diff", "a.mcap", "b.mcap", "-o", place),

@@ -144,18 +144,18 @@ def _spec(
     if node.fault:
         raise JobError(node.fault)
     words, ros_words = split_ros_arguments(node.arguments)
-    given = _RosArguments([*node.ros_arguments, *ros_words], node.where)
+    given = RosWords([*node.ros_arguments, *ros_words], node.where)
     name = given.name or node.name
     namespace = given.namespace or node.namespace
     whole = None if name is None else full_name(namespace, name)
     files, parameters = _in_order([*node.parameters, *given.parameters], whole)
-    remappings = dict(reversed([*node.remappings, *given.remappings]))  # the first one counts
+    words += ["--ros-args", *given.others] if given.others else []
     values: dict[str, Any] = {
         "name": name,
         "namespace": namespace,
         "parameters": parameters,
         "parameter_files": files,
-        "remappings": dict(reversed(remappings.items())),
+        "remappings": _first_counts([*node.remappings, *given.remappings]),
         "origin": node.where,
     }
     if node.after is not None:
@@ -195,6 +195,11 @@ def _surroundings(said: ProcessSettings) -> dict[str, Any]:
     return values
 
 
+def _first_counts(remappings: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Return remappings of which the first of a name counts, in their order."""
+    return dict(reversed(dict(reversed(remappings)).items()))
+
+
 def _in_order(
     parameters: Sequence[ParameterFilePath | dict[str, Any]], full_name: str | None
 ) -> tuple[list[str], dict[str, Any]]:
@@ -214,30 +219,46 @@ def _in_order(
     return files, values
 
 
-class _RosArguments:
-    """What ``--ros-args`` words say about one node."""
+class RosWords:
+    """What ``--ros-args`` words say about one program; ``others`` are those that no key of a job
+    says: rules for one node of it, and log options."""
 
     def __init__(self, words: Sequence[str], where: str) -> None:
         self.name: str | None = None
         self.namespace: str | None = None
         self.parameters: list[ParameterFilePath | dict[str, Any]] = []
         self.remappings: list[tuple[str, str]] = []
+        self.others: list[str] = []
         self._where = where
         rest = list(words)
         while rest:
             option = rest.pop(0)
             if option in ("--ros-args", "--"):
                 continue
-            if option in ("--enable-rosout-logs", "--disable-rosout-logs") or option.startswith(
-                ("--enable-", "--disable-")
-            ):
+            if option.startswith(("--enable-", "--disable-")):
                 continue
             if not rest:
                 raise JobError(f"the ROS argument {option} has no value", where=where)
             self._add(option, rest.pop(0))
 
+    def values(self) -> dict[str, Any]:
+        """Return the keys of an entry of a job; paths start at the working directory."""
+        whole = None if self.name is None else full_name(self.namespace, self.name)
+        files, parameters = _in_order(self.parameters, whole)
+        found = {
+            "name": self.name,
+            "namespace": self.namespace,
+            "parameters": parameters,
+            "parameter_files": [os.path.relpath(path) for path in files],
+            "remappings": _first_counts(self.remappings),
+        }
+        return {key: value for key, value in found.items() if value}
+
     def _add(self, option: str, value: str) -> None:
-        if option in ("--log-level", "--log-file-name", "--log-config-file", "-e", "--enclave"):
+        if option in ("--log-file-name", "--log-config-file", "-e", "--enclave"):
+            return
+        if option == "--log-level":
+            self.others += [option, value]
             return
         if option == "--params-file":
             path = os.path.abspath(value)
@@ -248,7 +269,9 @@ class _RosArguments:
         name, assigned, to = value.partition(":=")
         if option not in ("-r", "--remap", "-p", "--param") or not assigned:
             raise JobError(f"unknown ROS argument {option} {value}", where=self._where)
-        if option in ("-p", "--param"):
+        if ":" in name.removeprefix("rostopic://").removeprefix("rosservice://"):
+            self.others += [option, value]
+        elif option in ("-p", "--param"):
             self.parameters.append({name: inferred(to)})
         elif name in ("__node", "__name"):
             self.name = to

@@ -341,7 +341,13 @@ def program(
     libraries = [str(place) for place in library.ros.libraries]
     around = {**surroundings, _UNBUFFERED: "1", **environment}
     around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
-    around["LD_LIBRARY_PATH"] = os.pathsep.join([*libraries, *_listed(around, "LD_LIBRARY_PATH")])
+    libraries += _listed(around, "LD_LIBRARY_PATH")
+    there = os.pathsep.join(libraries).split(os.pathsep)
+    for prefix in around.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
+        place = os.path.join(prefix, "lib")
+        if prefix and place not in there and os.path.isdir(place):
+            libraries.append(place)  # set by hand: a sourced setup.bash lists it
+    around["LD_LIBRARY_PATH"] = os.pathsep.join(libraries)
     if search_path:
         around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
     if prefixes:  # what is built comes first

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.diff import diff_files
 from rsltrace.diff.report import render
 from rsltrace.search.explore.search import Explorer, SearchTally
+from rsltrace.search.explore.small.causes import FAILING, JOB, PASSING, PASSING_JOB
 from rsltrace.search.explore.trial import JobSource, TrialResult, overrides_of
 
 if TYPE_CHECKING:
     from rsltrace.diff.result import Diff
     from rsltrace.search.bisect.repository import Commit, GitRepository
     from rsltrace.search.bisect.search import BisectResult, TestedRevision
+    from rsltrace.search.explore.small.causes import ReducedFailure
 
 _FILES_MAX = 12
 Kept = tuple[Path, Path] | None
@@ -127,6 +129,7 @@ def _tried(tried: TestedRevision) -> dict[str, Any]:
 
 _CAUSES_MAX = 20
 _TEXT_MAX = 300
+_FAILURE_LINES_MAX = 3
 
 
 def search_lines(
@@ -156,6 +159,30 @@ def search_lines(
     if search.is_exhausted:
         yield "every run has been tried"
     yield f"results: {folder}; report: {folder / 'report.html'}"
+
+
+def flaky_lines(
+    search: Explorer, folder: Path, small: Mapping[str, ReducedFailure]
+) -> Iterator[str]:
+    """Yield the lines of what a search found about a test; ``small`` are its minimized failures."""
+    tally = search.tally
+    runs = f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different order')}"
+    failed = sum(tally.failures.values())
+    yield f"it failed in {failed} of {runs}" if failed else f"it never failed in {runs}"
+    for key in _by_frequency(tally)[:_CAUSES_MAX]:
+        failure, count, one = tally.first[key].failure, tally.failures[key], small.get(key)
+        assert failure is not None
+        yield f"{failure.kind}, {_counted(count, 'run')}: {key}"
+        yield from (f"  {line}" for line in failure.text.splitlines()[:_FAILURE_LINES_MAX])
+        if one is None or one.trouble:
+            yield f"  not minimized: {one.trouble if one else 'interrupted'}"
+            continue
+        yield f"  fails: rsltrace record {shlex.quote(str(one.folder / JOB))}"
+        if (one.folder / PASSING_JOB).is_file():
+            yield f"  passes: rsltrace record {shlex.quote(str(one.folder / PASSING_JOB))}"
+            traces = [str(one.folder / name) for name in (PASSING, FAILING)]
+            yield f"  compare: {shlex.join(['rsltrace', 'diff', *traces])}"
+    yield f"results: {folder}"
 
 
 def _by_frequency(tally: SearchTally) -> list[str]:

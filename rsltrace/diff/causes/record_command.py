@@ -103,8 +103,8 @@ def is_effective(trace: Trace) -> bool:
 
 
 def is_of_file(trace: Trace) -> bool:
-    """Whether the job was read from a file, not made in Python: that has no name for it."""
-    return trace.job.get("name", "") not in ("", "<python>")
+    """Whether the job was read from a file, not made in Python or of a command line."""
+    return trace.job.get("name", "")[:1] not in ("", "<")
 
 
 def options_of(trace: Trace) -> Iterator[tuple[str, str]]:

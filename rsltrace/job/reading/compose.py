@@ -113,18 +113,22 @@ class ComposedJob:
 
 
 def compose(
-    name: str, read: Callable[[str], YamlSource], overrides: Sequence[tuple[str, str]]
+    name: str,
+    read: Callable[[str], YamlSource],
+    overrides: Sequence[tuple[str, str]],
+    folder: str,
 ) -> ComposedJob:
     """Return the job of the file ``name``, which ``read`` parses, with overrides applied.
 
-    An override is (what messages call it, ``key=value``). Raises ``JobError``.
+    An override is (what messages call it, ``key=value``); its paths start at ``folder``. Raises
+    ``JobError``.
     """
     source = read(name)
     composed = ComposedJob(_root(source, name), source)
     early = JobSubstitution(None)
     composed.root = _with_others(composed.root, name, read, early, [], composed)
     for label, override in overrides:
-        composed.root = apply_override(composed.root, label, override, folder=os.getcwd())
+        composed.root = apply_override(composed.root, label, override, folder=folder)
         composed.overrides.append(f"{label} {override}")
     values = dict(composed.root.value)
     variables = values.get("vars")

@@ -89,8 +89,14 @@ LINE_MAX = 256 << 10
 """A job file of more bytes is something else."""
 
 
-def load_job(path: str | os.PathLike[str], *, overrides: Overrides = ()) -> Job:
-    """Return the job in the YAML file ``path``; relative paths in it start at its folder.
+def load_job(
+    path: str | os.PathLike[str],
+    *,
+    overrides: Overrides = (),
+    given_in: str | os.PathLike[str] = "",
+) -> Job:
+    """Return the job in the YAML file ``path``; relative paths in it start at its folder, those of
+    ``overrides`` at ``given_in`` (default: the working directory).
 
     ``overrides`` are ``key=value`` texts as of ``--set``, or pairs of what messages call one and
     the text. Imports neither rclpy nor user code.
@@ -98,7 +104,7 @@ def load_job(path: str | os.PathLike[str], *, overrides: Overrides = ()) -> Job:
     mistakes are reported together, in the order of the file.
     """
     name = os.fspath(path)
-    return _load(name, os.path.dirname(os.path.abspath(name)), _parse, overrides)
+    return _load(name, os.path.dirname(os.path.abspath(name)), _parse, overrides, (), given_in)
 
 
 def job_from_text(
@@ -108,8 +114,10 @@ def job_from_text(
     *,
     overrides: Overrides = (),
     only: Collection[str] = (),
+    given_in: str | os.PathLike[str] = "",
 ) -> Job:
-    """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``.
+    """Do ``load_job`` with the text of a job, not a file; its paths start at ``folder``, those
+    of ``overrides`` at ``given_in``.
 
     With ``only``, other keys than these are passed over: what they name need not be here.
     """
@@ -118,7 +126,7 @@ def job_from_text(
     def read(other: str) -> YamlSource:
         return parse_yaml(text, name, folder=base_dir) if other == name else _parse(other)
 
-    return _load(name, base_dir, read, overrides, only)
+    return _load(name, base_dir, read, overrides, only, given_in)
 
 
 def _load(
@@ -127,9 +135,10 @@ def _load(
     read: Callable[[str], YamlSource],
     overrides: Overrides,
     only: Collection[str] = (),
+    given_in: str | os.PathLike[str] = "",
 ) -> Job:
     labelled = [("--set", text) if isinstance(text, str) else text for text in overrides]
-    composed = compose(name, read, labelled)
+    composed = compose(name, read, labelled, os.path.abspath(given_in))
     given = plain(composed.root, base_dir)
     assert isinstance(given, dict)
 

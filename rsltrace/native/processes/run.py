@@ -363,7 +363,7 @@ class MultiProcessRun(NativeRun):
             return
         if what.respawn is not None and self._restart(what):
             self.notes.append(f"{what.name} {how} at {self._at} s, and was started again")
-        elif status < 0 and not what.may_fail:
+        elif (status < 0 or (status > 0 and what.order.command)) and not what.may_fail:
             self.fail(RunError(f"{what.name} {how}, {self._at} s after the start of the run"))
         elif not what.is_main and not what.may_fail:
             self.fail(RunError(f"{what.name} {how} in the middle of the run, at {self._at} s"))

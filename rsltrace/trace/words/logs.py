@@ -6,7 +6,7 @@ They are shown often, and loading the schema decoder takes longer than the rest 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from rsltrace.errors import TraceError
@@ -50,6 +50,16 @@ def silent_topics(entities: Iterable[Entity]) -> str:
         verb = "listen" if len(listeners) > 1 else "listens"
         return f"nobody publishes {printable(topic)}, which {_and(list(listeners))} {verb} to"
     return f"topics without a publisher: {_names_text(silent, 'topics')}"
+
+
+def unheard_topics(entities: Sequence[Entity], player: str) -> str:
+    """Return ``nobody subscribes to /scan, which a bag plays``, "" if all that the node ``player``
+    publishes is heard."""
+    players = {one.id for one in entities if one.name == player}
+    heard = {one.name for one in entities if one.kind is EntityKind.SUBSCRIPTION}
+    played = (e.name for e in entities if e.kind is EntityKind.PUBLISHER and e.node in players)
+    unheard = sorted(set(played) - heard - set(NODE_TOPICS))
+    return f"nobody subscribes to {_and(unheard)}, which a bag plays" if unheard else ""
 
 
 def missing_servers(entities: Iterable[Entity]) -> str:

@@ -7,7 +7,9 @@
 #include <rosidl_typesupport_fastrtps_cpp/message_type_support.h>
 #include <rosidl_typesupport_fastrtps_cpp/service_type_support.h>
 
+#include <cstdlib>
 #include <exception>
+#include <string>
 
 namespace rsltrace {
 
@@ -19,6 +21,7 @@ using eprosima::fastcdr::FastBuffer;
 constexpr const char *KINDS[] = {"rosidl_typesupport_fastrtps_c",
                                  "rosidl_typesupport_fastrtps_cpp"};
 constexpr std::size_t ENCAPSULATION = 4;
+constexpr std::size_t ERROR_MAX = 500;  // rcutils cuts what is longer, with a warning
 
 // "std_msgs__msg" (C) and "std_msgs::msg" (C++) are one name.
 std::string joined(const char *where, const char *name) {
@@ -31,6 +34,23 @@ std::string joined(const char *where, const char *name) {
   return text + "/" + name;
 }
 
+// Why the library that was looked for is not used, "" if the language is another one; the error is
+// reset.
+std::string why_not() {
+  const std::string text = rcutils_get_error_string().str;
+  rcutils_reset_error();
+  const bool is_other = text.find("is not supported by this library") != std::string::npos;
+  return is_other ? "" : ": " + text.substr(0, text.find(", at /"));
+}
+
+void set_not_found(const char *what, const std::string &tried) {
+  const char *folders = std::getenv("LD_LIBRARY_PATH");
+  const std::string text = std::string("the ") + what + " has no type support for Fast DDS" + tried +
+                           "; source the workspace that has its package. LD_LIBRARY_PATH is " +
+                           (folders == nullptr ? "not set" : folders);
+  RMW_SET_ERROR_MSG(text.substr(0, ERROR_MAX).c_str());
+}
+
 }  // namespace
 
 bool MessageCodec::find(const rosidl_message_type_support_t *given) {
@@ -38,15 +58,16 @@ bool MessageCodec::find(const rosidl_message_type_support_t *given) {
     RMW_SET_ERROR_MSG("no type support was given");
     return false;
   }
+  std::string tried;
   for (const char *kind : KINDS) {
     const auto *found = get_message_typesupport_handle(given, kind);
     if (found != nullptr) {
       callbacks_ = static_cast<const message_type_support_callbacks_t *>(found->data);
       return true;
     }
-    rcutils_reset_error();
+    tried += why_not();
   }
-  RMW_SET_ERROR_MSG("the message has no type support for Fast DDS: build it with rosidl's default");
+  set_not_found("message", tried);
   return false;
 }
 
@@ -91,6 +112,7 @@ bool ServiceCodec::find(const rosidl_service_type_support_t *given) {
     RMW_SET_ERROR_MSG("no type support was given");
     return false;
   }
+  std::string tried;
   for (const char *kind : KINDS) {
     const auto *found = get_service_typesupport_handle(given, kind);
     if (found != nullptr) {
@@ -98,9 +120,9 @@ bool ServiceCodec::find(const rosidl_service_type_support_t *given) {
       name = joined(service->service_namespace_, service->service_name_);
       return request.find(service->request_members_) && response.find(service->response_members_);
     }
-    rcutils_reset_error();
+    tried += why_not();
   }
-  RMW_SET_ERROR_MSG("the service has no type support for Fast DDS: build it with rosidl's default");
+  set_not_found("service", tried);
   return false;
 }
 

@@ -84,6 +84,7 @@ def _lines(
     yield ""
     if passing is not None:
         yield f"`passing.mcap` is the nearest run that passes: {printable(reduced.passing_words)}."
+        yield "`passing.yaml` repeats it."
         yield "`diff.txt` shows where the two diverge."
     else:
         yield "No run with one part less passes, so there is no `passing.mcap`."
@@ -116,6 +117,7 @@ def _one_line(result: TrialResult) -> str:
 
 
 JOB, FAILING, PASSING, DIFF = "job.yaml", "failing.mcap", "passing.mcap", "diff.txt"
+PASSING_JOB = "passing.yaml"
 README, TEST = "README.md", "test_reproduces.py"
 _OF_FOLDER = re.compile(r"[^\s()]*/((?:failing|passing)\.mcap)")
 
@@ -143,18 +145,17 @@ def _write(source: JobSource, reduced: ReducedTrial, folder: Path, timeout_s: fl
     job = moved_job(source, reduced.parts, folder)
     _put(folder / JOB, job.to_yaml())
     failing = _recorded(JobSource(str(folder / JOB)), job, folder / FAILING, timeout_s)
-    if failing.digest != reduced.result.digest:
+    if failing.digest != reduced.result.digest and not _is_moved(job, failing, reduced.result):
         raise ExploreError(
             f"{folder / JOB} does not repeat the trial (digest {failing.digest}, not "
             f"{reduced.result.digest}): they differ in something outside of the job"
         )
     passing, decides = None, ""
-    for name in (PASSING, DIFF):
+    for name in (PASSING, PASSING_JOB, DIFF):
         (folder / name).unlink(missing_ok=True)  # of an earlier one
     if reduced.passing is not None:
-        text = moved_job(source, reduced.passing, folder).to_yaml()
-        passing_source = JobSource(str(folder / JOB), (), text, str(folder))
-        passing = _recorded(passing_source, job, folder / PASSING, timeout_s)
+        _put(folder / PASSING_JOB, moved_job(source, reduced.passing, folder).to_yaml())
+        passing = _recorded(JobSource(str(folder / PASSING_JOB)), job, folder / PASSING, timeout_s)
         report, decides = _diff(folder)
         _put(folder / DIFF, report)
     _put(folder / TEST, test_module(failing))
@@ -162,12 +163,25 @@ def _write(source: JobSource, reduced: ReducedTrial, folder: Path, timeout_s: fl
     return decides
 
 
+def _is_moved(job: Job, failing: TrialResult, before: TrialResult) -> bool:
+    """Whether two runs fail alike and may differ only in the paths of programs, which their events
+    name."""
+    if failing.failure is None or before.failure is None:
+        return False
+    names_files = any(spec.script or spec.program for spec in job.nodes)
+    same = (failing.failure.kind, failing.events) == (before.failure.kind, before.events)
+    return names_files and same
+
+
 def moved_job(source: JobSource, parts: OverlayParts, folder: Path) -> Job:
     """Return the job of a trial with paths relative to ``folder``. Raises JobError."""
     trial = Trial(0, parts.overlay())
     own = [*source.overrides, *overrides_of(trial)]
     name = str(folder / JOB)
-    if source.text is not None:  # there is no file: the overrides have everything
+    if source.text is not None:  # there is no file: the overrides have everything else
+        before = source.job()
+        paths = [os.path.relpath(before.resolve(path)) for path in before.search_path]
+        own.append(("--set", f"search_path={json.dumps(paths)}"))
         return job_from_text(source.text, name, folder, overrides=own)
     original = os.path.abspath(source.path)
     base = json.dumps({"base": os.path.relpath(original, folder)})

@@ -1,0 +1,58 @@
+"""``rsltrace flaky``: search for the order or delay with which a test fails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from rsltrace.cli.explore import budget_option, explore, jobs_option, output_option
+from rsltrace.cli.job_source import RosArgsCommand, job_options, programs_given
+
+_DELAY = 'delay.default={"lognormal": {"median": "1ms", "sigma": 1.5}}'
+"""Mostly a millisecond, one in a hundred over 30 ms: messages of other topics overtake each other
+as on a loaded machine."""
+
+
+@click.command(cls=RosArgsCommand)
+@job_options
+@budget_option("100")
+@click.option("--stop-at-first", is_flag=True, help="Stop at the first run that fails.")
+@jobs_option
+@output_option
+@click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
+@click.option("--force", is_flag=True, help="Replace the search in the output folder.")
+@click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
+def flaky(overrides: tuple[str, ...], **options: Any) -> int:
+    """Run a test in many callback orders and with many delays, and keep the smallest run that
+    fails and the nearest that passes.
+
+    \b
+      rsltrace flaky -- pytest test/test_nodes.py::test_reset
+      rsltrace flaky -- ros2 launch my_robot nodes.launch.py -- pytest test/test_nodes.py
+      rsltrace flaky -- build/my_robot/test_filter
+
+    The test runs unmodified, in simulated time. It fails by an exception, an exit status, a
+    deadlock or a crash. Messages are delayed by about a millisecond, some by much more; --set
+    delay.default=T changes that.
+
+    Exit status: 0 if it never failed, 1 if it did, 2 for an error.
+    """
+    if not programs_given():
+        raise click.UsageError("name the test after '--': rsltrace flaky -- pytest FILE")
+    assert explore.callback is not None
+    status: int = explore.callback(
+        overrides=(_DELAY, *overrides),
+        strategy="mixed",
+        depth=None,
+        seed=0,
+        until=None,
+        fork_after=None,
+        timeout=None,
+        cluster=None,
+        form="flaky",
+        minimize=True,
+        history=None,
+        **options,
+    )
+    return status
