@@ -15,7 +15,7 @@ from textual.screen import Screen
 from textual.widget import Widget
 
 from rsltrace.errors import TraceError
-from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.model.texts import printable, shortened
 from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.query.tokens import QueryError
@@ -224,7 +224,7 @@ class ViewerApp(Stepping):
         if event.order:
             self.go(event.position, centre=True)
         else:
-            self.go(session.place_at_time(TimeInRun(event.position, is_absolute=True)), centre=True)
+            self.go(session.place_after(event.position), centre=True)
 
     def on_lanes_view_zoomed(self, event: LanesView.Zoomed) -> None:
         """The wheel was turned over the lanes."""

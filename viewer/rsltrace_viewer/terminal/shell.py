@@ -273,7 +273,6 @@ class Shell(App[None]):
         if session.comparison is not None:
             found = session.comparison.divergences_in(session.view, made.window, made.columns)
             first, divergences = found
-        lanes.base_ns = session.a.base_ns
         lanes.show(
             made, position, own=session.own_lane(), divergence=first, divergences=divergences
         )
