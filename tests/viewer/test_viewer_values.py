@@ -305,6 +305,16 @@ def test_times_since_1970_count_from_the_start(tmp_path: Path, drive: Callable[.
             feeder.event(EventKind.TIMER, timer, stamp)
         feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
 
+    session = Session(Run.open(path), Run.open(SAMPLES / "schedule" / "a.mcap"))
+    lanes, position = session.lanes(50)
+    assert lanes.window.end < 20_000_000_000  # each run from its own start
+    assert {lane.run for lane in lanes.lanes if any(lane.levels[:2])} == {"a", "b"}
+    session.go(session.show_event(40, other=False))
+    assert session.lanes(50)[1] == 4_000_000_000
+    assert session.current() == (session.a, 40)
+    assert session.place_after(4_000_000_000) == session.view.place_of(40)
+    session.close()
+
     async def steps(viewer: Any) -> None:
         assert "17000000" not in viewer.text.split("\n", 1)[1].partition("event 0")[0]
         assert "from 2023-11-14 22:13:20 UTC" in viewer.text

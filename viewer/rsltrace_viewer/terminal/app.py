@@ -263,7 +263,7 @@ class ViewerApp(Stepping):
         if self.focused is self.lanes:
             self._more_lanes += step
         else:
-            share = self._share or (7 if self.size.width >= WIDE else 6)
+            share = self._share or (8 if self.size.width >= WIDE else 6)
             share += step if self.focused is self.timeline else -step
             self._share = max(2, min(share, SHARES - 2))
         self._fit(self.size.width, self.size.height)

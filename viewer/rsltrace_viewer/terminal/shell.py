@@ -58,8 +58,8 @@ class Shell(App[None]):
     #source { height: 1fr; width: 1fr; display: none; }
     .with-source #source { display: block; }
     .wide #body { layout: horizontal; }
-    .wide #timeline { height: 1fr; width: 5fr; }
-    .wide #detail { layout: vertical; width: 3fr; height: 1fr; border-left: solid $panel; }
+    .wide #timeline { height: 1fr; width: 2fr; }
+    .wide #detail { layout: vertical; width: 1fr; height: 1fr; border-left: solid $panel; }
     .wide #inspector { height: 5fr; }
     .wide #source { height: 4fr; }
     .low #lanes { display: none; }
