@@ -306,7 +306,7 @@ def test_times_since_1970_count_from_the_start(tmp_path: Path, drive: Callable[.
         feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
 
     session = Session(Run.open(path), Run.open(SAMPLES / "schedule" / "a.mcap"))
-    lanes, position = session.lanes(50)
+    lanes, _ = session.lanes(50)
     assert lanes.window.end < 20_000_000_000  # each run from its own start
     assert {lane.run for lane in lanes.lanes if any(lane.levels[:2])} == {"a", "b"}
     session.go(session.show_event(40, other=False))
