@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError, near_or_all
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
@@ -309,6 +308,8 @@ def _read_text(run: Run, token: Token) -> EventFilter:
 
 
 def _read_where(run: Run, token: Token) -> EventFilter:
+    from rsltrace.conditions.trace_events import TraceCondition  # as long as opening a trace
+
     try:
         return conditions.Where(TraceCondition(unquoted(token), run.trace))
     except ConditionError as error:

@@ -78,7 +78,7 @@ def varying_values(
 
 def samples(count: int, most: int) -> list[int]:
     """Return up to ``most`` numbers of ``count`` messages, from the first to the last."""
-    return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist() if count else []
+    return sorted({*np.linspace(0, count - 1, most).astype(int).tolist()}) if count else []
 
 
 def _values(message: object, varying: Collection[str] = ()) -> str:
