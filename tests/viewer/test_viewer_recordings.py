@@ -212,7 +212,7 @@ def test_a_filter_by_a_time_that_is_not_there_says_which_are(tmp_path: Path) -> 
         writer.finish()
     session = open_recordings((path,))
     list(session.read())
-    here = r"here 0.0..4.0, as absolute times @1700000000.0..@1700000004.0"
+    here = r"from the start, 0\.0 to 4\.0 s, or @1700000000\.0 to @1700000004\.0"
     for text in ("time:5..", "time:@5..@6", "time:1600000000.."):
         with pytest.raises(QueryError, match=here):
             session.set_filter(text)

@@ -385,7 +385,7 @@ class ViewerApp(Stepping):
         """Ask why the selected callback did not come, or came late."""
         question = self.session.question()
         if question is None:
-            self._say("why is asked about callbacks: of subscriptions, timers, services, clients")
+            self._say("r asks about callbacks: of subscriptions, timers, services, clients")
         else:
             self._answer(question)
 

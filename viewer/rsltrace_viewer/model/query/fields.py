@@ -278,10 +278,10 @@ def time_range(token: Token, start_ns: int, ends: tuple[int, int] | None) -> tup
 
     low, high = number_range(token, stamp_ns, "a time")
     if ends is not None and (low > ends[1] or high < ends[0]):
-        since = "..".join(seconds_text(end - start_ns) for end in ends)
-        there = "..".join(f"@{seconds_text(end)}" for end in ends)
-        absolute = f", as absolute times {there}" if start_ns else ""
-        text = f"nothing is then: times count from the start, here {since}{absolute}"
+        since = " to ".join(seconds_text(end - start_ns) for end in ends)
+        there = " to ".join(f"@{seconds_text(end)}" for end in ends)
+        absolute = f", or {there}" if start_ns else ""
+        text = f"out of range: times count from the start, {since} s{absolute}"
         raise QueryError(text, token.start, token.end)
     return low, high
 

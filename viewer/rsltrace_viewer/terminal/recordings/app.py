@@ -99,6 +99,7 @@ class RecordingApp(RecordingShell):
                 self.topics.refresh()
         else:
             session.row = event.line
+            self.messages.refresh()
             self._show_message()
 
     def on_list_view_chosen(self, event: ListView.Chosen) -> None:
