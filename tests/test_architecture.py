@@ -53,6 +53,16 @@ def test_layers_load_only_what_they_need(module: str, allowed: set[str]) -> None
     assert loaded_after(f"import {module}") <= allowed
 
 
+def test_the_first_screen_needs_no_conditions_bags_or_latencies() -> None:
+    code = (
+        "import sys, rsltrace_viewer.terminal.app\n"
+        "late = ('rsltrace.conditions.text', 'rsltrace.trace.recordings', 'rsltrace.checks')\n"
+        "print(*[name for name in late if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
 def test_every_public_name_exists() -> None:
     import rsltrace
 

@@ -304,10 +304,6 @@ def _run(app: Shown) -> None:
     if sys.stdout.isatty():
         for name in ("COLUMNS", "LINES"):
             os.environ.pop(name, None)  # some shells export them; they would freeze the size
-    if "TEXTUAL_DRIVER" in os.environ and importlib.util.find_spec("textual_serve") is not None:
-        from rsltrace_viewer.terminal.serve import end_with_server
-
-        end_with_server()
     app.run()
     if app.return_code:
         sys.exit(app.return_code)
@@ -318,9 +314,11 @@ def _serve(port: int) -> None:
     _check_installed("textual_serve")
     from rsltrace_viewer.terminal.serve import LocalServer
 
+    from rsltrace.child_processes import rsltrace_command
+
     arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
-    command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])
-    server = LocalServer(command, port)
+    # A viewer does not notice that its server is gone, and would spin for ever.
+    server = LocalServer(shlex.join(rsltrace_command(arguments)), port)
     tell(f"rsltrace view: {server.address} (Ctrl-C ends it)")
     try:
         server.serve()

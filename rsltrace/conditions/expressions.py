@@ -24,9 +24,10 @@ from rsltrace.conditions.evaluation import (
     value_of,
 )
 from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
-from rsltrace.conditions.names import RunNames, nodes_called, short_name, wrong_field
+from rsltrace.conditions.names import RunNames, wrong_field
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
+from rsltrace.trace.words.entities import nodes_called, short_name
 
 FROM_THE_RUN = ("node", "event", "now", "msg")
 

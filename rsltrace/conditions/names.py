@@ -69,19 +69,6 @@ def _each(names: Iterable[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in names if name))
 
 
-def short_name(node: str) -> str:
-    """Return the last part of a node's name: ``ekf`` of ``/robot/ekf``."""
-    return node.rsplit("/", 1)[-1]
-
-
-def nodes_called(name: str, nodes: Iterable[str]) -> list[str]:
-    """Return the nodes that somebody means who calls one ``name``: its full or its short name."""
-    nodes = list(nodes)
-    if name in nodes:
-        return [name]
-    return [one for one in nodes if short_name(one) == name or one == f"/{name}"]
-
-
 # Whether the fields that an expression reads of a message are fields of its interface.
 
 

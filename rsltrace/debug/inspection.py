@@ -26,12 +26,13 @@ from rsltrace.conditions.expressions import (
     no_such_field,
     node_named,
 )
-from rsltrace.conditions.names import RunNames, nodes_called
+from rsltrace.conditions.names import RunNames
 from rsltrace.conditions.view import EventView
 from rsltrace.debug.current_event import CurrentEventView, source
 from rsltrace.errors import ConditionError, DebugError, did_you_mean, near_or_all
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.overview import graph_overview
+from rsltrace.trace.words.entities import nodes_called
 
 if TYPE_CHECKING:
     from rsltrace.debug.event_history import EventLedger

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
 from rsltrace.diff.facts.bags import BagComparison, NativeComparison
-from rsltrace.diff.facts.causes import Judgement, PossibleCause, Verdict
+from rsltrace.diff.facts.causes import CallbackAbsence, Judgement, PossibleCause, Verdict
 from rsltrace.diff.facts.evidence import (
     AffectedTopic,
     CallDifference,
@@ -31,7 +31,8 @@ class Divergence(Judgement):
 
     ``chain`` is the way from the root to it. ``rows`` are the last rows before it and its own,
     ``node_rows`` the last before it in the same node. ``next_step`` is a command that shows or
-    reproduces the place, in the viewer if ``next_opens_viewer``.
+    reproduces the place, in the viewer if ``next_opens_viewer``. ``absence`` is why a callback that
+    only one run has did not come in the other, if that is known.
     """
 
     chain: tuple[CauseStep, ...] = ()
@@ -41,6 +42,7 @@ class Divergence(Judgement):
     next_step: str = ""
     next_opens_viewer: bool = False
     calls: tuple[CallDifference, ...] = ()
+    absence: CallbackAbsence | None = None
 
     @property
     def sentence(self) -> str:

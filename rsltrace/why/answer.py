@@ -8,13 +8,13 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from statistics import median
 from typing import Any, NoReturn, Protocol
 
-from rsltrace.conditions.names import nodes_called
 from rsltrace.errors import TraceError, near_or_all, nearest
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.entities import nodes_called
 from rsltrace.trace.words.events import EventWords
 from rsltrace.trace.words.phrases import as_sentence
 from rsltrace.why.delivery import Late, LostByLink, PushedOut, RunEnded, Unfinished, Waiting
@@ -342,10 +342,9 @@ def _evidence(reason: Reason) -> Iterator[str]:
 
 def as_json(reason: Reason) -> dict[str, Any]:
     """Return a reason, its sentence and the evidence as JSON-compatible values."""
-    name = "".join(f"_{c.lower()}" if c.isupper() else c for c in type(reason).__name__)
     values = {one.name: getattr(reason, one.name) for one in fields(reason)}
     return {
-        "reason": name.lstrip("_"),
+        "reason": reason.kind,
         "sentence": sentence(reason),
         **{k: v for k, v in values.items() if not is_dataclass(v)},
         "because": as_json(inner) if (inner := reason.because()) is not None else None,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -24,6 +25,11 @@ class Reason:
     question: Question
     place: str = ""
     event: int | None = None
+
+    @property
+    def kind(self) -> str:
+        """What programs call it: ``pushed_out``."""
+        return re.sub("(?<=[a-z])(?=[A-Z])", "_", type(self).__name__).lower()
 
     @classmethod
     def find(cls, question: Question) -> Reason | None:

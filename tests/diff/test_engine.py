@@ -16,6 +16,7 @@ from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.run import Run
 
 import rsltrace
+from rsltrace.diff.causes import explain
 from rsltrace.diff.facts.causes import Root, Verdict
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
@@ -421,11 +422,28 @@ def test_a_dropped_message_names_where_it_came_from(tmp_path: Path) -> None:
     entity, at = first.a.entity, seconds_text(first.a.stamp_ns)
     asked = f"rsltrace why {tmp_path / 'b.mcap'} {entity.node} {entity.name} --at {at}"
     assert first.next_step == asked
+    assert first.absence is None  # a trace that was tampered with has no reason for it
     assert f"event {step(20, 1)}, subscription /a of /left" in first.root_sentence
     (message, output) = first.messages
     assert (message.position, message.presence) == (-1, "only a")
     assert "data:" in message.preview
     assert (output.topic, output.presence) == ("/s", "only a")
+
+
+@pytest.mark.parametrize("lacking", ["a", "b"])
+def test_a_callback_that_one_run_lacks_says_why(
+    lacking: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = ("b.mcap", "a.mcap") if lacking == "a" else ("a.mcap", "b.mcap")
+    paths = [Path(__file__).parents[2] / "sample_traces" / "missing_event" / one for one in names]
+    (first, *_) = rsltrace.diff(*paths).divergences
+    assert first.absence is not None
+    assert (first.absence.run, first.absence.reason) == (lacking, "unfinished")
+    assert (first.absence.place, first.absence.event) == ("picker.py:39", 31)
+    monkeypatch.setattr(explain, "_EXPLAINED_EVENTS_MAX", 10)  # of a longer run nobody looks
+    (first, *_) = rsltrace.diff(*paths).divergences
+    assert first.absence is None
+    assert first.next_step.startswith(f"rsltrace why {paths['ab'.index(lacking)]} /gripper /close")
 
 
 def test_ignored_fields_leave_the_verdict(tmp_path: Path) -> None:

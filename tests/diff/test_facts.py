@@ -26,6 +26,7 @@ ROOT = Path(__file__).parent.parent.parent
 PAIRS = sorted(path.parent for path in (ROOT / "sample_traces").glob("*/job.yaml"))
 PLANTED = 200
 SPOKEN = ("sentence", "root_sentence", "likely_cause", "notes", "note", "reason", "relation")
+SPOKEN += ("absence_sentence",)
 """Keys of the JSON report that hold sentences."""
 
 
@@ -126,6 +127,7 @@ def all_facts() -> Iterator[Any]:
         for kind in get_args(union):
             yield from kind if issubclass(kind, Enum) else (kind,)
     yield from evidence.NoFieldsReason
+    yield causes.CallbackAbsence
 
 
 def test_every_fact_has_its_sentence() -> None:

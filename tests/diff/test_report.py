@@ -27,6 +27,7 @@ from rsltrace.diff.facts.bags import (
     TopicDiff,
 )
 from rsltrace.diff.facts.causes import (
+    CallbackAbsence,
     DifferentOutput,
     EventInOneRun,
     ExceptionInOneRun,
@@ -243,6 +244,7 @@ def missing() -> Diff:
             EventRow(gone, None, RowSign.ONLY_A),
         ),
         next_step="rsltrace cat runs/run1.mcap --from 0.9 --to 0.9",
+        absence=CallbackAbsence("b", "timer_cancelled", "timer tick was cancelled", "p.py:3", 31),
     )
     return Diff(
         side("run1", "0123456789abcdef"),

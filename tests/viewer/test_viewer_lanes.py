@@ -59,7 +59,7 @@ def test_marks_do_not_cover_what_the_axis_says(
     window = Window(0, columns if order else 31 * _S // 10, order)
     position = int(window.end * at)
     cursor, marks = window.column(position, columns), {m for m in marks if m < columns}
-    line = axis_text(Lanes(window, columns, ()), position, cursor, marks, 0)
+    line = axis_text(Lanes(window, columns, ()), position, cursor, marks)
     assert len(line) == columns
     assert ("≠" in line) == bool(marks) or "▲" in line
     here = f"{position}" if order else f"{format_seconds(position)[:-3]} s"
@@ -142,7 +142,8 @@ def test_a_steady_run_is_drawn_steadily_at_every_zoom(steady: Run, columns: int)
         step = made.window.step(columns)
         assert step not in seen
         seen.add(step)
-        first, last = (made.window.column(s, columns) for s in (steady.start_ns, steady.end_ns))
+        ends = (one - steady.base_ns for one in (steady.start_ns, steady.end_ns))
+        first, last = (made.window.column(one, columns) for one in ends)
         for lane in made.lanes:
             if lane.label == "(run)":
                 continue
@@ -159,7 +160,7 @@ def test_both_runs_are_drawn_to_one_scale(steady: Run, run: Run) -> None:
     for maker in makers:
         for number in maker.order():
             maker.summarise(number)
-    window = Window(steady.start_ns, steady.end_ns + 1).fitted(60)
+    window = makers[0].whole.fitted(60)
     counted = [maker.count(window, 60) for maker in makers]
     made = drawn(window, 60, list(zip("ab", counted, strict=True)))
     labels = [(lane.label, lane.run) for lane in made.lanes if lane.label != "(run)"]

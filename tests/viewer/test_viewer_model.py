@@ -176,7 +176,7 @@ def test_lanes_show_every_event_whatever_the_window(long_run: Run) -> None:
     assert made.known == 1.0
     assert [lane.label for lane in made.lanes] == ["/talker", "/listener", "(run)"]
     assert all(any(lane.levels) for lane in made.lanes)
-    last = made.window.column(run.end_ns, 60)
+    last = made.window.column(run.end_ns - run.base_ns, 60)
     assert made.lanes[1].signs == {last: "!"}
     total = maker.count(made.window, 60).counts.sum()
     assert total == pytest.approx(run.count, rel=0.001)

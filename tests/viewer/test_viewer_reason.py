@@ -47,7 +47,7 @@ def test_of_one_run_it_says_why_the_selected_callback_was_late(
 
     async def steps(viewer: Any) -> None:
         await viewer.press("r")
-        assert "why is asked about callbacks" in viewer.text, "a constructor is none"
+        assert "r asks about callbacks" in viewer.text, "a constructor is none"
         session = viewer.app.session
         for index in range(1, session.a.count):
             session.place = index

@@ -191,13 +191,35 @@ def test_filters_mean_the_messages_that_they_say(
             key[0] == "/pose" and ("0.55" in texts[key] or "0.56" in texts[key]) and key[1] != 140
         ),
         "level:warn": lambda key: False,
-        "time:>@1700000000": lambda key: False,
         "": lambda key: True,
     }.items():
         assert _chosen(session, text) == {key for key in everything if means(key)}, text
     for text in ("nod:/x", "topic:/nothing", "time:soon", "index:x", "level:loud", "text:", '""'):
         with pytest.raises(QueryError):
             session.set_filter(text)
+
+
+def test_a_filter_by_a_time_that_is_not_there_says_which_are(tmp_path: Path) -> None:
+    path, start_ns = tmp_path / "bag.mcap", 1_700_000_000_000_000_000
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/UInt64", "ros2msg", b"uint64 data")
+        channel = writer.register_channel("/c", "cdr", schema)
+        for place in range(5):
+            stamp_ns = start_ns + place * 1_000_000_000
+            writer.add_message(channel, stamp_ns, uint64_message(place), stamp_ns)
+        writer.finish()
+    session = open_recordings((path,))
+    list(session.read())
+    here = r"from the start, 0\.0 to 4\.0 s, or @1700000000\.0 to @1700000004\.0"
+    for text in ("time:5..", "time:@5..@6", "time:1600000000.."):
+        with pytest.raises(QueryError, match=here):
+            session.set_filter(text)
+    with pytest.raises(QueryError, match="write @1700000001s"):
+        session.set_filter("time:1700000001..")
+    for text in ("time:1..", "time:@1700000001.."):
+        assert len(_chosen(session, text)) == 4
 
 
 @pytest.mark.long

@@ -109,9 +109,27 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
             ros_message("tf2_msgs/msg/TFMessage", transforms=[transform(1.2), transform(3.0)]),
             "odom→base_link x=1.2 and 1 more",
         ),
-        (ros_message("tf2_msgs/msg/TFMessage"), "none"),
+        (ros_message("tf2_msgs/msg/TFMessage"), "no transforms"),
+        (
+            ros_message("tf2_msgs/msg/TFMessage", transforms=[transform(1.2)] * 20),
+            "odom→base_link x=1.2 and 19 more",
+        ),
+        (ros_message("geometry_msgs/msg/TransformStamped"), "?→? x=0 y=0"),
         (ros_message(f"{sensor}/LaserScan", ranges=ranges), "3 ranges 0.4–8.9 m"),
-        (ros_message(f"{sensor}/LaserScan", ranges=ranges[2:]), "1 ranges, none finite"),
+        (ros_message(f"{sensor}/LaserScan", ranges=ranges[1:]), "2 ranges 8.9 m"),
+        (ros_message(f"{sensor}/LaserScan", ranges=ranges[2:]), "1 range, all inf"),
+        (ros_message(f"{sensor}/LaserScan", ranges=[np.inf, np.nan]), "2 ranges, all NaN or inf"),
+        (ros_message(f"{sensor}/LaserScan"), "no ranges"),
+        (ros_message(f"{sensor}/Image"), "0x0"),
+        (ros_message(f"{sensor}/PointCloud2"), "0 points"),
+        (ros_message(f"{sensor}/PointCloud2", width=1, height=1), "1 point"),
+        (
+            ros_message(f"{sensor}/JointState", position=np.array([0.5, np.nan])),
+            "0.5 nan (no names)",
+        ),
+        (ros_message(f"{sensor}/JointState"), "no joints"),
+        (ros_message("std_msgs/msg/String"), '""'),
+        (ros_message("std_msgs/msg/Float64", data=np.nan), "nan"),
         (ros_message(f"{sensor}/Image", width=640, height=480, encoding="rgb8"), "640x480 rgb8"),
         (
             ros_message(f"{sensor}/CompressedImage", format="jpeg", data=np.zeros(2500, np.uint8)),
@@ -145,6 +163,21 @@ def test_common_messages_say_what_one_wants_to_know() -> None:
                 changed_parameters=[],
             ),
             "rate and 1 more",
+        ),
+        (
+            ros_message(
+                "rcl_interfaces/msg/ParameterEvent",
+                deleted_parameters=[ros_message("rcl_interfaces/msg/Parameter", name="rate")],
+            ),
+            "deleted rate",
+        ),
+        (ros_message("diagnostic_msgs/msg/DiagnosticArray"), "no status"),
+        (
+            ros_message(
+                "diagnostic_msgs/msg/DiagnosticArray",
+                status=[ros_message("diagnostic_msgs/msg/DiagnosticStatus", name="motor")],
+            ),
+            "OK motor",
         ),
         (
             ros_message("diagnostic_msgs/msg/DiagnosticArray", status=status),
@@ -271,6 +304,16 @@ def test_times_since_1970_count_from_the_start(tmp_path: Path, drive: Callable[.
             feeder.output(OutputKind.MESSAGE, sender, data, feeder.payload(channel, stamp, data))
             feeder.event(EventKind.TIMER, timer, stamp)
         feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
+
+    session = Session(Run.open(path), Run.open(SAMPLES / "schedule" / "a.mcap"))
+    lanes, _ = session.lanes(50)
+    assert lanes.window.end < 20_000_000_000  # each run from its own start
+    assert {lane.run for lane in lanes.lanes if any(lane.levels[:2])} == {"a", "b"}
+    session.go(session.show_event(40, other=False))
+    assert session.lanes(50)[1] == 4_000_000_000
+    assert session.current() == (session.a, 40)
+    assert session.place_after(4_000_000_000) == session.view.place_of(40)
+    session.close()
 
     async def steps(viewer: Any) -> None:
         assert "17000000" not in viewer.text.split("\n", 1)[1].partition("event 0")[0]

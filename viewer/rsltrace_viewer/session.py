@@ -5,7 +5,7 @@ The app changes this object and draws what it says; tests drive it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -386,7 +386,9 @@ class Session:
     def lanes(self, columns: int) -> tuple[Lanes, int]:
         """Return the lanes, and where the cursor is in them (a time, or a place)."""
         made = self.lane_window.lanes(self.view, self.place, self._in_lanes(), columns)
-        return made, self.place if made.window.order else self.stamp()
+        here = self.current()
+        since_ns = 0 if here is None else here[0].stamp(here[1]) - here[0].base_ns
+        return made, self.place if made.window.order else since_ns
 
     def zoom(self, step: int, columns: int) -> None:
         """Zoom the lanes in (1), out (-1), or to the whole run (0)."""
@@ -617,10 +619,17 @@ class Session:
 
     def place_at_time(self, time: TimeInRun) -> int:
         """Return the place of the first event at a time or later; of the last one if none is."""
+        return self._place_at(lambda run: time.stamp_ns(run.trace.start_ns, run.end_ns))
+
+    def place_after(self, since_ns: int) -> int:
+        """Return the place of the first event so long after the start of its run, or later."""
+        return self._place_at(lambda run: run.base_ns + since_ns)
+
+    def _place_at(self, time: Callable[[Run], int]) -> int:
         found = []
         for name, run in self.shown.items():
             if run.count:
-                stamp_ns = time.stamp_ns(run.trace.start_ns, run.end_ns)
+                stamp_ns = time(run)
                 place = self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B)
                 found.append((run.end_ns < stamp_ns, place))
         over, place = min(found)

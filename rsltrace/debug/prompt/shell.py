@@ -11,14 +11,14 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.conditions.names import RunNames, short_name
+from rsltrace.conditions.names import RunNames
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
 from rsltrace.debug.prompt.commands import PromptContext
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.finding import NondeterminismSource
-from rsltrace.trace.words.entities import LOG_LEVELS
+from rsltrace.trace.words.entities import LOG_LEVELS, short_name
 
 if TYPE_CHECKING:
     from rsltrace.debug.checkpoints import StopReport

@@ -39,6 +39,7 @@ from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.facts.causes import (
+    CallbackAbsence,
     Consequence,
     Judgement,
     Root,
@@ -62,10 +63,15 @@ from rsltrace.diff.facts.remarks import Remark
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.errors import TraceError
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.model.operation import PARAMETER_EVENTS
+from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.phrases import path_word, seconds_text
+
+_EXPLAINED_EVENTS_MAX = 250_000
+"""Events and outputs of runs that are looked through, in all, for why callbacks did not come."""
 
 ANCESTORS_MAX = 5
 """Events shown that led to a root. Both runs have them."""
@@ -90,6 +96,7 @@ class Explainer:
         self._viewer_a = EventViews(self.run_a)
         self._viewer_b = EventViews(self.run_b)
         self._relevance = Relevance(self.run_a, self.run_b)
+        self._left_to_explain = _EXPLAINED_EVENTS_MAX
         self.warnings: dict[Remark, None] = {}
         """What to know before one runs a ``next_step``."""
 
@@ -301,6 +308,7 @@ class Explainer:
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
             next_opens_viewer=self._opens_viewer(judgement),
+            absence=self._absence(judgement),
         )
         return self._with_context(bare, place_a, place_b)
 
@@ -410,14 +418,12 @@ class Explainer:
                 until = seconds_text(self.run_a.trace.stamp(last))
                 again = f"{record.command} --until {until} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
-        in_a = judgement.a is not None
-        lacking = self.run_b if in_a else self.run_a
-        if self._is_missing_callback(judgement, view):
+        if (lacking := self._lacks_callback(judgement)) is not None:
             name = shlex.quote(view.entity.name)
-            since = seconds_text(lacking.trace.stamp(view.stamp_ns))
-            of = f"{path_word(lacking.trace.name)} {shlex.quote(view.entity.node)} {name}"
+            since = seconds_text(lacking.stamp(view.stamp_ns))
+            of = f"{path_word(lacking.name)} {shlex.quote(view.entity.node)} {name}"
             return f"rsltrace why {of} --at {since}"
-        path = path_a if in_a else path_b
+        path = path_a if judgement.a is not None else path_b
         time = seconds_text(view.stamp_ns)
         node = view.entity.node
         choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""
@@ -427,12 +433,34 @@ class Explainer:
             choice = " --kind construct"
         return f"rsltrace cat {path}{choice} --from {time} --to {time} --json --payloads"
 
-    def _is_missing_callback(self, judgement: Judgement, view: EventSummary) -> bool:
-        """Whether one run lacks a callback of an entity that both have: `rsltrace why` says why."""
-        matching = self.run_a.matching
+    def _lacks_callback(self, judgement: Judgement) -> Trace | None:
+        """Return the run that lacks a callback of an entity that both have, None if none does."""
+        view, matching = judgement.one, self.run_a.matching
+        if view is None or (judgement.a is not None and judgement.b is not None):
+            return None
         alone = matching.by_key[view.entity] in {*matching.only_a, *matching.only_b}
-        in_one = judgement.a is None or judgement.b is None
-        return in_one and not alone and not view.entity.ordinal and view.entity.kind in _EXPLAINED
+        if alone or view.entity.ordinal or view.entity.kind not in _EXPLAINED:
+            return None
+        return (self.run_a if judgement.a is None else self.run_b).trace
+
+    def _absence(self, judgement: Judgement) -> CallbackAbsence | None:
+        """Return why a run lacks a callback, unless that is unknown or takes too long to find."""
+        view, trace = judgement.one, self._lacks_callback(judgement)
+        if view is None or trace is None or "://" in trace.name:
+            return None
+        self._left_to_explain -= trace.event_count + trace.output_count
+        if self._left_to_explain < 0:
+            return None
+        from rsltrace.why.answer import why  # most diffs need none of it
+
+        try:
+            reason = why(trace, view.entity.node, view.entity.name, view.stamp_ns)
+        except TraceError:
+            return None
+        if not reason.is_reason:
+            return None
+        run = "a" if judgement.a is None else "b"
+        return CallbackAbsence(run, reason.kind, reason.words(), reason.place, reason.event)
 
 
 def _told_to_differ(settings: Sequence[Setting]) -> bool:

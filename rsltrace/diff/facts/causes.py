@@ -387,6 +387,20 @@ class UnguardedCall(Fact):
 
 
 PossibleCause = UnrecordedAnswer | UnguardedCall
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackAbsence(Fact):
+    """Why a callback did not come in ``run``, as `rsltrace why` says it: the kind of ``reason``,
+    its ``words``, the line to blame (or empty), and the event there to look at."""
+
+    run: str
+    reason: str
+    words: str
+    place: str
+    event: int | None
+
+
 LikelyCause = ExternalAnswers | SetOrder | ErrorInTransition | EntityChanges | PossibleCause
 
 

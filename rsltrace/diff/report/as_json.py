@@ -26,6 +26,7 @@ from rsltrace.diff.facts.evidence import (
     Setting,
 )
 from rsltrace.diff.result import BagDiff, Diff, Divergence
+from rsltrace.diff.sentences import sentence
 from rsltrace.diff.sentences.runs import order_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text, notes_text, output_change_text
 from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
@@ -104,6 +105,7 @@ def _snake(name: str) -> str:
 
 def _divergence(found: Divergence) -> dict[str, Any]:
     sentences = {"sentence": found.sentence, "root_sentence": found.root_sentence}
+    sentences["absence_sentence"] = "" if found.absence is None else sentence(found.absence)
     return {**_fields(found), **sentences, "likely_cause": found.likely_cause}
 
 

@@ -26,6 +26,7 @@ from rsltrace.diff.report.line import (
 )
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.diff.sentences.divergence import no_event_text
 from rsltrace.diff.sentences.event_differences import event_differences_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.trace.model.texts import format_duration, format_seconds, printable
@@ -75,7 +76,7 @@ def _event(found: Divergence, width: int) -> Section:
                 rows.insert(0, line(("  code ", Style.FAINT), code))
     elif some is not None:
         title = "where they diverge" if a and b else "the event"
-        rows += _events_of([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
+        rows += _events_of(found, width)
     else:
         title = ""
     for message in found.messages:
@@ -94,12 +95,18 @@ def _did(sides: list[tuple[str, str, EventSummary]], width: int) -> list[Line]:
     return [cut(row, width) for row in in_columns(rows)]
 
 
-def _events_of(sides: list[tuple[str, str, EventSummary | None]], width: int) -> list[Line]:
-    rows = []
-    for name, style, event in sides:
-        cells = event_cells(event) if event is not None else [("no such event", Style.FAINT)]
-        rows.append([(name, style), *cells])
-    return [cut(row, width) for row in in_columns(rows, widest=52)]
+def _events_of(found: Divergence, width: int) -> list[Line]:
+    sides = (("a", Style.SIDE_A, found.a), ("b", Style.SIDE_B, found.b))
+    rows = in_columns(
+        [[(n, style), *event_cells(one)] for n, style, one in sides if one], widest=52
+    )
+    rows = [cut(row, width) for row in rows]
+    for place, (name, style, event) in enumerate(sides):
+        if event is None:
+            first, *more = wrapped(printable(no_event_text(found.absence)), width - 5)
+            none = [line("  ", (name, style), "  ", *first), *(line("     ", *one) for one in more)]
+            rows[place:place] = none
+    return rows
 
 
 def _message(message: MessageDifference, width: int) -> list[Line]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from rsltrace.diff.facts.causes import (
     NO_CALLBACKS,
+    CallbackAbsence,
     CauseKind,
     Consequence,
     DifferentDraw,
@@ -422,6 +423,16 @@ def _(loss: QueueOverflow, of: object) -> str:
 def _(loss: UnfinishedCall, of: object) -> str:
     since = seconds_text(loss.since_ns)
     return f"{shortened(loss.text, _WAITS_MAX)}, from {since} s to the end of {loss.run}"
+
+
+@says(CallbackAbsence)
+def _(absence: CallbackAbsence, of: object) -> str:
+    return f"{absence.words} ({absence.place})" if absence.place else absence.words
+
+
+def no_event_text(absence: CallbackAbsence | None) -> str:
+    """Return what stands for an event in a run that has none."""
+    return "no such event" if absence is None else f"no such event: {sentence(absence)}"
 
 
 # -- why -------------------------------------------------------------------------------------------

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
@@ -19,6 +19,19 @@ def is_named(pattern: str, name: str) -> bool:
     if pattern.startswith("/"):
         return name == pattern
     return pattern.casefold() in name.casefold()
+
+
+def short_name(node: str) -> str:
+    """Return the last part of a node's name: ``ekf`` of ``/robot/ekf``."""
+    return node.rsplit("/", 1)[-1]
+
+
+def nodes_called(name: str, nodes: Iterable[str]) -> list[str]:
+    """Return the nodes that somebody means who calls one ``name``: its full or its short name."""
+    nodes = list(nodes)
+    if name in nodes:
+        return [name]
+    return [one for one in nodes if short_name(one) == name or one == f"/{name}"]
 
 
 RUN_NAME = "(run)"

@@ -42,7 +42,7 @@ class LiveSession(Session):
             return  # a main has no attributes
         changed = here.changed
         count = len(changed)
-        said = f"{count or 'nothing'} changed"
+        said = f"{count} changed" if count else "unchanged"
         if not here.after:
             said = "destroyed" if here.before else "not there"
         is_open = self.openness.is_open("live", True)

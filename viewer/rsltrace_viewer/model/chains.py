@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.checks.latency.instances import LatencyFigures
-from rsltrace.checks.latency.measure import Latencies, measuring
-from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import RsltraceError, TraceError
 from rsltrace_viewer.model.run import Run
 
 if TYPE_CHECKING:
+    from rsltrace.checks.latency.instances import LatencyFigures
+    from rsltrace.checks.latency.measure import Latencies
+    from rsltrace.checks.latency.paths import Hop
     from rsltrace.job import Job
 
 EVENTS_MAX = 500_000
@@ -44,6 +44,8 @@ def read_chains(run: Run) -> Iterator[tuple[Chain, ...]]:
     its job are about. Nothing for a run that is not finished, or is very long."""
     if not run.trace.complete or run.trace.event_count > EVENTS_MAX:
         return
+    from rsltrace.checks.latency.measure import measuring  # which the first screen can do without
+
     found: dict[tuple[tuple[Hop, ...], tuple[str, ...]], Chain] = {}
     for wanted in ({}, *_of_checks(run)):
         try:

@@ -26,7 +26,8 @@ class Comparison:
         self.runs = AlignedRuns(a.trace, b.trace)
         self.rows = self.runs.rows
         self._stamps: Ints = np.zeros(0, dtype=np.int64)
-        """When rows begin to differ, for as many divergences as were known, and sorted."""
+        """When rows begin to differ, in ns after the start of the run, for as many divergences as
+        were known, and sorted."""
         self._stamps_sorted = self._stamps
 
     # The view.
@@ -135,4 +136,5 @@ class Comparison:
 
     def _stamp(self, place: int) -> int:
         row = self.rows.row(place)
-        return self.run_a.stamp(row.a) if row.a is not None else self.run_b.stamp(row.b or 0)
+        run, index = (self.run_b, row.b or 0) if row.a is None else (self.run_a, row.a)
+        return run.stamp(index) - run.base_ns

@@ -12,8 +12,6 @@ from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.recordings import open_bag
-from rsltrace.trace.recordings.metadata import NAME as METADATA
 
 # Where one has been, to go back and forward through, and the events one marked.
 #
@@ -112,7 +110,9 @@ def found_in(folder: Path) -> list[Found]:
 
 
 def _paths_in(folder: Path) -> Iterator[Path]:
-    bags = {path.parent for deep in ("", "*/", "*/*/") for path in folder.glob(f"{deep}{METADATA}")}
+    from rsltrace.trace.recordings.metadata import NAME  # loads what reads all kinds of bags
+
+    bags = {path.parent for deep in ("", "*/", "*/*/") for path in folder.glob(f"{deep}{NAME}")}
     yield from bags
     for pattern in _FILES:
         for deep in ("", "*/"):
@@ -132,6 +132,8 @@ def _recording(path: Path) -> Found:
     size = sum(one.stat().st_size for one in ([path] if path.is_file() else path.iterdir()))
     if size > _OPENED_BYTES_MAX or path.suffix == ".zstd":
         return Found(path, f"{size / 1e6:,.1f} MB", "", "recording")
+    from rsltrace.trace.recordings import open_bag
+
     bag = open_bag(path, recover=path.is_file())
     try:
         length = format_duration(bag.recording_end_ns - bag.recording_start_ns)

@@ -35,8 +35,9 @@ class LaneMaker:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self.whole = Window(run.start_ns, max(run.end_ns + 1, run.start_ns + 1))
-        """The window of the whole run."""
+        first_ns = run.start_ns - run.base_ns
+        self.whole = Window(first_ns, max(run.end_ns - run.base_ns, first_ns) + 1)
+        """The window of the whole run. Windows of time count from the start of the run."""
         self.labels = [*(node.name for node in run.nodes), RUN_NAME]
         self._slots, self._row_of_slot = _slots(run)
         slots = len(self._row_of_slot)
@@ -103,6 +104,8 @@ class LaneMaker:
 
     def count(self, window: Window, columns: int) -> Counted:
         """Return the events in a window of time that fits ``columns`` (``Window.fitted``)."""
+        base_ns = self._run.base_ns
+        window = Window(window.start + base_ns, window.end + base_ns)
         numbers = self._overlapping(window)
         exact = len(numbers) <= _EXACT_SEGMENTS
         known = 1.0 if exact else float(self._known[numbers].mean())
@@ -141,24 +144,26 @@ class LaneMaker:
         if window.order:
             if step > 0:
                 return window
-            return self._around(
-                run.stamp(selected), step_from(self._narrowest(selected, columns)), columns
-            )
+            narrowest = step_from(self._narrowest(selected, columns))
+            return self._around(self._since_start(selected), narrowest, columns)
         shown = window.fitted(columns).step(columns)
         length = step_below(shown) if step > 0 else step_from(shown + 1)
         if step > 0 and (length == shown or length < self._narrowest(selected, columns)):
             return Window(0, columns, order=True)
-        return self._around(run.stamp(selected) if run.count else 0, length, columns)
+        return self._around(self._since_start(selected) if run.count else 0, length, columns)
 
     def centred(self, window: Window, selected: int, columns: int) -> Window:
         """Return a window of time moved so that event ``selected`` is in it."""
         if not self._run.count or window == self.whole:
             return window
-        stamp = self._run.stamp(selected)
+        stamp = self._since_start(selected)
         fitted = window.fitted(columns)
         if fitted.start <= stamp < fitted.end:
             return window
         return self._around(stamp, fitted.step(columns), columns)
+
+    def _since_start(self, event: int) -> int:
+        return self._run.stamp(event) - self._run.base_ns
 
     def _around(self, stamp: int, step: int, columns: int) -> Window:
         whole = self.whole

@@ -124,13 +124,11 @@ def lettered(
 _MARK = "≠"
 
 
-def axis_text(
-    lanes: Lanes, position: int, cursor: int, divergences: Collection[int], base_ns: int
-) -> str:
+def axis_text(lanes: Lanes, position: int, cursor: int, divergences: Collection[int]) -> str:
     """Return the line, one character per column.
 
     ``position`` is the time (or place) that one is at and ``cursor`` its column; ``divergences``
-    are columns; times count from ``base_ns``. What is said in words hides marks, but not all.
+    are columns; times count from the start. What is said in words hides marks, but not all.
     """
     window, columns = lanes.window, lanes.columns
     if window.order:
@@ -140,9 +138,9 @@ def axis_text(
         here = f"▲ {position}"
         scale = f"one column is one {what}"
     else:
-        left = f"{format_seconds(window.start - base_ns)[:-6]} s"
-        right = f"{format_seconds(window.end - base_ns)[:-6]} s"
-        here = f"▲ {format_seconds(position - base_ns)[:-3]} s"
+        left = f"{format_seconds(window.start)[:-6]} s"
+        right = f"{format_seconds(window.end)[:-6]} s"
+        here = f"▲ {format_seconds(position)[:-3]} s"
         scale = f"{format_duration(window.step(columns))} per column"
     if lanes.known < 1:
         scale += f", {lanes.known:.0%} read"

@@ -22,6 +22,7 @@ from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
 from rsltrace.diff.result import BagDiff, Diff, Divergence
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.diff.sentences.divergence import no_event_text
 from rsltrace.diff.sentences.values import setting_name
 from rsltrace.errors import RsltraceError
 from rsltrace.trace.model.operation import NODE_TOPICS
@@ -130,15 +131,13 @@ def _where(found: Divergence | None) -> list[tuple[str, str]]:
     """Return where the runs diverge: the event of each, or the one of both."""
     if found is None:
         return []
-    sides = [_event(one) for one in (found.a, found.b)]
+    sides = [_event(one) if one else no_event_text(found.absence) for one in (found.a, found.b)]
     if sides[0] == sides[1]:
         return [("in both", sides[0])]
     return [*zip(("in a", "in b"), sides, strict=True)]
 
 
-def _event(event: EventSummary | None) -> str:
-    if event is None:
-        return "no such event"
+def _event(event: EventSummary) -> str:
     code = f" ({event.code})" if event.code else ""
     return f"{event_text(event)}, event {event.index} at {format_seconds(event.stamp_ns)} s{code}"
 

@@ -15,7 +15,7 @@ from textual.screen import Screen
 from textual.widget import Widget
 
 from rsltrace.errors import TraceError
-from rsltrace.job.values.times import TimeInRun, parse_time_in_run
+from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.model.texts import printable, shortened
 from rsltrace_viewer.model.folder import Event
 from rsltrace_viewer.model.query.tokens import QueryError
@@ -224,7 +224,7 @@ class ViewerApp(Stepping):
         if event.order:
             self.go(event.position, centre=True)
         else:
-            self.go(session.place_at_time(TimeInRun(event.position, is_absolute=True)), centre=True)
+            self.go(session.place_after(event.position), centre=True)
 
     def on_lanes_view_zoomed(self, event: LanesView.Zoomed) -> None:
         """The wheel was turned over the lanes."""
@@ -263,7 +263,7 @@ class ViewerApp(Stepping):
         if self.focused is self.lanes:
             self._more_lanes += step
         else:
-            share = self._share or (7 if self.size.width >= WIDE else 6)
+            share = self._share or (8 if self.size.width >= WIDE else 6)
             share += step if self.focused is self.timeline else -step
             self._share = max(2, min(share, SHARES - 2))
         self._fit(self.size.width, self.size.height)
@@ -385,7 +385,7 @@ class ViewerApp(Stepping):
         """Ask why the selected callback did not come, or came late."""
         question = self.session.question()
         if question is None:
-            self._say("why is asked about callbacks: of subscriptions, timers, services, clients")
+            self._say("r asks about callbacks: of subscriptions, timers, services, clients")
         else:
             self._answer(question)
 

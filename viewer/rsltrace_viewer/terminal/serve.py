@@ -2,8 +2,8 @@
 
 textual-serve starts the viewer once per page and carries its screen over a websocket. What it lacks
 is added here: any page in the same browser, and any user of the machine, could connect to the port;
-its own page fetches a font from somebody's server; a viewer outlives a server that is killed; each
-page starts one more, of the size that it asks for; and what pages send is written to the terminal.
+its own page fetches a font from somebody's server; each page starts one more viewer, of the size
+that it asks for; and what pages send is written to the terminal.
 """
 
 from __future__ import annotations
@@ -11,10 +11,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
-import os
 import secrets
-import threading
-import time
 from collections.abc import Awaitable, Callable
 from typing import Any
 
@@ -25,32 +22,13 @@ from textual_serve.server import Server
 from rsltrace.terminal import tell
 
 HOST = "127.0.0.1"
-SERVER = "RSLTRACE_SERVER"
-"""The environment variable that tells a viewer the process id of its server."""
 _NAMES = (HOST, "localhost")
-_LOOK_EVERY_S = 0.5
 _QUIT_S = 10.0
 _PAGES_MAX = 12
 _SIZE = (("width", 80), ("height", 24))
 _SIDE_MAX = 1000
 """Columns or rows of a page; Textual keeps several objects for each cell."""
 _NO_MESSAGE = (ValueError, TypeError, KeyError, OverflowError, RecursionError)
-
-
-def end_with_server() -> None:
-    """End this process when the server that has started it is gone, if one has.
-
-    Its input ends then, too, but a viewer does not notice that, and would spin for ever.
-    """
-    server = os.environ.get(SERVER, "")
-    if server.isdecimal():
-        threading.Thread(target=_watch, args=(int(server),), daemon=True).start()
-
-
-def _watch(server: int) -> None:
-    while os.getppid() == server:
-        time.sleep(_LOOK_EVERY_S)
-    os._exit(1)
 
 
 class LocalServer(Server):  # type: ignore[misc]  # textual-serve has no types
@@ -60,9 +38,8 @@ class LocalServer(Server):  # type: ignore[misc]  # textual-serve has no types
     """
 
     def __init__(self, command: str, port: int) -> None:
-        # No shell stays between the server and its viewers, which look whether it is still there.
+        # No shell stays between the server and its viewers, which end with it.
         super().__init__(f"exec {command}", host=HOST, port=port, title="rsltrace view")
-        os.environ[SERVER] = str(os.getpid())
         self._token = secrets.token_urlsafe(24)
         self.address = f"http://{HOST}:{port}/{self._token}/"
         self._hosts = {f"{name}:{port}" for name in _NAMES}

@@ -58,8 +58,8 @@ class Shell(App[None]):
     #source { height: 1fr; width: 1fr; display: none; }
     .with-source #source { display: block; }
     .wide #body { layout: horizontal; }
-    .wide #timeline { height: 1fr; width: 5fr; }
-    .wide #detail { layout: vertical; width: 3fr; height: 1fr; border-left: solid $panel; }
+    .wide #timeline { height: 1fr; width: 2fr; }
+    .wide #detail { layout: vertical; width: 1fr; height: 1fr; border-left: solid $panel; }
     .wide #inspector { height: 5fr; }
     .wide #source { height: 4fr; }
     .low #lanes { display: none; }
@@ -273,7 +273,6 @@ class Shell(App[None]):
         if session.comparison is not None:
             found = session.comparison.divergences_in(session.view, made.window, made.columns)
             first, divergences = found
-        lanes.base_ns = session.a.base_ns
         lanes.show(
             made, position, own=session.own_lane(), divergence=first, divergences=divergences
         )

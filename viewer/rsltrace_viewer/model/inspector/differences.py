@@ -19,6 +19,7 @@ from rsltrace.diff.facts.remarks import EndedByException
 from rsltrace.diff.report.differences import distance_text
 from rsltrace.diff.result import Divergence
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.diff.sentences.divergence import no_event_text
 from rsltrace.diff.sentences.runs import remark_text
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.errors import TraceError
@@ -186,6 +187,9 @@ def _why(comparison: Comparison) -> Iterator[Line]:
     elif (divergence := comparison.diff.shown) is not None:
         sentence = divergence.root_sentence or divergence.sentence
         yield Line(1, "why", printable(sentence), Role.NOTE, "why")
+        if (absence := divergence.absence) is not None:
+            text = printable(no_event_text(absence))
+            yield Line(1, f"in {absence.run}", text, Role.NOTE, "why.absence")
         remarks = comparison.diff.remarks
         failed = [remark for remark in remarks if isinstance(remark, EndedByException)]
         for place, remark in enumerate(failed):

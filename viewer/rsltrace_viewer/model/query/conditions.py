@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError
 from rsltrace.trace.model.event import EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.logs import log_record
 from rsltrace_viewer.model.run import Run, Segment
+
+if TYPE_CHECKING:
+    from rsltrace.conditions.trace_events import TraceCondition
 
 Mask = npt.NDArray[np.bool_]
 Ids = npt.NDArray[np.uint32]

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError, near_or_all
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
@@ -20,6 +19,7 @@ from rsltrace.trace.model.event import NO_SEQUENCE, EventFlag, EventKind, Output
 from rsltrace.trace.segments import output_of
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.kinds import SHORT_KINDS
+from rsltrace.trace.words.phrases import seconds_text
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import EventFilter, Mask
 from rsltrace_viewer.model.query.tokens import (
@@ -268,13 +268,27 @@ def whole_number(text: str) -> int:
     return min(int(text), LARGEST)
 
 
-def _read_time(run: Run, token: Token) -> EventFilter:
-    start_ns, end_ns = run.trace.start_ns, run.end_ns
+def time_range(token: Token, start_ns: int, ends: tuple[int, int] | None) -> tuple[int, int]:
+    """Read a range of times that count from ``start_ns``; ``ends``: the first and the last there
+    is, None if that is not known. Raises QueryError, also for a range without any of these."""
+    last_ns = None if ends is None else ends[1]
 
     def stamp_ns(text: str) -> int:
-        return parse_time_in_run(text).stamp_ns(start_ns, end_ns)
+        return parse_time_in_run(text).stamp_ns(start_ns, last_ns)
 
-    return conditions.Between("stamp", *number_range(token, stamp_ns, "a time"))
+    low, high = number_range(token, stamp_ns, "a time")
+    if ends is not None and (low > ends[1] or high < ends[0]):
+        since = " to ".join(seconds_text(end - start_ns) for end in ends)
+        there = " to ".join(f"@{seconds_text(end)}" for end in ends)
+        absolute = f", or {there}" if start_ns else ""
+        text = f"out of range: times count from the start, {since} s{absolute}"
+        raise QueryError(text, token.start, token.end)
+    return low, high
+
+
+def _read_time(run: Run, token: Token) -> EventFilter:
+    ends = (run.start_ns, run.end_ns) if run.trace.complete else None
+    return conditions.Between("stamp", *time_range(token, run.trace.start_ns, ends))
 
 
 def _read_index(run: Run, token: Token) -> EventFilter:
@@ -294,6 +308,8 @@ def _read_text(run: Run, token: Token) -> EventFilter:
 
 
 def _read_where(run: Run, token: Token) -> EventFilter:
+    from rsltrace.conditions.trace_events import TraceCondition  # as long as opening a trace
+
     try:
         return conditions.Where(TraceCondition(unquoted(token), run.trace))
     except ConditionError as error:

@@ -19,11 +19,10 @@ from rsltrace.conditions.topic_fields import OF_MESSAGE, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError, near_or_all
-from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.decode import to_plain
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.logs import parse_log
-from rsltrace_viewer.model.query.fields import level_of, place_of, whole_number
+from rsltrace_viewer.model.query.fields import level_of, place_of, time_range, whole_number
 from rsltrace_viewer.model.query.parser import Choices, Language, read
 from rsltrace_viewer.model.query.tokens import (
     QueryError,
@@ -93,7 +92,7 @@ def read_filter(text: str, recordings: Sequence[Recording]) -> TopicCondition | 
             {
                 "topic": partial(_named, topics, lambda topic: topic.name, "topic"),
                 "type": partial(_named, types, lambda topic: topic.type, "type"),
-                "time": _time,
+                "time": partial(_time, recordings),
                 "index": _index,
                 "text": lambda token: _says(unquoted(token).casefold()),
                 "level": _level,
@@ -143,21 +142,20 @@ def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token
     return TopicCondition(lambda part, among: part.all(of(part.topic) in wanted))
 
 
-def _time(token: Token) -> TopicCondition:
-    def limits(start_ns: int) -> tuple[int, int]:
-        def stamp_ns(text: str) -> int:
-            return parse_time_in_run(text).stamp_ns(start_ns)
-
-        return number_range(token, stamp_ns, "a time")
-
-    limits(0)  # which says what is wrong with it
+def _time(recordings: Sequence[Recording], token: Token) -> TopicCondition:
+    ranges, errors = {}, []
+    for one in recordings:
+        try:
+            ends = (one.start_ns, one.end_ns) if one.done else None
+            ranges[one] = time_range(token, one.start_ns, ends)
+        except QueryError as error:  # in the other recording something may be then
+            errors.append(error)
+    if not ranges:
+        raise errors[0]
 
     def between(part: TopicMessages, among: Mask) -> Mask:
         stamps = np.array(part.topic.stamps[part.start : part.end], dtype=np.int64)
-        try:
-            low, high = limits(part.recording.start_ns)
-        except QueryError:  # "5..@3": no time of this recording is in it
-            low, high = 1, 0
+        low, high = ranges.get(part.recording, (1, 0))
         found: Mask = (stamps >= low) & (stamps <= min(high, 2**63 - 1))
         return found
 

@@ -62,7 +62,7 @@ class ListSpace:
     @property
     def share(self) -> int:
         """Cells of a column of names."""
-        return self.width // (8 if self.two and self.narrow else 6)
+        return self.width // (8 if self.narrow else 6)
 
 
 @dataclass(frozen=True, slots=True)

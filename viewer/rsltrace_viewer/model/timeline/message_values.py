@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import Counter, OrderedDict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence, Sized
 from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
@@ -44,7 +44,7 @@ def message_values(message: object, varying: Collection[str] = ()) -> str:
     if summary is not None:
         # A type of this name may have other fields, or the same ones with other types.
         with suppress(AttributeError, TypeError, ValueError, IndexError):
-            return printable(summary(message))
+            return printable(summary(message)).strip()
     return printable(_values(message, varying))
 
 
@@ -78,7 +78,7 @@ def varying_values(
 
 def samples(count: int, most: int) -> list[int]:
     """Return up to ``most`` numbers of ``count`` messages, from the first to the last."""
-    return np.unique(np.linspace(0, count - 1, most).astype(int)).tolist() if count else []
+    return sorted({*np.linspace(0, count - 1, most).astype(int).tolist()}) if count else []
 
 
 def _values(message: object, varying: Collection[str] = ()) -> str:
@@ -106,11 +106,11 @@ def _is_text(leaf: tuple[str, str]) -> bool:
 
 
 def _transforms(message: Any) -> str:
-    return _first_of([_transform(one) for one in message.transforms[:1]], message.transforms)
+    return _first_of(_transform, message.transforms, "transforms")
 
 
 def _transform(one: Any) -> str:
-    frames = f"{_cut(one.header.frame_id)}→{_cut(one.child_frame_id)}"
+    frames = f"{_cut(one.header.frame_id) or '?'}→{_cut(one.child_frame_id) or '?'}"
     return f"{frames} {_values(one.transform)}"
 
 
@@ -140,16 +140,20 @@ def _fix(message: Any) -> str:
 
 
 def _parameters(message: Any) -> str:
-    changed = [one.name for one in (*message.new_parameters, *message.changed_parameters)]
-    return _first_of([_cut(name) for name in changed[:1]], changed)
+    changed = [_cut(one.name) for one in (*message.new_parameters, *message.changed_parameters)]
+    deleted = [f"deleted {_cut(one.name)}" for one in message.deleted_parameters]
+    return _first_of(str, [*changed, *deleted], "parameters")
 
 
 def _scan(message: Any) -> str:
     ranges = np.asarray(message.ranges, dtype=np.float64)
     seen = ranges[np.isfinite(ranges)]
     if not len(seen):
-        return f"{len(ranges)} ranges, none finite"
-    return f"{len(ranges)} ranges {number(seen.min(), 3)}–{number(seen.max(), 3)} m"
+        kinds = {"NaN": np.isnan(ranges).any(), "inf": np.isinf(ranges).any()}
+        what = " or ".join(kind for kind, there in kinds.items() if there)
+        return f"{_count(ranges, 'range')}, all {what}" if what else "no ranges"
+    ends = dict.fromkeys(number(end, 3) for end in (seen.min(), seen.max()))
+    return f"{_count(ranges, 'range')} {'–'.join(ends)} m"
 
 
 def _image(message: Any) -> str:
@@ -161,16 +165,17 @@ def _compressed_image(message: Any) -> str:
 
 
 def _cloud(message: Any) -> str:
-    return f"{message.width * message.height:,} points"
+    return _count(range(message.width * message.height), "point")
 
 
 def _joint_state(message: Any) -> str:
     values = next((v for v in (message.position, message.velocity, message.effort) if len(v)), ())
-    texts = [
-        f"{_cut(name)}={number(float(value))}"
-        for name, value in zip(message.name, values, strict=False)
-    ]
-    return _some_of(texts or [_cut(name) for name in message.name], "joints")
+    texts = [number(float(value)) for value in values]
+    if not len(message.name):
+        return f"{_some_of(texts, 'joints')}{' (no names)' if texts else ''}"
+    names = [_cut(name) for name in message.name]
+    named = [f"{name}={text}" for name, text in zip(names, texts, strict=False)]
+    return _some_of(named or names, "joints")
 
 
 def _trajectory(message: Any) -> str:
@@ -196,15 +201,16 @@ def _diagnostics(message: Any) -> str:
     def level(one: Any) -> int:
         return one.level[0] if isinstance(one.level, bytes) else int(one.level)
 
-    worst = sorted(message.status, key=level)[-1:]
-    return _first_of(
-        [f"{_LEVELS[min(level(one), 3)]} {_cut(one.name)}: {_cut(one.message)}" for one in worst],
-        message.status,
-    )
+    def status(one: Any) -> str:
+        said = f": {_cut(one.message)}" if one.message else ""
+        return f"{_LEVELS[min(level(one), 3)]} {_cut(one.name)}{said}"
+
+    return _first_of(status, sorted(message.status, key=level, reverse=True), "status")
 
 
-def _first_of(texts: list[str], every: Sequence[object]) -> str:
-    return f"{texts[0]} and {len(every) - 1} more" if len(every) > 1 else "".join(texts) or "none"
+def _first_of(text: Callable[[Any], str], items: Sequence[Any], what: str) -> str:
+    more = f" and {len(items) - 1} more" if len(items) > 1 else ""
+    return f"{text(items[0])}{more}" if len(items) else f"no {what}"
 
 
 def _some_of(texts: list[str], what: str) -> str:
@@ -212,7 +218,7 @@ def _some_of(texts: list[str], what: str) -> str:
     return " ".join(texts[:_VALUES_MAX]) + more or f"no {what}"
 
 
-def _count(items: Sequence[object], what: str) -> str:
+def _count(items: Sized, what: str) -> str:
     return f"{len(items):,} {what}{'' if len(items) == 1 else 's'}"
 
 

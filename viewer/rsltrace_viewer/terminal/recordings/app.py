@@ -13,6 +13,7 @@ from rsltrace.job.values.times import TimeError, TimeInRun, parse_time_in_run
 from rsltrace.trace.model.texts import printable
 from rsltrace_viewer.model.inspector.message_tree import Line
 from rsltrace_viewer.model.query.parser import complete
+from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.recordings.filter import FIELDS, choices, read_filter
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Recording
@@ -98,6 +99,7 @@ class RecordingApp(RecordingShell):
                 self.topics.refresh()
         else:
             session.row = event.line
+            self.messages.refresh()
             self._show_message()
 
     def on_list_view_chosen(self, event: ListView.Chosen) -> None:
@@ -190,7 +192,10 @@ class RecordingApp(RecordingShell):
             self.session.go_to_difference()
         self.topics.cursor = self.session.place
         if self._first_filter and not self.session.damage:
-            self._filter(self._first_filter)
+            try:
+                self._filter(self._first_filter)
+            except QueryError as error:  # a time that is not in it
+                self.notify(f"{self._first_filter}: {error}", severity="error")
 
     def _filter(self, text: str) -> None:
         session = self.session

@@ -143,7 +143,8 @@ class RecordingShell(App[None]):
             width=self.size.width,
         )
         self.topics.show(self._topic, len(session.keys))
-        self.topics.border_title = " topics: messages, rate "
+        both = " of a, of b" if session.two else ""
+        self.topics.border_title = f" topics: messages, rate{both} "
         self._show_messages()
         self._show_footer()
 
@@ -152,7 +153,8 @@ class RecordingShell(App[None]):
         messages.cursor = session.row
         messages.show(self._message, session.pairs.count)
         topic = session.topic_text(session.place)[0] if session.keys else "no topic"
-        messages.border_title = Content(f" {topic}: number, time in s, values ")
+        values = "values of a │ of b" if session.two else "values"
+        messages.border_title = Content(f" {topic}: number, time in s, {values} ")
         messages.call_after_refresh(messages.scroll_to_cursor)
         self._show_message()
 
@@ -183,13 +185,14 @@ class RecordingShell(App[None]):
 
     def _message(self, row: int) -> Pieces:
         time, sign, texts = self.session.message_text(row)
-        head = (f"{self.session.number_of(row):>7} {time:>{_TIME}} ", "muted")
+        lead = (">" if row == self.session.row else " ", "title")
+        head = (f"{self.session.number_of(row):>6} {time:>{_TIME}} ", "muted")
         if sign is None:
-            return (head, (texts[0], "plain"))
+            return (lead, head, (texts[0], "plain"))
         style = _STYLES[sign]
         room = max((self.messages.size.width - _TIME - 15) // 2, 8)
         both = [(fit(text, room), "plain" if sign is RowSign.MATCH else style) for text in texts]
-        return (head, (f"{sign.value} ", style), both[0], (" │ ", "muted"), both[1])
+        return (lead, head, (f"{sign.value} ", style), both[0], (" │ ", "muted"), both[1])
 
     def _show_footer(self) -> None:
         parts: list[Content | tuple[str, str] | str] = []

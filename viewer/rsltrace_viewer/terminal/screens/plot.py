@@ -80,6 +80,7 @@ class PlotView(Widget):
         row = y - 1
         value = {0: made.high, last - 2: made.low, (last - 2) // 2: (made.high + made.low) / 2}
         label = f"{value[row]:.5g}" if row in value else ""
+        label = f"{value[row]:.3g}" if len(label) > _AXIS - 2 else label
         tick = "┤" if label else "│"
         pieces = [Piece(f"{fit(label, _AXIS - 2, right=True)} {tick}", axis)]
         styles = [axis, *(self.get_component_rich_style(f"plot--{n}") for n in ("a", "b", "both"))]

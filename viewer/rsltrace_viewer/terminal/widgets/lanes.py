@@ -82,8 +82,6 @@ class LanesView(Widget, can_focus=True):
         super().__init__(id=id)
         self.lanes: Lanes | None = None
         self.cursor: int = 0
-        self.base_ns = 0
-        """What the times at the bottom count from."""
         self._position = 0
         self._own = ""
         self._divergence: int | None = None
@@ -235,7 +233,7 @@ class LanesView(Widget, can_focus=True):
             return Strip([Piece(" " * width, self._style("empty"))], width)
         if y == self.size.height - 1:
             marks = self._divergences
-            axis = axis_text(self.lanes, self._position, self.cursor, marks, self.base_ns)
+            axis = axis_text(self.lanes, self._position, self.cursor, marks)
             text = fit(" " * self._before_lanes + axis, width)
             return Strip([Piece(text, self._style("focused" if self.has_focus else "axis"))], width)
         place = self._first_lane() + y
