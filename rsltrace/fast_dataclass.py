@@ -1,0 +1,58 @@
+"""``dataclass(frozen=True, slots=True)`` in a fifth of the time: a command makes a hundred of them.
+
+The one of Python compiles seven functions for each class; here most are shared. Type checkers see
+Python's, and only they refuse to change a value.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from operator import attrgetter
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dataclasses import dataclass as dataclass
+else:
+
+    def dataclass(**options):
+        """Return a decorator of classes, for the same options as Python's."""
+        made = dataclasses.dataclass(**options)
+        if options != {"frozen": True, "slots": True}:
+            return made
+        made = dataclasses.dataclass(eq=False, repr=False, slots=True)
+
+        def decorate(cls):
+            cls = made(cls)
+            compared = [field.name for field in dataclasses.fields(cls) if field.compare]
+            cls._compared = _values(compared)
+            for name, shared in _SHARED.items():
+                if name not in vars(cls):
+                    setattr(cls, name, shared)
+            return cls
+
+        return decorate
+
+
+def _values(names: list[str]) -> Callable[[Any], Any]:
+    """Return a function from an object to the tuple of some of its attributes."""
+    if len(names) > 1:
+        return attrgetter(*names)
+    return lambda self: tuple(getattr(self, name) for name in names)
+
+
+def _equal(self: Any, other: object) -> Any:
+    cls: Any = type(self)
+    return cls._compared(self) == cls._compared(other) if type(other) is cls else NotImplemented
+
+
+def _hash(self: Any) -> int:
+    return hash(type(self)._compared(self))
+
+
+def _text(self: Any) -> str:
+    shown = (field.name for field in dataclasses.fields(self) if field.repr)
+    return f"{type(self).__qualname__}({', '.join(f'{n}={getattr(self, n)!r}' for n in shown)})"
+
+
+_SHARED = {"__eq__": _equal, "__hash__": _hash, "__repr__": _text}
