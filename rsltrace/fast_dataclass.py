@@ -15,11 +15,10 @@ if TYPE_CHECKING:
     from dataclasses import dataclass as dataclass
 else:
 
-    def dataclass(**options):
-        """Return a decorator of classes, for the same options as Python's."""
-        made = dataclasses.dataclass(**options)
+    def dataclass(cls=None, /, **options):
+        """Return a class or a decorator of classes, as Python's does."""
         if options != {"frozen": True, "slots": True}:
-            return made
+            return dataclasses.dataclass(cls, **options)
         made = dataclasses.dataclass(eq=False, repr=False, slots=True)
 
         def decorate(cls):
@@ -41,13 +40,13 @@ def _values(names: list[str]) -> Callable[[Any], Any]:
     return lambda self: tuple(getattr(self, name) for name in names)
 
 
-def _equal(self: Any, other: object) -> Any:
-    cls: Any = type(self)
+def _equal(self: Any, other: Any) -> Any:
+    cls: Any = self.__class__
     return cls._compared(self) == cls._compared(other) if type(other) is cls else NotImplemented
 
 
 def _hash(self: Any) -> int:
-    return hash(type(self)._compared(self))
+    return hash(self.__class__._compared(self))
 
 
 def _text(self: Any) -> str:

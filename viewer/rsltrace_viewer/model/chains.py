@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.checks.latency.instances import LatencyFigures
 from rsltrace.checks.latency.measure import Latencies, measuring
 from rsltrace.checks.latency.paths import Hop
 from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace_viewer.model.run import Run
 
 if TYPE_CHECKING:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy.typing as npt
 
 from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.errors import ConditionError, TraceError, near_or_all
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import WITH_TOPIC
