@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field
+from dataclasses import dataclass, field
 
 from rsltrace.conditions.bounds import LimitError
 from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, RsltraceError
-from rsltrace.fast_dataclass import dataclass
 
 _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
 """What an expression may raise of one message and not of the next: it is not true then."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.conditions.bounds import StepBudget
@@ -26,7 +27,6 @@ from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, OF_MODULES
 from rsltrace.conditions.names import RunNames, nodes_called, short_name, wrong_field
 from rsltrace.conditions.view import EventView, PausedRun
 from rsltrace.errors import ConditionError, did_you_mean
-from rsltrace.fast_dataclass import dataclass
 
 FROM_THE_RUN = ("node", "event", "now", "msg")
 

@@ -6,11 +6,10 @@ import ast
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from rsltrace.errors import did_you_mean, near_or_all
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.words.entities import is_named
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -14,7 +15,6 @@ from rsltrace.conditions.text import parse_condition
 from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
 from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import ConditionError, TraceError
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventRecord, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Protocol
-
-from rsltrace.fast_dataclass import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ An interrupted trace has no summary; ``scan`` makes the same index by walking th
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import chain
 from typing import NamedTuple
 
@@ -16,7 +16,6 @@ import xxhash
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError, TraceFormatError
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     CHECKSUM_KEY,

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import gc
 import importlib.metadata
+import pickle
 import subprocess
 import sys
 from contextlib import suppress
@@ -54,6 +56,12 @@ def test_a_small_run_loads_no_generators_no_plugins_and_no_metadata(tmp_path: Pa
     assert [name for name in _NOT_NEEDED if f'"{name}"' in loaded] == []
 
 
+@fast_dataclass.dataclass(frozen=True, slots=True)
+class Kept:
+    a: int
+    b: tuple[int, ...]
+
+
 def test_a_quick_dataclass_is_one_of_pythons() -> None:
     options = {"frozen": True, "slots": True}
     annotations = {"a": int, "b": list[int], "c": int}
@@ -74,7 +82,16 @@ def test_a_quick_dataclass_is_one_of_pythons() -> None:
             for other in values:
                 assert (quick(*one) == quick(*other)) is (own(*one) == own(*other))
         assert [field.name for field in dataclasses.fields(quick)] == names
-        assert not hasattr(quick(*values[0]), "__dict__")
+        made = quick(*values[0])
+        assert not hasattr(made, "__dict__")
+        for name in names:
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(made, name, 0)
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                delattr(made, name)
+        assert (
+            pickle.loads(pickle.dumps(Kept(1, (2,)))) == Kept(1, (2,)) == copy.copy(Kept(1, (2,)))
+        )
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.checks.latency.flow import MessageFlow
 from rsltrace.checks.latency.paths import NO_PATH
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 
 # A series of durations in a few numbers.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -24,7 +24,6 @@ from rsltrace.checks.latency.instances import (
 )
 from rsltrace.checks.latency.paths import ChainSelection, Hop, sink_hop
 from rsltrace.errors import TraceError, near_or_all
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.reader import Trace

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
-
-from rsltrace.fast_dataclass import dataclass
 
 NO_PATH = -1
 

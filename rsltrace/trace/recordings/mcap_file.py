@@ -10,13 +10,12 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mcap.opcode import Opcode
 
 from rsltrace.errors import BagError
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.mcap.chunk import cut_messages, read_chunk
 from rsltrace.trace.mcap.reader import (
     McapFooter,

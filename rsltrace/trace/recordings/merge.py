@@ -7,9 +7,8 @@ the stream reaches its start, and dropped at its end.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from heapq import heappop, heappush
-
-from rsltrace.fast_dataclass import dataclass
 
 BagMessage = tuple[int, int, bytes]
 """Log time in nanoseconds, index of the topic, CDR bytes."""

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from rsltrace.errors import BagError
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.mcap.records import METADATA_YAML_BYTES_MAX
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.recordings.topic import BagQos, parse_qos

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Protocol
 
-from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.operation import nested_too_deep
 from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.recordings.merge import BagMessage
