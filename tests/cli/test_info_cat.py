@@ -443,7 +443,15 @@ print(sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
 
 
 _REPORTS = ("asyncio", "pydantic", "rclpy", "rich", "rosbags", "ruamel.yaml", "textual", "jinja2")
-_HEAVY = ("numpy", "mcap", "rerun", "rsltrace.trace.format", "rsltrace.fast_dataclass")
+_HEAVY = (
+    "numpy",
+    "ctypes",
+    "json",
+    "mcap",
+    "rerun",
+    "rsltrace.trace.format",
+    "rsltrace.fast_dataclass",
+)
 
 
 @pytest.mark.parametrize(

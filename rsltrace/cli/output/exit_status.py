@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -108,6 +107,8 @@ def status_of(command: Callable[[], object]) -> int:
         status = status_without_output(error)
     except Exception:
         # Python's own status would be 1, which means of some commands that runs differ.
+        import traceback
+
         tell(traceback.format_exc(), end="")
         status = EXIT_USAGE
     status = status if isinstance(status, int) else EXIT_USAGE if status else 0
