@@ -91,6 +91,7 @@ def all_cases() -> list[Case]:
 def child_environment(folder: Path) -> dict[str, str]:
     """Return an environment in which a native graph neither meets others nor litters."""
     environment = dict(os.environ)
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # users have their modules compiled
     environment.pop("ROS_LOCALHOST_ONLY", None)  # its successor, next line, is enough
     environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     # Domains 1 to 100 have ports below the ephemeral range on every platform.

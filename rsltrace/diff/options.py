@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 
 BY_ORDER = "order"
 BY_STAMP = "stamp"

@@ -6,7 +6,6 @@ unsigned 64-bit. Sentences are made on demand; nothing is decided by them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
@@ -20,6 +19,7 @@ from rsltrace.diff.facts.evidence import (
     Setting,
 )
 from rsltrace.diff.facts.remarks import Outcome, Remark, RepeatedRun, Repeats
+from rsltrace.fast_dataclass import dataclass
 
 if TYPE_CHECKING:
     from rsltrace.trace.words.entities import EntityKey

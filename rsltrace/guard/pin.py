@@ -7,8 +7,6 @@ library and sorted library folders. It costs one start of Python. ``unpin`` goes
 
 from __future__ import annotations
 
-import ctypes
-import json
 import os
 import sys
 import time
@@ -62,6 +60,8 @@ def pin() -> None:
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
         return
+    import json  # here, as ctypes below: few commands need them
+
     changes = pinned_variables()
     before = {name: os.environ.get(name) for name in changes}
     fixed = fix_addresses(True)
@@ -89,6 +89,8 @@ def unpin() -> None:
     """Start this command again as it was before ``pin``; return if it was not pinned."""
     if _before in ("", _UNPINNED):
         return
+    import json
+
     before = json.loads(_before)
     if before.pop("addresses", False):
         fix_addresses(False)
@@ -124,6 +126,8 @@ def has_fixed_addresses() -> bool:
 
 def _personality(value: int) -> int:
     """Call ``personality``; -1 where the system has none or forbids it."""
+    import ctypes
+
     try:
         return int(ctypes.CDLL(None).personality(ctypes.c_ulong(value)))
     except (OSError, AttributeError):

@@ -17,10 +17,10 @@ from __future__ import annotations
 import ast
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import EditError, did_you_mean
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import TimeInRun, parse_stamp, parse_time_in_run
 from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.model.entity import EntityKind

@@ -7,12 +7,12 @@ it has the times of the callbacks.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import (
     CDR_HEADER,
     METADATA_NATIVE,

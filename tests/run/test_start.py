@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import gc
 import importlib.metadata
+import pickle
 import subprocess
 import sys
 from contextlib import suppress
@@ -12,6 +15,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from rsltrace import fast_dataclass
 from rsltrace.cli.main import cli
 from rsltrace.run.provenance import _PACKAGES, _versions
 
@@ -50,6 +54,44 @@ def test_a_small_run_loads_no_generators_no_plugins_and_no_metadata(tmp_path: Pa
     loaded = done.stdout.splitlines()[-1]
     assert '"rsltrace.run.session"' in loaded
     assert [name for name in _NOT_NEEDED if f'"{name}"' in loaded] == []
+
+
+@fast_dataclass.dataclass(frozen=True, slots=True)
+class Kept:
+    a: int
+    b: tuple[int, ...]
+
+
+def test_a_quick_dataclass_is_one_of_pythons() -> None:
+    options = {"frozen": True, "slots": True}
+    annotations = {"a": int, "b": list[int], "c": int}
+    for names in (["a", "b", "c"], ["a"], []):
+        given = {name: annotations[name] for name in names}
+        body = {"__annotations__": given, "c": dataclasses.field(default=3, compare=False)}
+        body = body if "c" in names else {"__annotations__": given}
+        quick, own = (
+            make(**options)(type("Made", (), dict(body)))
+            for make in (fast_dataclass.dataclass, dataclasses.dataclass)
+        )
+        values = [[1, (2,)], [1, (2,), 4], [2, (2,)]] if len(names) == 3 else [[1], [2]]
+        values = values if names else [[]]
+        for one in values:
+            assert repr(quick(*one)) == repr(own(*one))
+            assert hash(quick(*one)) == hash(own(*one))
+            assert quick(*one) != own(*one)
+            for other in values:
+                assert (quick(*one) == quick(*other)) is (own(*one) == own(*other))
+        assert [field.name for field in dataclasses.fields(quick)] == names
+        made = quick(*values[0])
+        assert not hasattr(made, "__dict__")
+        for name in names:
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                setattr(made, name, 0)
+            with pytest.raises(dataclasses.FrozenInstanceError):
+                delattr(made, name)
+        assert (
+            pickle.loads(pickle.dumps(Kept(1, (2,)))) == Kept(1, (2,)) == copy.copy(Kept(1, (2,)))
+        )
 
 
 def test_versions_are_those_of_the_packages_metadata() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any, NamedTuple
 
 from ruamel.yaml import YAML
@@ -13,6 +13,7 @@ from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import YAMLError
 
 from rsltrace.errors import JobError, did_you_mean
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job import Job
 from rsltrace.job.reading.yaml_source import SourcePlace
 from rsltrace.trace.model.operation import nested_too_deep

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 
 from rsltrace.adapters.processes.child import ProcessHandle
 from rsltrace.adapters.processes.process import Process
 from rsltrace.errors import RunError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.simulation.loop.loop import Dispatchable
 from rsltrace.simulation.loop.stop import Stop

@@ -18,13 +18,13 @@ import tempfile
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.adapters.processes.adapter import ProcessProgram
 from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError
+from rsltrace.fast_dataclass import dataclass
 
 SOURCES = Path(__file__).parent / "native"
 _STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"

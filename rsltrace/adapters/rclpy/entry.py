@@ -6,12 +6,12 @@ import re
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.errors import JobError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.finding import GuardPolicy
 
 

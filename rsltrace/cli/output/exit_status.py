@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import os
 import sys
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -118,6 +117,8 @@ def status_of(command: Callable[[], object]) -> int:
         if isinstance(error, ModuleNotFoundError) and error.name in _OF_UNIX:
             status = _failed(_NEEDS_UNIX, EXIT_USAGE)
         else:
+            import traceback
+
             tell(traceback.format_exc(), end="")
             status = EXIT_USAGE
     status = status if isinstance(status, int) else EXIT_USAGE if status else 0

@@ -6,7 +6,6 @@ values of their own are members of ``DivergenceKind`` and ``CauseKind``.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 from rsltrace.diff.facts.evidence import (
@@ -18,6 +17,7 @@ from rsltrace.diff.facts.evidence import (
     Setting,
     StateDifference,
 )
+from rsltrace.fast_dataclass import dataclass
 
 
 class Verdict(Enum):

@@ -5,10 +5,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.model.texts import Stamp

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 from rsltrace.diff.facts.evidence import Fact
+from rsltrace.fast_dataclass import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,10 @@ enabling one does not change what others draw.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.distribution import Constant, Distribution
 from rsltrace.simulation.chance.stream import RandomStream
 from rsltrace.trace.model.operation import NODE_TOPICS

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from math import sqrt
 from typing import TYPE_CHECKING, Protocol
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.simulation.chance.portable_math import exp, log
 
 if TYPE_CHECKING:

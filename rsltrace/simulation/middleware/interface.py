@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import PurePath
 from types import CodeType, CoroutineType, FunctionType, MethodType
+
+from rsltrace.fast_dataclass import dataclass
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ PendingMessages = list[Any]
 contains nothing that the garbage collector must visit."""
 
 PENDING_FIELDS = 4
-LARGE_BYTES = 1 << 20
+LARGE_BYTES = 64 << 10
 """Messages from this size on are not copied."""
 
 

@@ -165,10 +165,10 @@ _ZSTD_LEVEL = 1
 _SAMPLES = 32
 _SAMPLE_BYTES = 16 << 10
 _PAYS = 0.8
-"""A large message is compressed only if samples shrink to this factor."""
+"""Large messages are compressed only if samples, an eighth at most, shrink to this factor."""
 
 _TRUSTED = 15
-"""The number of a topic's large messages stored without a test after one that did not shrink."""
+"""The number of chunks with large messages of a topic that go without a test after one."""
 
 _ROWS = zstandard.ZstdCompressionParameters.from_level(
     _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
@@ -207,7 +207,7 @@ class McapWriter:
         self._compression = compression
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._row_compressor = zstandard.ZstdCompressor(compression_params=_ROWS)
-        self._trusted: dict[tuple[int, ...], int] = {}
+        self._trusted: dict[tuple[int, ...], tuple[int, bool]] = {}
         self._progress = progress
         self._summary = SummaryBuilder()
         self._schema_ids: dict[tuple[str, str], int] = {}
@@ -337,17 +337,19 @@ class McapWriter:
     def _packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...]]:
         """Return the compression of a chunk, and its data in parts.
 
-        Compressing what does not shrink takes as long as writing it, so samples of large messages
-        decide, for the topic's next ones, too. Only the bytes matter, so equal runs give equal
-        files.
+        Compressing what does not shrink takes up to seven times as long as writing it (numbers of a
+        point cloud), so samples of large messages decide, for the topic's next ones, too. Only the
+        bytes matter, so equal runs give equal files.
         """
         if not self._compression:
             return "", body.parts
         if len(body.parts) > 1:
             channels = tuple(channel for channel, _, _ in body.indexes)
-            trusted = self._trusted.get(channels, 0)
-            if trusted or not self._pays(body.parts):
-                self._trusted[channels] = trusted - 1 if trusted else _TRUSTED
+            trusted, pays = self._trusted.get(channels, (0, False))
+            if not trusted:
+                trusted, pays = _TRUSTED + 1, self._pays(body.parts)
+            self._trusted[channels] = trusted - 1, pays
+            if not pays:
                 return "", body.parts
         packer = self._row_compressor if body.rows else self._compressor
         return self._compression, (packer.compress(body.records),)
@@ -355,7 +357,7 @@ class McapWriter:
     def _pays(self, parts: tuple[bytes, ...]) -> bool:
         total = packed = 0
         for part in parts:
-            step = max(len(part) // _SAMPLES, _SAMPLE_BYTES)
+            step = max(len(part) // _SAMPLES, 8 * _SAMPLE_BYTES)
             for at in range(0, len(part), step):
                 sample = part[at : at + _SAMPLE_BYTES]
                 total += len(sample)

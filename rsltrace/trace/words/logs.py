@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import Output
 from rsltrace.trace.model.operation import NODE_TOPICS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import printable

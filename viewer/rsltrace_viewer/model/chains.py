@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace_viewer.model.run import Run
 
 if TYPE_CHECKING:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import RsltraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace_viewer.model.run import Run
 
 if TYPE_CHECKING:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import RsltraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.texts import format_duration, printable
 from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace

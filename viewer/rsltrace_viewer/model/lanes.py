@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.texts import format_duration, format_seconds
 from rsltrace.trace.words.entities import RUN_NAME

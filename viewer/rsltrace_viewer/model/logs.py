@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import OutputKind
 from rsltrace.trace.model.texts import printable, shortened

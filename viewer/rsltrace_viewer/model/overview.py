@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.contents import Occurrences, add_occurrences
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import (

@@ -8,7 +8,6 @@ needs no more memory than a small one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, EventKind, EventRecord, Output, OutputKind

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import ast
 import hashlib
-from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.code import code_file, code_places, output_places, places_text

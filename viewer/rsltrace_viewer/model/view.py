@@ -5,12 +5,13 @@ A *place* is a row of the unfiltered timeline. Of one run it is the index of the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 from rich.cells import cell_len, set_cell_size
+
+from rsltrace.fast_dataclass import dataclass
 
 if TYPE_CHECKING:
     from rsltrace.diff.alignment.aligned_rows import AlignedRows

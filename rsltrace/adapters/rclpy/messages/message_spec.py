@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from rsltrace.adapters.rclpy.messages.interface_classes import nested_class, type_name
+from rsltrace.fast_dataclass import dataclass
 
 HEADER = b"\x00\x01\x00\x00"
 """Encapsulation header of plain little-endian CDR; positions count from after it."""

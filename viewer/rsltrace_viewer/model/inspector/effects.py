@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import OutputKind, is_second_copy
 from rsltrace_viewer.model.query.conditions import Mask, find

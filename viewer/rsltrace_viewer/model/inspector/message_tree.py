@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from typing import Any
 
 import numpy as np
 
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.texts import PLACEHOLDERS, printable, shortened
 
 # Lines of the inspector: a tree written as lines with depths, opened where one wants to look.

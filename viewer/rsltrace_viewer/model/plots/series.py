@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from rsltrace.checks.latency.measure import measuring
 from rsltrace.errors import TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import NO_EVENT, OutputKind

@@ -7,13 +7,13 @@ numbers; those that must read messages are given a mask of the events still in q
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import ConditionError, TraceError
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.model.event import EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.logs import log_record

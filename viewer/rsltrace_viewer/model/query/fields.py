@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import ConditionError, TraceError, near_or_all
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.job.values.times import parse_time_in_run
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import WITH_TOPIC

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+
+from rsltrace.fast_dataclass import dataclass
 
 LARGEST = 2**64 - 1
 """The end of a range that has none: stamps, indexes and hashes are unsigned 64-bit."""

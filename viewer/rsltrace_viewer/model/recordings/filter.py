@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from functools import partial
 from itertools import islice
 
@@ -19,6 +18,7 @@ from rsltrace.conditions.topic_fields import OF_MESSAGE, with_topic_prefix
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError, near_or_all
+from rsltrace.fast_dataclass import dataclass
 from rsltrace.trace.decode import to_plain
 from rsltrace.trace.words.entities import LOG_LEVELS, is_named
 from rsltrace.trace.words.logs import parse_log

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 
 from rich.cells import set_cell_size
 
 from rsltrace.diff.row_sign import RowSign
+from rsltrace.fast_dataclass import dataclass
 from rsltrace_viewer.model.timeline.events import EventText
 from rsltrace_viewer.model.view import cells, fit
 
