@@ -3,7 +3,8 @@
     python campaigns/gtests FOLDER [-k PART] [--timeout 60]
 
 FOLDER has the executables, at any depth, as a build of rclcpp's tests leaves them. Each runs as a
-whole; a test that did not pass in that run has a run of its own.
+whole; a test that crashes or hangs ends the process, and the rest runs in a new one. One that
+failed has a run of its own.
 The exit status is 0 if every test that passes natively passes in rsltrace, or is in ``known.py``.
 """
 
@@ -13,18 +14,20 @@ import argparse
 import fnmatch
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from known import KNOWN
 
 PASSED = "passed"
+_HUNG = "not done after"
+_STEP = re.compile(r"^\[ +(RUN|OK|FAILED|SKIPPED) +\] ([\w/.]+)(?:, where .*)?(?: \(\d+ ms\))?$")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -38,14 +41,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for program in executables(options.folder, options.part):
         with tempfile.TemporaryDirectory(prefix="gtests_") as temporary:
             folder = Path(temporary)
-            tests = _names(_results(folder, [str(program), "--gtest_list_tests"], options.timeout))
+            tests = names(_run(folder, [str(program), "--gtest_list_tests"], options.timeout)[0])
             here = verdicts(folder, program, tests, options.timeout, simulated=False)
             passing = [test for test in tests if here[test] == PASSED]
             there = verdicts(folder, program, passing, options.timeout, simulated=True)
         total, native = total + len(tests), native + len(passing)
         alike = sum(there[test] == PASSED for test in passing)
         both += alike
-        print(f"{program.name}: {len(passing)} of {len(tests)} natively, {alike} in rsltrace")
+        print(
+            f"{program.name}: {len(passing)} of {len(tests)} natively, {alike} in rsltrace",
+            flush=True,
+        )
         for test in passing:
             if there[test] == PASSED:
                 continue
@@ -70,22 +76,36 @@ def executables(folder: Path, part: str) -> list[Path]:
     ]
 
 
+def names(listed: str) -> list[str]:
+    """Return the tests that ``--gtest_list_tests`` lists, without those that are disabled."""
+    found, suite = [], ""
+    for line in listed.splitlines():
+        name = line.partition("#")[0].rstrip()
+        if not name.startswith("  "):
+            suite = name
+        elif suite.endswith(".") and "DISABLED_" not in suite + name:
+            found.append(suite + name.strip())
+    return found
+
+
 def verdicts(
     folder: Path, program: Path, tests: Sequence[str], limit_s: float, *, simulated: bool
 ) -> dict[str, str]:
     """Return how each test went: ``passed``, or what it said."""
 
-    def run(which: str) -> dict[str, str]:
-        command = [str(program), f"--gtest_filter={which}"]
-        found = _results(folder, command, limit_s, simulated=simulated)
-        if isinstance(found, str):
-            return dict.fromkeys(which.split(":"), found)
-        return {f"{suite}.{one['name']}": _verdict(one) for suite, one in _each(found)}
+    def run(which: Sequence[str]) -> dict[str, str]:
+        command = [str(program), f"--gtest_filter={':'.join(which)}"]
+        return _went(*_run(folder, command, limit_s, simulated=simulated))
 
-    went = run(":".join(tests)) if tests else {}
+    went: dict[str, str] = {}
+    left = list(tests)
+    while left:
+        found = run(left)
+        went.update(found or dict.fromkeys(left, "did not run"))
+        left = [test for test in left if test not in went]
     for test in tests:
-        if went.get(test) != PASSED:
-            went[test] = run(test).get(test, "did not run")
+        if went[test] != PASSED and len(tests) > 1 and not went[test].startswith(_HUNG):
+            went.update(run([test]))
     return went
 
 
@@ -94,13 +114,10 @@ def reason_for(name: str) -> str:
     return next((why for which, why in KNOWN.items() if fnmatch.fnmatch(name, which)), "")
 
 
-def _results(
+def _run(
     folder: Path, command: Sequence[str], limit_s: float, *, simulated: bool = False
-) -> dict[str, Any] | str:
-    """Run a command of gtest; return what it reports, or how it ended without a report."""
-    report = folder / "report.json"
-    report.unlink(missing_ok=True)
-    command = [*command, f"--gtest_output=json:{report}"]
+) -> tuple[str, str]:
+    """Run a command of gtest; return what it printed, and how it ended."""
     if simulated:
         node = {"program": command[0], "arguments": command[1:], "required": True}
         job = {"nodes": [node], "clocks": {"source": "topic"}, "stop": {"duration": "1h"}}
@@ -113,36 +130,41 @@ def _results(
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
         "ROS_LOG_DIR": str(folder / "log"),
     }
-    try:
-        ended = subprocess.run(
-            command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, timeout=limit_s,
-            capture_output=True, text=True, errors="replace", check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return f"not done after {limit_s:g} s of wall time"
-    if report.exists():
-        found: dict[str, Any] = json.loads(report.read_text())
-        return found
-    said = [line for line in ended.stderr.splitlines() if line.startswith("rsltrace: error")]
-    return said[0] if said else f"ended with status {ended.returncode}"
+    with (folder / "said").open("w+") as said, (folder / "errors").open("w+") as errors:
+        process = subprocess.Popen(
+            command,
+            cwd=folder,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=errors,
+        )
+        try:
+            how = f"ended with status {process.wait(limit_s)}"
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            process.wait()
+            how = f"{_HUNG} {limit_s:g} s of wall time"
+        said.seek(0)
+        errors.seek(0)
+        why = [line for line in errors if line.startswith("rsltrace: error")]
+        return said.read(), why[0].strip() if why else how
 
 
-def _each(found: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
-    for suite in found["testsuites"]:
-        for one in suite["testsuite"]:
-            yield suite["name"], one
-
-
-def _names(found: dict[str, Any] | str) -> list[str]:
-    if isinstance(found, str):
-        return []
-    return [f"{suite}.{one['name']}" for suite, one in _each(found)]
-
-
-def _verdict(one: dict[str, Any]) -> str:
-    if "failures" in one:
-        return " ".join(one["failures"][0]["failure"].split())[:300]
-    return PASSED if one["result"] == "COMPLETED" else one["result"].lower()
+def _went(printed: str, how: str) -> dict[str, str]:
+    """Return how each test went that was begun."""
+    went: dict[str, str] = {}
+    begun, text = "", ""
+    for line in printed.splitlines():
+        step = _STEP.match(line)
+        if step is None:
+            text += f" {line.strip()}" if len(text) < 300 else ""
+        elif step[1] == "RUN":
+            begun, text = step[2], ""
+        elif step[2] == begun:
+            went[begun] = PASSED if step[1] == "OK" else f"{step[1].lower()}:{text}"
+            begun = ""
+    return {**went, begun: f"{how}:{text}"} if begun else went
 
 
 if __name__ == "__main__":

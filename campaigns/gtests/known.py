@@ -1,4 +1,17 @@
-"""Which tests of rclcpp go another way in a simulation, and why: ``docs/qualification/index.md``."""
+"""Which tests of rclcpp go another way in a simulation, and why."""
 
-KNOWN: dict[str, str] = {}
+KNOWN = {
+    "test_executors TestExecutors/*.testRaceConditionAddNode": (
+        "its threads compute until another one sets a flag; here a thread runs until it waits"
+    ),
+    "test_executors_busy_waiting TestBusyWaiting/MultiThreadedExecutor.test_spin": (
+        "counts how often an executor looks before another thread runs"
+    ),
+    "test_events_executor TestEventsExecutor.spin_once_max_duration_timer": (
+        "expects what a node sends itself before it waits; here it arrives when it waits"
+    ),
+    "test_qos_event TestQosEvent.test_on_new_event_callback": (
+        "expects to be called for earlier events at once; here it is when it waits"
+    ),
+}
 """By ``executable test``, as a pattern of the shell."""

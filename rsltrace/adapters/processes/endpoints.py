@@ -110,7 +110,7 @@ class _QueueEndpoint(Receiver):
 
     def arriving_type(self) -> str:
         """Return the type of what arrives."""
-        return self.type_name
+        raise NotImplementedError
 
     def changed(
         self, args: tuple[int, WakeReason, bytes], change: Callable[[bytes], bytes]
@@ -152,6 +152,9 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
         self.process = process
         self.number = number
         self._received = 0
+
+    def arriving_type(self) -> str:
+        return self.type_name
 
     def packed(self, delivery: Delivery) -> bytes:
         self._received += 1
