@@ -21,6 +21,7 @@ _LIBRARIES = (
     "rcl_yaml_param_parser",
     "tracetools",
     "rosidl_runtime_c",
+    "rosidl_typesupport_c",
     "std_msgs__rosidl_typesupport_c",
     "std_msgs__rosidl_generator_c",
     "std_srvs__rosidl_typesupport_c",

@@ -17,7 +17,7 @@ import std_msgs.msg
 from rosidl_parser.definition import BasicType
 
 import rsltrace
-from rsltrace.adapters.processes.build import find_ros
+from rsltrace.adapters.processes.build import PreloadLibrary, find_ros, program
 from rsltrace.adapters.rclpy.messages.interface_classes import forget_interfaces
 from rsltrace.diff import diff_files
 from rsltrace.errors import JobError, SetupError
@@ -455,3 +455,28 @@ def test_a_diff_does_not_advise_to_record_the_state_of_a_process(
     (first,) = diff_files(tmp_path / "a.mcap", tmp_path / "b.mcap").divergences[:1]
     assert "/counter" in first.sentence
     assert first.root_sentence.endswith("itself is not deterministic")
+
+
+def test_a_type_whose_libraries_are_not_found_is_named_with_what_was_looked_for(
+    compiled: Compiled, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "job.yaml").write_text(f"nodes: [{{program: {compiled('unknown_type.c')}}}]\n")
+    run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
+    said = capfd.readouterr().err
+    assert "the message has no type support for Fast DDS; is the prefix of its package" in said
+    assert "libnowhere__rosidl_typesupport_fastrtps_c.so" in said
+
+
+def test_a_process_finds_the_libraries_of_the_prefixes_that_are_sourced(tmp_path: Path) -> None:
+    for name in ("has", "known", "has_none"):
+        (tmp_path / name / "lib").mkdir(parents=True)
+    for name in ("has", "known"):
+        (tmp_path / name / "lib" / "libmine.so").touch()
+    prefixes = ":".join(str(tmp_path / name) for name in ("has", "known", "has_none"))
+    around = {"AMENT_PREFIX_PATH": prefixes, "LD_LIBRARY_PATH": f"{tmp_path}/known/lib"}
+    preload = PreloadLibrary(tmp_path / "a.so", tmp_path / "b.so", find_ros())
+    made = program(
+        [sys.executable], preload, surroundings=around, environment={}, folder=None
+    ).environment
+    found = made["LD_LIBRARY_PATH"].split(":")
+    assert found[-2:] == [f"{tmp_path}/known/lib", f"{tmp_path}/has/lib"]

@@ -172,9 +172,9 @@ def packed_item(
 
 def changed_item(item: bytes, change: Callable[[bytes], bytes]) -> tuple[bytes, bytes]:
     """Return an item with other data, and that data."""
-    *head, _ = _ITEM.unpack_from(item)
+    source_ns, received_ns, number, reception, gid, _ = _ITEM.unpack_from(item)
     data = change(item[_ITEM.size :])
-    return packed_item(*head, data), data
+    return packed_item(source_ns, received_ns, number, reception, gid, data), data
 
 
 def gid_of(entity_id: int) -> bytes:

@@ -20,6 +20,20 @@ constexpr const char *KINDS[] = {"rosidl_typesupport_fastrtps_c",
                                  "rosidl_typesupport_fastrtps_cpp"};
 constexpr std::size_t ENCAPSULATION = 4;
 
+// The dispatch of rosidl says what it has looked for and not found, of each kind.
+void not_found(const char *what, const std::string &reasons) {
+  const std::string text = std::string("the ") + what +
+                           " has no type support for Fast DDS; is the prefix of its package sourced?" + reasons;
+  RMW_SET_ERROR_MSG(text.c_str());
+}
+
+std::string reason() {
+  std::string text;
+  if (rcutils_error_is_set()) text = std::string("; ") + rcutils_get_error_string().str;
+  rcutils_reset_error();
+  return text;
+}
+
 // "std_msgs__msg" (C) and "std_msgs::msg" (C++) are one name.
 std::string joined(const char *where, const char *name) {
   std::string text = where;
@@ -38,15 +52,16 @@ bool MessageCodec::find(const rosidl_message_type_support_t *given) {
     RMW_SET_ERROR_MSG("no type support was given");
     return false;
   }
+  std::string reasons;
   for (const char *kind : KINDS) {
     const auto *found = get_message_typesupport_handle(given, kind);
     if (found != nullptr) {
       callbacks_ = static_cast<const message_type_support_callbacks_t *>(found->data);
       return true;
     }
-    rcutils_reset_error();
+    reasons += reason();
   }
-  RMW_SET_ERROR_MSG("the message has no type support for Fast DDS: build it with rosidl's default");
+  not_found("message", reasons);
   return false;
 }
 
@@ -91,6 +106,7 @@ bool ServiceCodec::find(const rosidl_service_type_support_t *given) {
     RMW_SET_ERROR_MSG("no type support was given");
     return false;
   }
+  std::string reasons;
   for (const char *kind : KINDS) {
     const auto *found = get_service_typesupport_handle(given, kind);
     if (found != nullptr) {
@@ -98,9 +114,9 @@ bool ServiceCodec::find(const rosidl_service_type_support_t *given) {
       name = joined(service->service_namespace_, service->service_name_);
       return request.find(service->request_members_) && response.find(service->response_members_);
     }
-    rcutils_reset_error();
+    reasons += reason();
   }
-  RMW_SET_ERROR_MSG("the service has no type support for Fast DDS: build it with rosidl's default");
+  not_found("service", reasons);
   return false;
 }
 
