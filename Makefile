@@ -16,7 +16,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-all test-long test-native test-kilted test-arm truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
+.PHONY: demo test test-all test-long test-native test-kilted test-arm truth attack rclpy-tests rclcpp-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -85,6 +85,11 @@ truth: compiled
 RCLPY ?=
 rclpy-tests: $(INSTALLED)
 	$(BIN)/python campaigns/rclpy_suite --rclpy $(RCLPY)
+
+# rclcpp's own gtests, that you have built, natively and here: make rclcpp-tests PREFIX=folder/of/the/executables
+PREFIX ?=
+rclcpp-tests: $(INSTALLED)
+	$(BIN)/python campaigns/gtests $(PREFIX)
 
 # The tests that run nodes, on the next release of ROS 2, in an environment of its own.
 KILTED := VENV=.venv-kilted ROS=ros-kilted,dev-ros-kilted

@@ -17,15 +17,11 @@ checkout of rclpy (none of its code is kept here):
 - **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
   rclpy and its compiled parts, unmodified, on [the library of processes](../processes.md).
 
-Wherever a test spins, sleeps, waits or starts a thread, simulated time passes. `make rclpy-tests
-RCLPY=PATH` does it without the document.
+`make rclpy-tests RCLPY=PATH` does it without the document.
 
 | rclpy {version} | here | process |
 |---|---|---|
 {counts}
-
-(Some tests are too sensitive to load to pass natively three times in a row; in simulated time they
-pass.)
 
 ## What is excluded, and why
 

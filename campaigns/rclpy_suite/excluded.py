@@ -13,10 +13,7 @@ _HERE: dict[str, str] = {
     "test_get_type_description": _NATIVE,
 }
 
-_ONE = (
-    "expects that one wait hands over a response and a message together; here a wait hands over "
-    "one thing, and the response came first"
-)
+_ONE = "expects a response and a message in one wait; here a wait hands over one thing"
 _STANDS = "expects that time passes between two statements; in a process it stands still there"
 _NEWER = "fails natively, too: it sets what the compiled rclpy of the wheels does not have"
 

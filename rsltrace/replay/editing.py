@@ -55,6 +55,7 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
     :raises EditError: it receives none, or the edit does not fit.
     """
     from rsltrace.adapters.rclpy.messages.codec import codec_for
+    from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 
     handle, kind, args = call.handle, call.kind, call.args
     is_coroutine = hasattr(handle, "task")
@@ -64,6 +65,11 @@ def receive_edited(edit: Edit, call: EventCall) -> None:
             call.input_hash = _change_arrival(part, edit)
             return
         args = tuple(one for one in _begun_with(handle, kind) if _is_message(one))[:1]
+    if hasattr(handle, "arriving_type"):  # of a process
+        codec = codec_for(get_message_class(handle.arriving_type()))
+        call.args, data = handle.changed(args, partial(_recoded, codec, edit))
+        call.input_hash = hash64(data)
+        return
     if kind == EventKind.BAG or (args and isinstance(args[0], bytes)):
         data = changed_data(handle, edit, args[0])
         call.input_hash = hash64(data)

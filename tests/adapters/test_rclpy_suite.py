@@ -116,3 +116,32 @@ def test_the_document_is_that_of_the_table() -> None:
         assert counts.suite == counts.passed + counts.excluded + counts.failed
         assert counts.excluded == len(excluded[way])
         assert counts.failed == 0
+
+
+# Something like a gtest executable. What it prints depends on whether it is in a simulation.
+GTEST = r"""#!/bin/sh
+list='Some.\n  passes\n  dies  # GetParam() = 1\n  DISABLED_x\n'
+case "$1" in --gtest_list_tests) printf "$list"; exit;; esac
+case "$1" in *passes*) printf '[ RUN      ] Some.passes\n[       OK ] Some.passes (0 ms)\n';; esac
+case "$1" in *dies*) printf '[ RUN      ] Some.dies\n';; *) exit;; esac
+case "$*" in *--ros-args*) echo 'a.cpp:1: Failure'; exit 7;; esac
+printf '[       OK ] Some.dies (0 ms)\n'
+"""
+
+
+@pytest.mark.long
+def test_a_gtest_that_passes_natively_only_is_named(tmp_path: Path) -> None:
+    program = tmp_path / "build" / "test_some"
+    program.parent.mkdir()
+    program.write_text(GTEST)
+    program.chmod(0o755)
+    command = [sys.executable, str(SUITE.with_name("gtests")), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 1, done.stderr
+    assert "test_some: 2 of 2 natively, 1 in rsltrace" in done.stdout
+    assert "Some.dies: rsltrace: error: process " in done.stdout
+    assert "a.cpp:1: Failure" in done.stdout
+    assert (
+        "2 tests: 2 pass natively, 1 of these in rsltrace; 0 are known to differ, 1 are not"
+        in done.stdout
+    )

@@ -40,11 +40,3 @@ def test_what_the_compiler_refuses_is_shown(
     _building_in(tmp_path, monkeypatch)
     with pytest.raises(SetupError, match=r"cannot build .*headers of rmw(.|\n)*no-such-header.h"):
         build.library(lambda text: None, ["-include", "no-such-header.h"])
-
-
-def test_libraries_are_also_searched_in_the_prefixes_of_the_ament_index(tmp_path: Path) -> None:
-    (tmp_path / "lib").mkdir()
-    library = build.PreloadLibrary(Path("a.so"), Path("b.so"), build.RosInstallation(tmp_path, ()))
-    around = {"LD_LIBRARY_PATH": "/first", "AMENT_PREFIX_PATH": f"{tmp_path}:/nowhere"}
-    made = build.program(["/bin/true"], library, surroundings=around, environment={}, folder=None)
-    assert made.environment["LD_LIBRARY_PATH"] == f"/first:{tmp_path / 'lib'}"

@@ -17,8 +17,9 @@ import std_msgs.msg
 from rosidl_parser.definition import BasicType
 
 import rsltrace
-from rsltrace.adapters.processes.build import find_ros
+from rsltrace.adapters.processes.build import PreloadLibrary, find_ros, program
 from rsltrace.adapters.rclpy.messages.interface_classes import forget_interfaces
+from rsltrace.diff import diff_files
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run, watchdog
@@ -419,3 +420,53 @@ def test_without_headers_the_error_says_what_to_install(
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
     with pytest.raises(SetupError, match="need ROS 2 with its headers"):
         find_ros()
+
+
+def test_a_message_that_a_process_receives_can_be_edited(counter: Path, tmp_path: Path) -> None:
+    run(_job(tmp_path, counter), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        found = (trace.event(index) for index in range(trace.event_count))
+        at = [
+            event.index
+            for event in found
+            if event.kind is EventKind.SUBSCRIPTION and trace.entity(event.entity).name == "/echo"
+        ][3]
+    edits = [f"{at}: message.data += 100"]
+    rsltrace.replay(tmp_path / "run.mcap", edits=edits, output=tmp_path / "b.mcap", trust=True)
+    heard = [
+        data
+        for name in ("run", "b")
+        for _, data in _said(tmp_path / f"{name}.mcap", "/heard")["/heard"]
+    ]
+    numbers = [int.from_bytes(data[4:12], "little") for data in heard]
+    half = len(numbers) // 2
+    assert numbers[half:] == [*numbers[:3], numbers[3] + 100, *numbers[4:half]]
+    again = rsltrace.replay(tmp_path / "b.mcap", trust=True)
+    assert again.is_whole, again.sentence
+
+
+def test_a_diff_does_not_advise_to_record_the_state_of_a_process(
+    counter: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        (tmp_path / "more").write_text(str(ord(name)))  # which no trace has
+        run(_job(tmp_path, counter), tmp_path / f"{name}.mcap")
+    (first,) = diff_files(tmp_path / "a.mcap", tmp_path / "b.mcap").divergences[:1]
+    assert "/counter" in first.sentence
+    assert first.root_sentence.endswith("itself is not deterministic")
+
+
+def test_a_process_finds_the_libraries_of_the_prefixes_that_are_sourced(tmp_path: Path) -> None:
+    for name in ("has", "known", "has_none"):
+        (tmp_path / name / "lib").mkdir(parents=True)
+    for name in ("has", "known"):
+        (tmp_path / name / "lib" / "libmine.so").touch()
+    prefixes = ":".join(str(tmp_path / name) for name in ("has", "known", "has_none"))
+    around = {"AMENT_PREFIX_PATH": prefixes, "LD_LIBRARY_PATH": f"{tmp_path}/known/lib"}
+    preload = PreloadLibrary(tmp_path / "a.so", tmp_path / "b.so", find_ros())
+    made = program(
+        [sys.executable], preload, surroundings=around, environment={}, folder=None
+    ).environment
+    found = made["LD_LIBRARY_PATH"].split(":")
+    assert found[-2:] == [f"{tmp_path}/known/lib", f"{tmp_path}/has/lib"]

@@ -43,6 +43,7 @@ def _compile(name: str, target: Path, extra: Sequence[str] = ()) -> Path:
     words += [f"-Wl,-rpath,{p / 'lib'}" for p in prefixes]
     words += [
         "-lrclcpp",
+        "-llibstatistics_collector",
         "-lrcl",
         "-lrmw",
         "-lrcutils",

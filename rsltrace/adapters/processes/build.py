@@ -341,19 +341,22 @@ def program(
     libraries = [str(place) for place in library.ros.libraries]
     around = {**surroundings, _UNBUFFERED: "1", **environment}
     around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
-    libraries += _listed(around, "LD_LIBRARY_PATH")
-    there = os.pathsep.join(libraries).split(os.pathsep)
-    for prefix in around.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
-        place = os.path.join(prefix, "lib")
-        if prefix and place not in there and os.path.isdir(place):
-            libraries.append(place)  # set by hand: a sourced setup.bash lists it
-    around["LD_LIBRARY_PATH"] = os.pathsep.join(libraries)
     if search_path:
         around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
     if prefixes:  # what is built comes first
         found = [*_listed(around, "AMENT_PREFIX_PATH"), *prefixes]
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
+    known = [*libraries, *_listed(around, "LD_LIBRARY_PATH")]
+    around["LD_LIBRARY_PATH"] = os.pathsep.join([*known, *_not_in(known, around)])
     return ProcessProgram(list(command), around, folder, pinned)
+
+
+def _not_in(known: Sequence[str], environment: Mapping[str, str]) -> list[str]:
+    """Return where prefixes that are sourced have libraries that nobody would look for."""
+    prefixes = os.pathsep.join(_listed(environment, "AMENT_PREFIX_PATH")).split(os.pathsep)
+    places = [Path(prefix) / "lib" for prefix in prefixes if prefix]
+    folders = os.pathsep.join(known).split(os.pathsep)
+    return [str(one) for one in places if str(one) not in folders and any(one.glob("lib*.so"))]
 
 
 def _listed(environment: Mapping[str, str], name: str) -> list[str]:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Protocol
 
-from rsltrace.adapters.processes.wire import WakeReason, gid_of, packed_item
+from rsltrace.adapters.processes.wire import WakeReason, changed_item, gid_of, packed_item
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
@@ -107,6 +108,18 @@ class _QueueEndpoint(Receiver):
         """Return an arrival as the process reads it."""
         raise NotImplementedError
 
+    def arriving_type(self) -> str:
+        """Return the type of what arrives."""
+        raise NotImplementedError
+
+    def changed(
+        self, args: tuple[int, WakeReason, bytes], change: Callable[[bytes], bytes]
+    ) -> tuple[tuple[int, WakeReason, bytes], bytes]:
+        """Return the arguments of ``go_on_with`` with another message, and that message."""
+        number, ready, item = args
+        item, data = changed_item(item, change)
+        return (number, ready, item), data
+
 
 class _CallbackEndpoint(_QueueEndpoint):
     """An endpoint whose callback has a name, if the process says it."""
@@ -139,6 +152,9 @@ class ProcessSubscription(_CallbackEndpoint, Subscription):
         self.process = process
         self.number = number
         self._received = 0
+
+    def arriving_type(self) -> str:
+        return self.type_name
 
     def packed(self, delivery: Delivery) -> bytes:
         self._received += 1
@@ -174,6 +190,9 @@ class ProcessService(_CallbackEndpoint, Service):
         self._asked[gid, request_id.sequence_number] = request_id
         return _packed_exchange(exchange, gid)
 
+    def arriving_type(self) -> str:
+        return f"{self.type_name}_Request"
+
     def answer(self, gid: bytes, number: int, data: bytes) -> None:
         """Send a response; one to nobody's request is lost, as in DDS."""
         request_id = self._asked.pop((gid, number), None)
@@ -202,6 +221,9 @@ class ProcessClient(_QueueEndpoint, Client):
 
     def packed(self, exchange: Exchange) -> bytes:
         return _packed_exchange(exchange, gid_of(self.entity_id))
+
+    def arriving_type(self) -> str:
+        return f"{self.type_name}_Response"
 
 
 def _packed_exchange(exchange: Exchange, gid: bytes) -> bytes:

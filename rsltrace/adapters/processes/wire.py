@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Any
 
@@ -167,6 +168,13 @@ def packed_item(
 ) -> bytes:
     """Return a message, request or response as it is handed over."""
     return _ITEM.pack(source_ns, received_ns, number, reception, gid, len(data)) + data
+
+
+def changed_item(item: bytes, change: Callable[[bytes], bytes]) -> tuple[bytes, bytes]:
+    """Return an item with other data, and that data."""
+    source_ns, received_ns, number, reception, gid, _ = _ITEM.unpack_from(item)
+    data = change(item[_ITEM.size :])
+    return packed_item(source_ns, received_ns, number, reception, gid, data), data
 
 
 def gid_of(entity_id: int) -> bytes:

@@ -368,7 +368,8 @@ def _hidden(
     if case.why == NODE:
         return None
     case.blame(inside=inside)
-    state_unknown = bool(case.one.entity.node and not case.one.state_hash)
+    node = case.one.entity.node
+    state_unknown = case.relevance.is_of_a_class(node) and not case.one.state_hash
     return NoEarlierDifference(doubt, state_unknown, case.relevance.guard_is_off)
 
 

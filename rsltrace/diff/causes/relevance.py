@@ -212,6 +212,10 @@ class Relevance:
                     found |= {name for name, of in self._classes if of == target}
         return found
 
+    def is_of_a_class(self, node: str) -> bool:
+        """Whether a node has a state to record: one in a process of its own has no class here."""
+        return node in self._modules
+
     @cached_property
     def guard_is_off(self) -> bool:
         """Whether one of the runs had ``guard: false``."""
