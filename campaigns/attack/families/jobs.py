@@ -161,8 +161,8 @@ def _types(rng: Random, case: Case, corpus: Corpus) -> None:
     for _ in range(rng.choice((1, 1, 1, 3))):
         path = rng.choice(_places(job))
         _at(job, path[:-1])[path[-1]] = rng.choice(_VALUES)
-    case.user_code = True  # a node may not take the value as its parameter
     _ask(rng, case, _dumped(job).replace("NaN", ".nan").replace("Infinity", ".inf"))
+    case.user_code = True  # a node may not take the value as its parameter
 
 
 def _unknown_texts(rng: Random, case: Case, corpus: Corpus) -> None:
