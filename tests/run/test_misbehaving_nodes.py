@@ -234,7 +234,7 @@ def test_force_replaces_the_old_trace_by_one_that_is_whole(
         ("pass", "has not called super().__init__(name)"),
         ("self.create_timer(1.0, print)", "must call super().__init__(name) first"),
         ("self.declare_parameter('x', 1)", "must call super().__init__(name) first"),
-        ("rclpy.spin_once(self)", "must call super().__init__(name) first"),
+        ("import rclpy; rclpy.spin_once(self)", "must call super().__init__(name) first"),
     ],
 )
 def test_a_node_without_its_constructor(

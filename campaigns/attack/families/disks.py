@@ -208,8 +208,10 @@ def _strange_outputs(rng: Random, case: Case, corpus: Corpus) -> None:
     case.names = (*case.names, place, "a.mcap")
     case.note = f"writes to {place}"
     case.commands.append(_command(case, words))
+    is_read = words[0] != "diff" or place not in ("job.yaml", "robot.py")
     case.judge = lambda runs: (
-        _inputs_kept(case, before, runs[-1]) + _devices_kept(case.folder, runs[-1])
+        (_inputs_kept(case, before, runs[-1]) if is_read else [])
+        + _devices_kept(case.folder, runs[-1])
     )
 
 

@@ -162,6 +162,7 @@ def _types(rng: Random, case: Case, corpus: Corpus) -> None:
         path = rng.choice(_places(job))
         _at(job, path[:-1])[path[-1]] = rng.choice(_VALUES)
     _ask(rng, case, _dumped(job).replace("NaN", ".nan").replace("Infinity", ".inf"))
+    case.user_code = True  # a node may not take the value as its parameter
 
 
 def _unknown_texts(rng: Random, case: Case, corpus: Corpus) -> None:
