@@ -422,6 +422,7 @@ def test_without_headers_the_error_says_what_to_install(
         find_ros()
 
 
+@long
 def test_a_message_that_a_process_receives_can_be_edited(counter: Path, tmp_path: Path) -> None:
     run(_job(tmp_path, counter), tmp_path / "run.mcap")
     with Trace.open(tmp_path / "run.mcap") as trace:
