@@ -183,7 +183,8 @@ def test_a_folder_reproduces_the_run_also_when_it_is_moved_with_its_sources(
     assert "- it needs no idle\n" in text
     assert "seed" not in text
     assert {path.name for path in folder.iterdir()} == {
-        "README.md", "diff.txt", "failing.mcap", "job.yaml", "passing.mcap", "test_reproduces.py"
+        "README.md", "diff.txt", "failing.mcap", "job.yaml", "passing.mcap", "passing.yaml",
+        "test_reproduces.py",
     }  # fmt: skip
     with Trace.open(folder / "failing.mcap") as one, Trace.open(folder / "passing.mcap") as other:
         assert one.digest == reduced.result.digest != other.digest
