@@ -127,6 +127,9 @@ def test_what_is_no_ros_argument_remains() -> None:
     words = ["a", "x:=y", "--ros-args", "-r", "x:=y", "--", "b", "--ros-args"]
     assert arguments.RosArguments(words).others == real().rclpy_remove_ros_args(words)
     assert arguments.RosArguments(words).others == ["a", "b"]
+    for wrong in (["a", "--ros-args", "--x", "y"], ["--ros-args", "-r"], ["--ros-args", "-p", "1"]):
+        ours = text_of(boundary().rclpy_remove_ros_args, wrong)
+        assert ours == text_of(real().rclpy_remove_ros_args, wrong)
 
 
 # -- parameters ------------------------------------------------------------------------------------
