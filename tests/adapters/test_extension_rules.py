@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from rsltrace.adapters.rclpy import arguments, names
@@ -127,6 +127,9 @@ def test_what_is_no_ros_argument_remains() -> None:
     words = ["a", "x:=y", "--ros-args", "-r", "x:=y", "--", "b", "--ros-args"]
     assert arguments.RosArguments(words).others == real().rclpy_remove_ros_args(words)
     assert arguments.RosArguments(words).others == ["a", "b"]
+    for wrong in (["a", "--ros-args", "--x", "y"], ["--ros-args", "-r"], ["--ros-args", "-p", "1"]):
+        ours = text_of(boundary().rclpy_remove_ros_args, wrong)
+        assert ours == text_of(real().rclpy_remove_ros_args, wrong)
 
 
 # -- parameters ------------------------------------------------------------------------------------
@@ -251,6 +254,7 @@ def test_profiles_are_compatible_where_ros_says_so(one: Any, other: Any) -> None
 LOGGERS = st.sampled_from(["", "a", "a.b", "a.b.c", "a.", "a..b", ".a", ".", "b", "a.b.d", "aa"])
 
 
+@example([("", 0), ("a", None)])
 @given(st.lists(st.tuples(LOGGERS, st.sampled_from([None, 0, 10, 20, 30, 40, 50, 15, -1, 60]))))
 def test_loggers_have_the_levels_that_ros_gives_them(steps: list[tuple[str, int | None]]) -> None:
     theirs, ours = real(), LogLevels()
@@ -316,3 +320,11 @@ def test_enums_exceptions_and_profiles_are_those_of_the_extension() -> None:
     )
     point = extension.rcl_time_point_t(5, theirs.ClockType.STEADY_TIME)
     assert (point.nanoseconds, point.clock_type.name) == (5, "STEADY_TIME")
+
+
+def test_a_name_is_a_text() -> None:
+    for check in (names.topic_fault, names.full_topic_fault, names.node_name_fault):
+        with pytest.raises(TypeError):
+            check(1)  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        names.expand(1, "n", "/")  # type: ignore[arg-type]

@@ -28,7 +28,7 @@ class LogLevels:
 
     def get(self, name: str) -> int:
         """Return the level that was set for a logger itself, UNSET if none was."""
-        return self._levels.get(name, 0) or (0 if name else LEVELS["INFO"])
+        return self._levels.get(name, 0 if name else LEVELS["INFO"])
 
     def effective(self, name: str) -> int:
         """Return the level of a logger: its own, that of the next one above it, or the default."""

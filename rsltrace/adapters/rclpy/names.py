@@ -25,7 +25,7 @@ _SUBSTITUTION = re.compile(r"\{[^}]*\}")
 
 def node_name_fault(name: str) -> Fault | None:
     """Return what is wrong with the name of a node, without namespace."""
-    text = name.encode()
+    text = str.encode(name)
     if not text:
         return "node name must not be empty", 0
     if found := _NOT_IN_NAMES.search(text):
@@ -39,7 +39,7 @@ def node_name_fault(name: str) -> Fault | None:
 
 def full_topic_fault(name: str) -> Fault | None:
     """Return what is wrong with the full name of a topic or service."""
-    text = name.encode()
+    text = str.encode(name)
     fault = _path_fault(text, "topic name", "topic name must not end with a '/'")
     if fault is None and len(text) > _TOPIC_MAX:
         return "topic length should not exceed '255U - 8U'", _TOPIC_MAX - 1
@@ -48,7 +48,7 @@ def full_topic_fault(name: str) -> Fault | None:
 
 def namespace_fault(namespace: str) -> Fault | None:
     """Return what is wrong with a namespace."""
-    text = namespace.encode()
+    text = str.encode(namespace)
     if text == b"/":
         return None
     fault = _path_fault(text, "namespace", "namespace must not end with a '/', unless only a '/'")
@@ -76,7 +76,7 @@ def _path_fault(text: bytes, what: str, slash_at_end: str) -> Fault | None:
 def topic_fault(name: str) -> Fault | None:
     """Return what is wrong with a topic or service name that may be relative, begin with ``~`` or
     have substitutions."""
-    text = name.encode()
+    text = str.encode(name)
     if not text:
         return "topic name must not be empty string", 0
     if text[:1].isdigit():

@@ -389,7 +389,8 @@ class RclpyBoundary:
         try:
             yield
         except UnknownArgumentsError as error:
-            raise self.UnknownROSArgsError(str(error)) from error
+            text = str(error)
+            raise self.UnknownROSArgsError(text.partition(": ")[2] if prefix else text) from error
         except InvalidArgumentsError as error:
             raise self.RCLInvalidROSArgsError(f"{prefix}{error}") from error
 
