@@ -3,10 +3,10 @@
     sudo apt-get install debootstrap qemu-user-static binfmt-support
     sudo make test-arm                       # or: python -m campaigns.arm cart ping_pong/job_burst
 
-A Debian for arm64 is unpacked in ``out/arm`` (nothing of it is installed or started), the aarch64
-wheels of rsltrace's dependencies are unpacked into its Python, and so are the parts of ROS's wheels
-that are not compiled: on ARM rsltrace records without any of ROS's binaries. Each job is then
-recorded on both. The exit status is 0 if all digests are equal.
+A Debian for arm64 is unpacked in ``out/arm`` (nothing of it is installed or started). The aarch64
+wheels of rsltrace's dependencies are unpacked into its Python, and ``rsltrace install-ros`` adds
+rclpy without ROS's libraries. Each job is then recorded on both. The exit status is 0 if all
+digests are equal.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 
@@ -68,7 +68,7 @@ def _unpack(system: Path) -> None:
     shutil.rmtree(first)
     (system / "tmp").mkdir(exist_ok=True)
     needed = [one for one in metadata.requires("rsltrace") or () if "extra ==" not in one]
-    needed.append("pyyaml")  # rclpy's
+    needed += ["pyyaml", "kiss-icp"]  # rclpy's, and that of an example
     wheels = ROOT / "wheels"
     platforms = [f"--platform=manylinux_2_{minor}_aarch64" for minor in GLIBC]
     command = [sys.executable, "-m", "pip", "download", "-qq", "--only-binary=:all:"]
@@ -77,21 +77,8 @@ def _unpack(system: Path) -> None:
     for wheel in sorted(wheels.glob("*.whl")):
         with zipfile.ZipFile(wheel) as packed:
             packed.extractall(system / PACKAGES)
-    for path, source in _ros_files():
-        target = system / PACKAGES / path
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(source, target)
-
-
-def _ros_files() -> Iterator[tuple[str, Path]]:
-    """Yield the files of ROS's wheels that are not compiled: path in site-packages, file here."""
-    for distribution in metadata.distributions():
-        if not distribution.metadata["Name"].startswith("ros-"):
-            continue
-        for path in distribution.files or ():
-            source = Path(str(distribution.locate_file(path)))
-            if ".so" not in path.name and ".." not in path.parts and source.is_file():
-                yield str(path), source
+    ros = [sys.executable, "-m", "rsltrace", "install-ros", "--into", str(system / PACKAGES)]
+    subprocess.run(ros, check=True, stdout=subprocess.DEVNULL)
 
 
 def _copy_project(target: Path) -> None:

@@ -42,6 +42,7 @@ _COMMANDS = {
     "rerun": "Show a trace, or two side by side, in Rerun.",
     "export": "Export a trace to a rosbag2 bag, Perfetto or a Foxglove layout.",
     "diff": "Show where two traces or recordings first diverge, and why.",
+    "install-ros": "Install rclpy where ROS has no wheels for the machine.",
     "mcp": "Serve AI agents over the Model Context Protocol.",
 }
 """Each is the function of its name in the module of its name, beside this one."""
@@ -58,7 +59,8 @@ class LazyGroup(click.Group):
         """Import a command, or return None if there is none of that name."""
         if cmd_name not in _COMMANDS:
             return None
-        command = getattr(importlib.import_module(f"rsltrace.cli.{cmd_name}"), cmd_name)
+        module = cmd_name.replace("-", "_")
+        command = getattr(importlib.import_module(f"rsltrace.cli.{module}"), module)
         assert isinstance(command, click.Command)
         return command
 

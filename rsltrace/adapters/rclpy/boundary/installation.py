@@ -307,8 +307,8 @@ def boundary() -> RclpyBoundary:
             sys.modules.pop(NAME, None)
             raise SetupError(
                 "rclpy is not installed for this Python: install the ROS wheels with "
-                "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
-                f"({error})"
+                "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation; `rsltrace "
+                f"install-ros` is for machines that have neither ({error})"
             ) from error
         load_type_support(compiled=ours.real is not None)
         check_release(ours, Path(singleton.__file__).parents[1])

@@ -107,8 +107,8 @@ def _prefixes(package: str) -> Iterator[Path]:
     spec = find_spec(package)
     for location in (spec.submodule_search_locations or []) if spec is not None else []:
         # <prefix>/lib/python3.12/site-packages/<package>, or one folder deeper; of packages that
-        # are not built: <prefix>/site-packages/<package>
-        yield from list(Path(location).parents)[1:5]
+        # are not built: <prefix>/site-packages/<package>; of install-ros --into: <prefix>/<package>
+        yield from list(Path(location).parents)[:5]
     for entry in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         if entry:
             yield Path(entry)
