@@ -445,6 +445,8 @@ WRITES = {
     "rsltrace/search/perturb.py": "mkdir symlink_to",
     "rsltrace/search/verify.py": "unlink",
     "rsltrace/trace/recordings/files.py": "open",  # an unpacked file of a bag
+    # Where Python packages are, under the names in wheels of the package index.
+    "rsltrace/cli/install_ros.py": "mkdir write_bytes write_text",
     # Nowhere.
     "rsltrace/adapters/rclpy/terminals/calls.py": "open",
     "rsltrace/cli/output/exit_status.py": "open",

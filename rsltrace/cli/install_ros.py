@@ -103,8 +103,8 @@ def _unpack(wheel: Path, packages: Path, data: Path) -> int:
     written: list[Path] = []
     with zipfile.ZipFile(wheel) as packed:
         for name in packed.namelist():
-            target = None if name.endswith("/") else _place(name, packages, data)
-            if target is not None and ".." not in target.parts:
+            target = _place(name, packages, data)
+            if target is not None:
                 target.parent.mkdir(parents=True, exist_ok=True)
                 target.write_bytes(packed.read(name))
                 written.append(target)
@@ -118,6 +118,8 @@ def _unpack(wheel: Path, packages: Path, data: Path) -> int:
 
 def _place(name: str, packages: Path, data: Path) -> Path | None:
     """Return where a file of a wheel is written, None for what is compiled or for building."""
+    if name.endswith("/") or name.startswith("/") or ".." in PurePosixPath(name).parts:
+        return None
     shared = _SHARED.match(name)
     if shared:
         return data / shared[1]
