@@ -20,7 +20,9 @@ from contextlib import suppress
 from rsltrace.errors import DebugError
 
 _PR_SET_PDEATHSIG, _PR_GET_TID_ADDRESS = 1, 40
-_CLONE, _SET_ROBUST_LIST, _GET_ROBUST_LIST = 56, 273, 274  # of x86_64
+_CALLS = {"x86_64": (56, 273, 274), "aarch64": (220, 99, 100)}
+"""The numbers of the kernel's ``clone``, ``set_robust_list`` and ``get_robust_list``."""
+_MACHINE = os.uname().machine
 _CLONE_PARENT, _CLONE_CHILD_CLEARTID, _CLONE_CHILD_SETTID = 0x8000, 0x200000, 0x1000000
 _SIGCHLD = 17
 _NULL = ctypes.c_void_p()
@@ -97,7 +99,10 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
     """
     read_end, write_end = os.pipe()
     try:
-        is_copy = _is_copy_of_many() if other_threads() else _is_copy_of_one()
+        if other_threads() or _MACHINE not in _CALLS:
+            is_copy = _is_copy_of_many()
+        else:
+            is_copy = _is_copy_of_one()
         if is_copy:
             with suppress(BaseException):
                 die_with_parent(parent)
@@ -125,7 +130,7 @@ def fork_below(pairs: Pairs) -> int:
     :raises DebugError: if no process can be made.
     """
     parent = os.getpid()
-    pid = _c.fork() if other_threads() else _clone(0)
+    pid = _c.fork() if other_threads() or _MACHINE not in _CALLS else _clone(0)
     if not _is_copy(pid):
         return int(pid)
     try:
@@ -149,15 +154,17 @@ def _clone(more_flags: int) -> int:
     does nothing else but call handlers (``pthread_atfork``), which see to locks and threads of
     others, and to generators of random numbers: a checkpoint is to have the same ones.
     """
+    clone, set_robust_list, get_robust_list = _CALLS[_MACHINE]
     tid, robust, size = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_size_t()
     _c.prctl(_PR_GET_TID_ADDRESS, ctypes.byref(tid), _NULL, _NULL, _NULL)
-    _c.syscall(_GET_ROBUST_LIST, _NULL, ctypes.byref(robust), ctypes.byref(size))
+    _c.syscall(get_robust_list, _NULL, ctypes.byref(robust), ctypes.byref(size))
     flags = more_flags | _SIGCHLD
     if tid:
         flags |= _CLONE_CHILD_SETTID | _CLONE_CHILD_CLEARTID
-    pid = _c.syscall(_CLONE, ctypes.c_long(flags), _NULL, _NULL, tid, _NULL)
+    last = (tid, _NULL) if _MACHINE == "x86_64" else (_NULL, tid)  # tid and tls change places
+    pid = _c.syscall(clone, ctypes.c_long(flags), _NULL, _NULL, *last)
     if pid == 0 and robust:
-        _c.syscall(_SET_ROBUST_LIST, robust, size)
+        _c.syscall(set_robust_list, robust, size)
     return int(pid)
 
 
