@@ -117,7 +117,7 @@ def test_everything(write: Callable[..., Path], prefix: Path) -> None:
         "number": "12",
     }
     assert [Path(file).name for file in talk.parameter_files] == ["demo.yaml"]
-    assert talk.arguments == ("--loud", "jackal")
+    assert talk.arguments == ("--loud", "jackal", "--ros-args", "--log-level", "warn")
     assert talk.remappings == {"tf": "/tf_all", "chatter": "/chat"}
     assert (component.parameters, component.remappings) == ({"shared": 7, "gain": 3}, {"in": "out"})
     assert specs[6].start_after == StartAfterSpec.after(1_000_000_000)
