@@ -278,6 +278,7 @@ def test_order():
 def test_modules_that_pytest_compiles(
     tmp_path: Path, capfd: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.delenv("PYTEST_ADDOPTS", raising=False)  # of the run that this test is in
     (tmp_path / "test_things.py").write_text(TESTS)
     words = "[-q, -s, -p, 'no:cacheprovider', --rootdir=., test_things.py]"
     (tmp_path / "job.yaml").write_text(
