@@ -49,5 +49,5 @@ def test_two_runs(tmp_path: Path) -> None:
     gallery.write_gallery(tmp_path / "a.mcap", 40)
     gallery.write_gallery(tmp_path / "b.mcap", 40, differs_from=20)
     export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
-    assert picture.take(tmp_path / "ab.rrd", tmp_path / "ab.png", "event", 60) == []
+    assert picture.take(tmp_path / "ab.rrd", tmp_path / "ab.png", "row", 60) == []
     assert colours(tmp_path / "ab.png") > 50
