@@ -497,6 +497,27 @@ class RclpyBoundary:
         pass
 
 
+HANDLES: dict[str, type] = {
+    "ActionClient": ActionClientHandle,
+    "ActionGoalHandle": GoalHandle,
+    "ActionServer": ActionServerHandle,
+    "Client": ClientHandle,
+    "Clock": ClockHandle,
+    "ClockEvent": ClockEventHandle,
+    "Context": ContextHandle,
+    "EventHandle": EventHandle,
+    "GuardCondition": GuardConditionHandle,
+    "LifecycleStateMachine": StateMachineHandle,
+    "Node": NodeHandle,
+    "Publisher": PublisherHandle,
+    "Service": ServiceHandle,
+    "Subscription": SubscriptionHandle,
+    "Timer": TimerHandle,
+    "TypeDescriptionService": TypeDescriptionServiceHandle,
+    "WaitSet": WaitSetHandle,
+}
+"""The classes of the objects that the boundary makes, by their names in rclpy's extension."""
+
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
 
 

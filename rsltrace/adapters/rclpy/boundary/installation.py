@@ -13,7 +13,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from importlib.machinery import ModuleSpec
@@ -25,7 +25,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from rsltrace.adapters.rclpy import boundary as package
-from rsltrace.adapters.rclpy.boundary.boundary import RclpyBoundary
+from rsltrace.adapters.rclpy.boundary.boundary import HANDLES, RclpyBoundary
 from rsltrace.adapters.rclpy.boundary.extension import NAME
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.guard.guard import engage
@@ -258,15 +258,17 @@ def _quick(real: Callable[[Any, Any], None]) -> Any:
 
 KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
 _USED = re.compile(rb"_rclpy\.([A-Za-z]\w*)")
-_IN_A_COMMENT = {b"rclpy_init", b"rclpy_ok"}
+_DECLARED = re.compile(r"^(?:class (?P<kind>\w+)|    def (?P<method>[A-Za-z]\w*)\()", re.MULTILINE)
+_UNUSED = {"add_to_waitset"}  # executors get no wait set here
 
 
-def check_release(replacement: Any, package: Path) -> None:
+def check_release(replacement: Any, handles: Mapping[str, type], package: Path) -> None:
     """Raise SetupError if rclpy uses a name of its extension that is missing in ``replacement``.
 
+    ``handles`` are the classes of the objects that it makes, by their names in the extension;
     ``package`` is the folder of rclpy's sources.
     """
-    missing = missing_parts(replacement, package)
+    missing = missing_parts(replacement, handles, package)
     if missing:
         raise SetupError(
             f"this version of rsltrace cannot simulate the rclpy in {package}: it uses "
@@ -276,16 +278,38 @@ def check_release(replacement: Any, package: Path) -> None:
         )
 
 
-def missing_parts(replacement: Any, package: Path) -> list[str]:
+def missing_parts(replacement: Any, handles: Mapping[str, type], package: Path) -> list[str]:
     """Return the names of the extension that rclpy's sources use and that are missing, sorted."""
-    used = set()
-    for path in package.rglob("*.py"):
-        source = path.read_bytes()
-        for found in _USED.finditer(source):
-            if source[found.start() - 1] not in b"'\"[":  # else: in a text for type checkers
-                used.add(found[1])
-    names = map(bytes.decode, used - _IN_A_COMMENT)
-    return sorted(name for name in names if not hasattr(replacement, name))
+    files = set(package.rglob("*.py")) - {package / "impl" / "implementation_singleton.py"}
+    sources = b"\n".join(path.read_bytes() for path in files)  # that one only has an example
+    names = set()
+    for found in _USED.finditer(sources):
+        before = sources[sources.rfind(b"\n", 0, found.start()) + 1 : found.start()]
+        if b"#" not in before and before[-1:] not in (b"'", b'"', b"["):  # texts for type checkers
+            names.add(found[1].decode())
+    missing = [name for name in names if not hasattr(replacement, name)]
+    for kind, method in _methods(getattr(replacement, "real", None), package):
+        handle = handles.get(kind)
+        if handle is None or method in _UNUSED or hasattr(handle, method):
+            continue
+        if f".{method}(".encode() in sources:
+            missing.append(f"{kind}.{method}")
+    return sorted(missing)
+
+
+def _methods(real: Any, package: Path) -> Iterator[tuple[str, str]]:
+    """Yield the classes of the extension with their methods: of the extension itself, or as its
+    stub file declares them, which rclpy has since Kilted."""
+    if real is not None:
+        for kind, of in vars(real).items():
+            yield from ((kind, method) for method in getattr(of, "__dict__", ()))
+        return
+    stub = package / "impl" / "_rclpy_pybind11.pyi"
+    kind = ""
+    for found in _DECLARED.finditer(stub.read_text("utf-8") if stub.is_file() else ""):
+        kind = found["kind"] or kind
+        if found["method"]:
+            yield kind, found["method"]
 
 
 _installed: RclpyBoundary | None = None
@@ -311,7 +335,7 @@ def boundary() -> RclpyBoundary:
                 f"install-ros` is for machines that have neither ({error})"
             ) from error
         load_type_support(compiled=ours.real is not None)
-        check_release(ours, Path(singleton.__file__).parents[1])
+        check_release(ours, HANDLES, Path(singleton.__file__).parents[1])
         _installed = ours
     return _installed
 
