@@ -99,10 +99,7 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
     """
     read_end, write_end = os.pipe()
     try:
-        if other_threads() or _MACHINE not in _CALLS:
-            is_copy = _is_copy_of_many()
-        else:
-            is_copy = _is_copy_of_one()
+        is_copy = _is_copy_of_one() if _may_clone() else _is_copy_of_many()
         if is_copy:
             with suppress(BaseException):
                 die_with_parent(parent)
@@ -130,7 +127,7 @@ def fork_below(pairs: Pairs) -> int:
     :raises DebugError: if no process can be made.
     """
     parent = os.getpid()
-    pid = _c.fork() if other_threads() or _MACHINE not in _CALLS else _clone(0)
+    pid = _clone(0) if _may_clone() else _c.fork()
     if not _is_copy(pid):
         return int(pid)
     try:
@@ -140,6 +137,10 @@ def fork_below(pairs: Pairs) -> int:
     except BaseException:
         end_process(1)
     return 0
+
+
+def _may_clone() -> bool:
+    return _MACHINE in _CALLS and not other_threads()
 
 
 def _is_copy_of_one() -> bool:

@@ -11,7 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
+from rsltrace.cli.job_source import (
+    RosArgsCommand,
+    check_named,
+    job_of,
+    job_options,
+    ros_arguments_given,
+)
 from rsltrace.cli.options import (
     json_option,
     no_pin_option,
@@ -160,8 +166,8 @@ def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
     files = [Path(word) for word in given.words if ":=" not in word]
     files += [given.launch] if given.launch is not None else []
-    if not files:  # programs
-        files = [Path("run")]
+    check_named(files, given.launch)
+    files = files or [Path("run")]  # programs have no file, but a folder
     ros = given.ros
     files += [Path(ros[at + 1]) for at, word in enumerate(ros[:-1]) if word == "--params-file"]
     return [file.parent.resolve() / file.name for file in files]

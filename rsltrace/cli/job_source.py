@@ -150,6 +150,12 @@ def bags_given() -> bool:
     return bool(click.get_current_context().meta[_BAGS])
 
 
+def check_named(files: Sequence[object], launch: Path | None) -> None:
+    """Raise UsageError if this command line says nothing that a job could run."""
+    if not (files or launch or programs_given() or bags_given()):
+        raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
+
+
 def override_folder() -> Path:
     """Return where the paths of a command line start."""
     return Path(click.get_current_context().meta[_FOLDER])
@@ -204,8 +210,7 @@ def job_words(
     given = dict(word.split(":=", 1) for word in words if ":=" in word)
     if len(files) > 1:
         raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
-    if not files and launch is None and not overrides:
-        raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
+    check_named(files, launch)
     if launch is None and (given or skip):
         what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
         raise click.UsageError(f"{what}: give the launch file with --launch FILE")

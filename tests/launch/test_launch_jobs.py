@@ -141,6 +141,7 @@ def test_words_that_do_not_fit_together(
 ) -> None:
     for arguments, message in [
         ((), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),
+        (("--set", "seed=1"), "Missing argument 'JOB' (or --launch FILE, or -- PROGRAM)"),
         (("a.yaml", "b.yaml"), "give one JOB, not a.yaml and b.yaml"),
         (("job.yaml", "a:=1"), "a:=… is a launch argument: give the launch file with --launch"),
         (("job.yaml", "--skip-unsupported"), "--skip-unsupported: give the launch file"),
