@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,6 +32,7 @@ from rsltrace_viewer.terminal.screens.help import help_text
 
 from rsltrace.job.values.times import parse_stamp
 from rsltrace.trace.model.event import NO_EVENT
+from rsltrace.trace.reader import Trace
 
 
 def test_the_model_loads_no_terminal_library() -> None:
@@ -286,3 +288,13 @@ def test_no_line_of_help_is_wider_than_its_column(two: bool) -> None:
         assert max(line.cell_length for line in help_text(width, two=two).split("\n")) <= width - 6
     narrow = help_text(80, two=two).split("\n")
     assert max(line.cell_length for line in narrow) <= 62
+
+
+def test_a_callback_that_goes_on_later_says_that_it_waits() -> None:
+    sample = Path(__file__).parents[2] / "sample_traces" / "delayed_input" / "a.mcap"
+    with Trace.open(sample) as trace:
+        texts = EventTexts(Run(trace))
+        assert [texts.of(index).outputs for index in (249, 250)] == [
+            "/pose",
+            "waits",
+        ]

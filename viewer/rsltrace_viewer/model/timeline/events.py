@@ -81,6 +81,7 @@ class EventTexts:
         logs = [
             log_record(run.trace, output) for output in outputs if output.kind is OutputKind.LOG
         ]
+        suspended = EventFlag.SUSPENDED in event.flags
         return EventText(
             index=index,
             time=format_seconds(event.stamp_ns - run.base_ns),
@@ -89,7 +90,7 @@ class EventTexts:
             entity=entity_of(run, event),
             input_hash=f"{event.input_hash:016x}"[:6] if event.input_hash else "·",
             output_hash=f"{event.output_hash:016x}"[:6] if event.output_hash else "·",
-            outputs=outputs_text(run, outputs),
+            outputs=outputs_text(run, outputs) or ("waits" if suspended else ""),
             raised=EventFlag.RAISED in event.flags,
             warns=any(log is not None and log.level >= LEVEL_WARN for log in logs),
         )
