@@ -6,7 +6,8 @@ import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import grimp
@@ -123,11 +124,22 @@ def test_files_that_the_guard_knows_by_their_path_are_there() -> None:
     assert Path(callers._ADAPTER).is_dir()
 
 
+_parse: Callable[[str], ast.Module] = cache(ast.parse)  # several tests read all modules
+
+
+def dotted(node: ast.expr) -> str:
+    """Return names joined by dots, "" for what is more than names."""
+    if isinstance(node, ast.Attribute):
+        owner = dotted(node.value)
+        return owner and f"{owner}.{node.attr}"
+    return getattr(node, "id", "")
+
+
 def parsed() -> dict[str, ast.Module]:
     """Return the product's modules by their paths."""
     root = Path(__file__).parents[1]
     return {
-        str(path.relative_to(root)): ast.parse(path.read_text(encoding="utf-8"))
+        str(path.relative_to(root)): _parse(path.read_text(encoding="utf-8"))
         for folder in ("rsltrace", "viewer")
         for path in (root / folder).rglob("*.py")
     }
@@ -172,7 +184,7 @@ def data_names(modules: Iterable[ast.Module]) -> set[str]:
     slots = {
         text
         for kind in nodes
-        if isinstance(kind, ast.Assign) and ast.unparse(kind.targets[0]) == "__slots__"
+        if isinstance(kind, ast.Assign) and dotted(kind.targets[0]) == "__slots__"
         for text in ast.literal_eval(kind.value)
     }
     return fields | properties | own | slots
@@ -180,7 +192,7 @@ def data_names(modules: Iterable[ast.Module]) -> set[str]:
 
 def assigned(node: ast.AST) -> Iterator[tuple[ast.expr, str, ast.expr]]:
     """Yield object, attribute and value of each attribute that a statement sets."""
-    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
+    if isinstance(node, ast.Call) and dotted(node.func).endswith("setattr"):
         if len(node.args) == 3 and isinstance(node.args[1], ast.Constant):
             yield node.args[0], str(node.args[1].value), node.args[2]
         return
@@ -331,8 +343,8 @@ class _CodeFinder(ast.NodeVisitor):
         if name in _CALLS and not is_ours:
             self.found.add(name)
         words = {one.arg: one.value for one in node.keywords}
-        if ast.unparse(called) in _SHELLS:
-            self.found.add(ast.unparse(called))
+        if dotted(called) in _SHELLS:
+            self.found.add(dotted(called))
         if isinstance(words.get("shell"), ast.Constant) and words["shell"].value:  # type: ignore[attr-defined]
             self.found.add("shell=True")
         if isinstance(words.get("allow_pickle"), ast.Constant):
@@ -352,7 +364,7 @@ class _CodeFinder(ast.NodeVisitor):
 
 def _turns_into_code(source: str) -> set[str]:
     finder = _CodeFinder()
-    finder.visit(ast.parse(source))
+    finder.visit(_parse(source))
     for text in re.findall(r"^import ([\w, ]+)$", source, re.M):  # in programs that are texts here
         finder.found |= {one.strip().split(" ")[0] for one in text.split(",")} & _MODULES
     return finder.found
@@ -390,13 +402,13 @@ _OPENS_PORTS = {
 def _opens_for_others(source: str) -> set[str]:
     """Return what a module uses that changes files, or opens sockets."""
     found = set()
-    for node in ast.walk(ast.parse(source)):
+    for node in ast.walk(_parse(source)):
         if not isinstance(node, ast.Call):
             continue
         called = node.func
         name = getattr(called, "attr", getattr(called, "id", ""))
         if isinstance(called, ast.Attribute) or name.endswith("Server"):
-            found |= {name, ast.unparse(called)} & (_WRITES_FILES | _OPENS_PORTS)
+            found |= {name, dotted(called)} & (_WRITES_FILES | _OPENS_PORTS)
         modes = [*node.args[:2], *(w.value for w in node.keywords if w.arg in ("mode", "flags"))]
         if name in ("open", "fdopen") and any(map(_is_for_writing, modes)):
             found.add("open")
@@ -509,7 +521,7 @@ _MARKUP = {"from_markup", "Template"}
 def _formats_of_others(source: str) -> list[str]:
     """Return formats that are no texts or constants of the module, and what reads markup."""
     found = []
-    tree = ast.parse(source)
+    tree = _parse(source)
     texts = {
         name.id
         for node in ast.walk(tree)

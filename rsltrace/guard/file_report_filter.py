@@ -25,7 +25,7 @@ _COMPILED = "/__pycache__/"
 _BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
 """Modules through which others access the file system."""
 
-UNREPORTED_MODULES = frozenset(("logging", "threading", *SOURCE_READERS))
+UNREPORTED_MODULES = frozenset(("importlib.metadata", "logging", "threading", *SOURCE_READERS))
 """Modules that access files and the machine for their own records."""
 
 

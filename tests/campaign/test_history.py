@@ -58,6 +58,7 @@ def git(folder: Path, *words: str) -> str:
     return done.stdout.strip()
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_verify_appends_a_line_with_commit_and_digest(
     rsltrace: Command, job: WriteJob, tmp_path: Path

@@ -59,6 +59,7 @@ def test_of_a_core_type_that_makes_a_difference_the_way_out_is_named() -> None:
     assert "CORETYPE" not in verify_text._provoked(other, "rsltrace verify job.yaml --run 1")
 
 
+@pytest.mark.long
 def test_one_digest_is_stated_as_what_was_tried(
     rsltrace: Command, job: WriteJob, tmp_path: Path
 ) -> None:

@@ -109,6 +109,7 @@ def test_a_session_in_a_script(folder: Path) -> None:
     assert answers["goto 30"][0].split()[1] == "29"
 
 
+@pytest.mark.long
 def test_pdb_in_the_first_line_of_a_callback(folder: Path) -> None:
     done = script(
         folder,

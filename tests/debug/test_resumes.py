@@ -249,6 +249,7 @@ def test_what_the_viewer_says_of_those_that_go_on(waiting: Path) -> None:
     run.close()
 
 
+@pytest.mark.long
 def test_a_main_of_a_job_that_nobody_has_recorded(waiting: Path, trace: Trace) -> None:
     """Whether one that spins does something is known only when it has; then it is known."""
     wanted = events_of(trace, "waiting_nodes:main")

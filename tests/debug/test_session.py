@@ -205,6 +205,7 @@ def test_a_job_that_was_never_recorded(folder: Path) -> None:
         assert session.checkpoints()["why_not"] == ""
 
 
+@pytest.mark.long
 def test_a_trace_that_nobody_trusts_is_not_run(folder: Path) -> None:
     with pytest.raises(ReplayError, match="would run code"):
         DebugSession(folder / "run.mcap")

@@ -247,6 +247,7 @@ def test_however_a_socket_is_waited_for_its_answers_are_given_again(
     assert again.digest == first.digest
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_server_in_a_node_is_asked_again_by_the_trace(go: Callable[..., Any]) -> None:

@@ -448,6 +448,7 @@ def test_an_attribute_that_is_set_again_removed_and_added_is_seen(tmp_path: Path
     assert len({first, other, more, one, real}) == 5
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_a_node_may_say_itself_what_its_state_is(tmp_path: Path) -> None:
     from rsltrace.diff import diff_files

@@ -421,6 +421,7 @@ rclpy.spin(node)
 """
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_a_run_of_a_python_launch_file(
     write: Any, prefix: Path, command: Callable[..., subprocess.CompletedProcess[str]]

@@ -29,6 +29,7 @@ def wall(tmp_path: Path) -> Path:
     return tmp_path / "wall.py"
 
 
+@pytest.mark.long
 def test_from_a_failing_job_and_a_golden_trace_to_the_line(wall: Path) -> None:
     code = wall.read_text("utf-8")
     noise = '{"jsonrpc": "2.0", "id": 1, "result": {}}'

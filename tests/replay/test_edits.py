@@ -126,6 +126,7 @@ def test_attributes_and_parameters(folder: Path) -> None:
         assert [one.topic for one in sent if one is not None] == ["/parameter_events"]
 
 
+@pytest.mark.long
 def test_what_is_dropped_and_what_comes_later(folder: Path) -> None:
     recorded = folder / "run.mcap"
     tick = events(recorded, EventKind.TIMER, "Source.tick")[4]

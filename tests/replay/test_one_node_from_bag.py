@@ -126,6 +126,7 @@ def test_what_is_wrong_with_a_bag_is_said(robot: Path) -> None:
         rsltrace.replay("run.mcap", bag="bag")  # type: ignore[call-overload]
 
 
+@pytest.mark.long
 def test_the_command(robot: Path) -> None:
     done = command("run.mcap", "--node", "/filter")
     assert done.exit_code == 0, done.output

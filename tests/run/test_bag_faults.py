@@ -56,6 +56,7 @@ def plain(number: int) -> float:
 PLAIN = [plain(number) for number in range(1, 41)]
 
 
+@pytest.mark.long
 def test_a_message_of_a_bag_changes_swaps_or_comes_again_and_the_trace_has_that(
     tmp_path: Path,
 ) -> None:

@@ -116,6 +116,7 @@ JUST = [
 ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_a_simulator_drives_the_time_of_others(record_job: Callable[..., Any]) -> None:
     nodes = "nodes: [{node: nodes_under_test:Simulator}, {node: nodes_under_test:Robot}]\n"
     yaml = f"{nodes}clocks: {{source: topic}}\nstop: {{duration: 1.35s}}\n"

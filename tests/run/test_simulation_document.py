@@ -15,6 +15,7 @@ DOCUMENT = Path(__file__).parents[2] / "docs" / "simulation.md"
 MARK = "<!-- tested: tests/run/test_simulation_document.py -->\n```python\n"
 
 
+@pytest.mark.long
 def test_the_gym_like_example_reaches_its_goal(tmp_path: Path) -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     code = text.split(MARK)[1].split("```")[0]

@@ -65,7 +65,7 @@ def command(folder: Path, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("time", ["2.5", "2500ms", f"@{START_S}.0", f"@{START_S + 2}.5s"])
 def test_record_and_replay_mean_the_same_time(folder: Path, time: str) -> None:
     expected = 25 if "@" not in time or time.endswith("s") else 0
@@ -80,6 +80,7 @@ def test_record_and_replay_mean_the_same_time(folder: Path, time: str) -> None:
     assert len(listed.splitlines()) == expected
 
 
+@pytest.mark.long
 def test_edits_sessions_and_simulations_mean_the_same_time(folder: Path) -> None:
     branch = folder / "branch.mcap"
     for edit in ("2.45s: drop()", f"@{START_S + 2}.45s: drop()"):

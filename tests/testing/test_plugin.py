@@ -312,6 +312,7 @@ def test_tests_are_no_code_of_the_job(team: Run, tmp_path: Path) -> None:
     assert _modules(tmp_path / "golden" / "test_own.mcap") == {"counting", "test_own"}
 
 
+@pytest.mark.long
 def test_comparisons_are_lines_of_a_history(team: Run, tmp_path: Path) -> None:
     (tmp_path / "test_robot.py").write_text(
         "from rsltrace.testing import assert_matches_golden\n"

@@ -24,6 +24,7 @@ def check(seeds: range, folder: Path) -> None:
     assert bounded > 5 * len(seeds)
 
 
+@pytest.mark.long
 def test_no_run_takes_longer_than_its_bound(tmp_path: Path) -> None:
     check(range(3), tmp_path)
 

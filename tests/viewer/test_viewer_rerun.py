@@ -111,6 +111,7 @@ def follow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable
     assert list((tmp_path / "tmp").iterdir()) == []
 
 
+@pytest.mark.long
 def test_a_viewer_that_does_not_start(follow: Any, made: Path) -> None:
     async def steps(shown: Shown) -> None:
         screen = await shown.says("the selection is no longer followed")
