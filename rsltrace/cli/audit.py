@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
+from rsltrace.cli.job_source import Override, RosArgsCommand, job_of, job_options
 from rsltrace.errors import EXIT_USAGE
 from rsltrace.terminal import say, tell
 from rsltrace.trace.model.texts import printable
@@ -42,7 +42,7 @@ def audit(
     words: tuple[str, ...],
     launch: Path | None,
     skip: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     form: str,
     as_json: bool,
     unguarded: bool,
@@ -77,7 +77,7 @@ def audit(
 
 
 def _look(
-    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]
+    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[Override]
 ) -> AuditReport:
     from rsltrace.guard.audit.audit import audit_job, audit_path
 

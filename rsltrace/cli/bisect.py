@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import (
+    Override,
     RosArgsCommand,
     check_named,
     job_of,
@@ -85,7 +86,7 @@ def bisect(
     words: tuple[str, ...],
     launch: Path | None,
     skip: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     good: str,
     bad: str,
     expression: str | None,
@@ -166,7 +167,7 @@ def _named(given: JobArguments) -> list[Path]:
     """Return the files that the command line names, the job's (or launch file's) first."""
     files = [Path(word) for word in given.words if ":=" not in word]
     files += [given.launch] if given.launch is not None else []
-    check_named(files, given.launch)
+    check_named(files, given.launch, given.overrides)
     files = files or [Path("run")]  # programs have no file, but a folder
     ros = given.ros
     files += [Path(ros[at + 1]) for at, word in enumerate(ros[:-1]) if word == "--params-file"]

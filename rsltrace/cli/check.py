@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
+from rsltrace.cli.job_source import Override, RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.terminal import say, tell
@@ -56,7 +56,7 @@ def check(
     words: tuple[str, ...],
     launch: Path | None,
     skip: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     form: str,
     graph: Path | None,
     other: Path | None,
@@ -171,7 +171,7 @@ def _text(job: Job, checked: CheckedJob) -> list[str]:
     found = checked.overview
     lines = ["job:", *(f"  {line}" for line in job.to_yaml().splitlines()), ""]
     lines += [f"starts at simulated time {format_seconds(checked.start_ns)} s", ""]
-    lines.append("nodes:")
+    lines.append("nodes:" if found.nodes else "nodes: none, no entry makes one")
     for node in found.nodes:
         lines.append(f"  {node.name}  {node.type}".rstrip())
         lines += [

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import (
+    Override,
     RosArgsCommand,
     all_overrides,
     job_options,
@@ -174,7 +175,7 @@ def explore(
     words: tuple[str, ...],
     launch: Path | None,
     skip: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     strategy: str,
     budget: SearchBudget,
     stop_at_first: bool,

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from rsltrace.cli.explore import budget_option, explore, jobs_option, output_option
-from rsltrace.cli.job_source import RosArgsCommand, job_options, programs_given
+from rsltrace.cli.job_source import Override, RosArgsCommand, job_options, programs_given
 
 _DELAY = 'delay.default={"lognormal": {"median": "1ms", "sigma": 1.5}}'
 """Mostly a millisecond, one in a hundred over 30 ms: messages of other topics overtake each other
@@ -23,7 +23,7 @@ as on a loaded machine."""
 @click.option("--resume", is_flag=True, help="Continue the search in the output folder.")
 @click.option("--force", is_flag=True, help="Replace the search in the output folder.")
 @click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
-def flaky(overrides: tuple[str, ...], **options: Any) -> int:
+def flaky(overrides: tuple[Override, ...], **options: Any) -> int:
     """Run a test in many callback orders and with many delays, and keep the smallest run that
     fails and the nearest that passes.
 

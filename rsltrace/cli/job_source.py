@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+import shlex
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 _META = "rsltrace.ros_args"
 _PROGRAMS = "rsltrace.programs"
+_ADDED = ("nodes.+=", "launch.+=", "bags.+=")
+Override = str | tuple[str, str]
+"""A ``--set``, or an option and what that sets."""
 _BAGS = "rsltrace.bags"
 _FOLDER = "rsltrace.override_folder"
 
@@ -40,7 +44,7 @@ class RosArgsCommand(click.Command):
 
             launch, words = launch_file(params["launch"], params["words"])
             params.update(launch=launch, words=tuple(words))
-        entries = [("bags", {"path": str(path)}) for path in ctx.meta.get(_BAGS, ())]
+        entries = [("--bag", ("bags", {"path": str(path)})) for path in ctx.meta.get(_BAGS, ())]
         if programs is not None:
             from rsltrace.cli.programs import program_entries, program_name
 
@@ -52,8 +56,12 @@ class RosArgsCommand(click.Command):
                 )
             named = program_entries(programs)
             ctx.meta[_PROGRAMS] = program_name(named[0])
-            entries = [*named, *entries]
-        more = (f"{key}.+={json.dumps(entry, ensure_ascii=False)}" for key, entry in entries)
+            written = [f"-- {shlex.join(words)}" for words in programs]
+            entries = [*zip(written, named, strict=True), *entries]
+        more = (
+            (option, f"{key}.+={json.dumps(entry, ensure_ascii=False)}")
+            for option, (key, entry) in entries
+        )
         params["overrides"] = (*more, *params["overrides"])
         return left
 
@@ -150,9 +158,12 @@ def bags_given() -> bool:
     return bool(click.get_current_context().meta[_BAGS])
 
 
-def check_named(files: Sequence[object], launch: Path | None) -> None:
+def check_named(
+    files: Sequence[object], launch: Path | None, overrides: Iterable[Override]
+) -> None:
     """Raise UsageError if this command line says nothing that a job could run."""
-    if not (files or launch or programs_given() or bags_given()):
+    texts = (one if isinstance(one, str) else one[1] for one in overrides)
+    if not (files or launch or any(text.startswith(_ADDED) for text in texts)):
         raise click.UsageError("Missing argument 'JOB' (or --launch FILE, or -- PROGRAM).")
 
 
@@ -177,7 +188,7 @@ def job_of(
     words: Sequence[str],
     launch: Path | None,
     skip: bool,
-    overrides: Sequence[str | tuple[str, str]],
+    overrides: Sequence[Override],
 ) -> tuple[Job, Path]:
     """Return the job, and the path of the file that names it.
 
@@ -199,8 +210,8 @@ def job_words(
     words: Sequence[str],
     launch: Path | None,
     skip: bool,
-    overrides: Sequence[str | tuple[str, str]],
-) -> tuple[Path, list[str | tuple[str, str]], str | None]:
+    overrides: Sequence[Override],
+) -> tuple[Path, list[Override], str | None]:
     """Return the path of the job or launch file, all overrides, and the job's text if there is
     no job file.
 
@@ -210,7 +221,7 @@ def job_words(
     given = dict(word.split(":=", 1) for word in words if ":=" in word)
     if len(files) > 1:
         raise click.UsageError(f"give one JOB, not {' and '.join(files)}")
-    check_named(files, launch)
+    check_named(files, launch, overrides)
     if launch is None and (given or skip):
         what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
         raise click.UsageError(f"{what}: give the launch file with --launch FILE")
@@ -230,10 +241,10 @@ def job_words(
 
 
 def all_overrides(
-    overrides: Sequence[str], seed: int | None, until: str | None
-) -> list[str | tuple[str, str]]:
+    overrides: Sequence[Override], seed: int | None, until: str | None
+) -> list[Override]:
     """Return the overrides of ``--set``, then those of ``--seed`` and ``--until``."""
-    found: list[str | tuple[str, str]] = list(overrides)
+    found: list[Override] = list(overrides)
     if seed is not None:
         found.append(("--seed", f"seed={seed}"))
     if until is not None:

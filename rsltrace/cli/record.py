@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import (
+    Override,
     RosArgsCommand,
     all_overrides,
     bags_given,
@@ -115,7 +116,7 @@ def record(
     until: str | None,
     replay: Path | None,
     as_json: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     print_job: bool,
     no_pin: bool,
     native: bool,
@@ -158,6 +159,8 @@ def record(
         return
     if programs_given() and not (quiet or as_json):
         tell(f"the job (--print-job before '--' prints it alone):\n{loaded.to_yaml()}", end="")
+        if not (loaded.stop.model_fields_set or loaded.bags or any(n.main for n in loaded.nodes)):
+            tell("it lasts as long as its programs: --until 10 ends it after 10 s, Ctrl-C at once")
     path = output or default_output(named)
     _check_first(loaded, export_bag, force=force)
     if native:

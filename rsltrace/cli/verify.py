@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import (
+    Override,
     RosArgsCommand,
     job_of,
     job_options,
@@ -46,7 +47,7 @@ class JobArguments:
     words: tuple[str, ...]
     launch: Path | None
     skip: bool
-    overrides: tuple[str, ...]
+    overrides: tuple[Override, ...]
     seed: int | None
     until: str | None
     no_pin: bool
@@ -62,7 +63,7 @@ class JobArguments:
             found += ["--launch", str(path(str(self.launch)))]
         found += ["--skip-unsupported"] * self.skip
         for override in self.overrides:
-            found += ["--set", override]
+            found += ["--set", override if isinstance(override, str) else override[1]]
         if self.seed is not None:
             found += ["--seed", str(self.seed)]
         if self.until is not None:
@@ -137,7 +138,7 @@ def verify(
     words: tuple[str, ...],
     launch: Path | None,
     skip: bool,
-    overrides: tuple[str, ...],
+    overrides: tuple[Override, ...],
     runs: int,
     jobs: int,
     seed: int | None,

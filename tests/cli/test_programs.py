@@ -162,6 +162,27 @@ def test_the_same_bag_the_same_result(workspace: Path, command: Command) -> None
     assert "nobody subscribes to /numbers, which a bag plays" in unheard
 
 
+def test_entries_of_set_are_a_job(workspace: Path, command: Command) -> None:
+    """Child processes are given programs in this way."""
+    done = command("record", "--print-job", "--set", "nodes.+={script: race.py}")
+    assert done.stdout == command("record", "--print-job", "--", "python3", "race.py").stdout
+
+
+@pytest.mark.ros
+@pytest.mark.long
+def test_verify_of_programs(workspace: Path, command: Command) -> None:
+    done = command("verify", "--runs", "2", "--until", "1", "--", "ros2", "run", "duo", "talker")
+    assert "2 runs, 9 perturbations, one digest" in done.stdout
+
+
+@pytest.mark.ros
+def test_what_ends_a_run_is_said(workspace: Path, command: Command) -> None:
+    said = "it lasts as long as its programs: --until 10 ends it after 10 s"
+    assert said in command("record", "-o", "a.mcap", "--", "python3", "race.py").stderr
+    line = ("record", "-o", "b.mcap", "--until", "1", "--", "python3", "race.py")
+    assert said not in command(*line).stderr
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -181,7 +202,7 @@ def test_the_same_bag_the_same_result(workspace: Path, command: Command) -> None
         ("-- launch_test race.py", "a launch_testing file cannot run in simulated time"),
         ("-- pytest launched.py", "a launch_testing file cannot run in simulated time"),
         ("--bag nosuch -- ros2 run duo ear", "there is no bag nosuch (record --export-bag"),
-        ("-- ros2 run duo eat", "package 'duo' has no executable 'eat'; did you mean 'ear'?"),
+        ("-- ros2 run duo eat", "-- ros2 run duo eat: package 'duo' has no executable 'eat'"),
         ("-- ros2 run due ear", "there is no package 'due'; did you mean 'duo'?"),
     ],
 )

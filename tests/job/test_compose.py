@@ -9,7 +9,7 @@ from textwrap import dedent
 import pytest
 
 from rsltrace.errors import JobError
-from rsltrace.job import Job, load_job, locate
+from rsltrace.job import Job, job_from_text, load_job, locate
 
 
 @pytest.fixture(autouse=True)
@@ -301,6 +301,24 @@ def test_every_key_can_be_set(folder: Path) -> None:
     assert job.stop.topic is not None
     assert job.stop.topic.exit_code == "data"
     assert (job.stop.events, job.seed) == (None, 0)
+
+
+@pytest.mark.parametrize(
+    ("entry", "name"),
+    [
+        ("node: m:TrackMonitor", "track_monitor"),
+        ("node: m:TrackMonitor", "TrackMonitor"),
+        ("script: job/test_compose.py", "test_compose"),
+        ("module: wave", "wave"),
+        ("main: m:run", "run"),
+    ],
+)
+def test_an_entry_is_called_as_its_node_or_program(entry: str, name: str) -> None:
+    text = f"nodes: [{{{entry}}}, {{node: m:Other}}]"
+    job = job_from_text(
+        text, "job.yaml", Path(__file__).parents[1], overrides=[f"nodes.{name}.parameters.rate=5"]
+    )
+    assert [node.parameters for node in job.nodes] == [{"rate": 5}, {}]
 
 
 @pytest.mark.usefixtures("base")

@@ -170,6 +170,7 @@ def _index(items: list[YamlValue], step: _PathStep, name: str) -> int:
         raise step.place.error(f"{name} has no entry {step.text}: {there}, and + is a new one")
     named = [(key, i) for i, item in enumerate(items) for key in _names(item)]
     found = {i for key, i in named if key == step.text}
+    found = found or {i for key, i in named if _as_one_word(key) == _as_one_word(step.text)}
     if len(found) == 1:
         return found.pop()
     if found:
@@ -184,14 +185,27 @@ def _index(items: list[YamlValue], step: _PathStep, name: str) -> int:
 
 
 def _names(item: YamlValue) -> list[str]:
-    """Return what an entry may be called: its name, else its class, or the end of its path."""
+    """Return what an entry may be called: its name, else its class, its program or the end of its
+    path.
+    """
     if isinstance(item.value, str):
         return [item.value.rstrip("/").rpartition("/")[2]]
     if not isinstance(item.value, dict):
         return []
-    for key, separator in (("name", ""), ("node", ":"), ("path", "/")):
+    for key, separator in _NAMED_BY:
         inner = item.value.get(key)
         if inner is not None and isinstance(inner.value, str):
             text = inner.value.rstrip("/")
-            return [text.rpartition(separator)[2] if separator else text]
+            return [text.rpartition(separator)[2].removesuffix(".py") if separator else text]
     return []
+
+
+_NAMED_BY = (
+    *(("name", ""), ("node", ":"), ("path", "/"), ("script", "/"), ("program", "/")),
+    *(("executable", "/"), ("main", ":"), ("module", ".")),
+)
+
+
+def _as_one_word(name: str) -> str:
+    """Return what a class and its node have in common: TrackMonitor is called track_monitor."""
+    return name.replace("_", "").lower()
