@@ -297,6 +297,8 @@ class RclpyBoundary:
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
         return EventHandle(parent, event_type)
 
+    QoSEvent = EventHandle  # its name up to Humble
+
     def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
         node.require_up("failed to create action server")
         return ActionServerHandle(node, *arguments)

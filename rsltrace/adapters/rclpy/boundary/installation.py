@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
+from operator import attrgetter
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NoReturn, cast
@@ -253,6 +254,18 @@ def _quick(real: Callable[[Any, Any], None]) -> Any:
     return publish
 
 
+@contextmanager
+def callback_as_attribute() -> Iterator[None]:
+    """Let subscriptions have ``_callback`` within the ``with`` block, as they have from Iron on."""
+    from rclpy.subscription import Subscription
+
+    with ExitStack() as stack:
+        if not hasattr(Subscription, "callback"):
+            Subscription._callback = property(attrgetter("callback"))
+            stack.callback(delattr, Subscription, "_callback")
+        yield
+
+
 # Each release of ROS 2 adds a few names to the extension. If rclpy's Python code uses one that is
 # missing here, the run is refused before it starts.
 
@@ -387,7 +400,7 @@ def installed() -> Iterator[RclpyBoundary]:
     ours = boundary()
     _bind(ours)
     try:
-        with quick_log_callers(), quick_id_texts(), quick_publish():
+        with quick_log_callers(), quick_id_texts(), quick_publish(), callback_as_attribute():
             yield ours
     finally:
         _bind(ours.real or ours)
