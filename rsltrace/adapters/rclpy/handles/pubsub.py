@@ -8,7 +8,12 @@ from typing import Any, NoReturn
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
 from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
-from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
+from rsltrace.adapters.rclpy.handles.entity_handle import (
+    EVENTS,
+    Alarm,
+    EntityHandle,
+    ReceiverHandle,
+)
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.messages.codec import codec_for
@@ -274,7 +279,7 @@ class EventHandle(QosEvent, EntityHandle):
 
     def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
         for waitable in node.waitables:
-            for name in ("_EventHandler__event", "_QoSEventHandler__event"):  # from Iron on, before
+            for name in EVENTS:
                 handle = getattr(waitable, name, None)
                 if handle is not None:
                     yield handle, waitable
