@@ -23,6 +23,7 @@ from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.trace.mcap.descriptor import PrivateDescriptor
+from rsltrace.trace.model.texts import ros_release
 
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
@@ -123,8 +124,6 @@ def keep_freed_memory() -> None:
         mallopt(_M_MMAP_THRESHOLD, _HEAP_BLOCK_BYTES)
 
 
-_RELEASES = {"3": "humble", "4": "iron", "7": "jazzy", "9": "kilted"}
-"""Releases of ROS by the first part of rclpy's version."""
 _INSTALLED = frozenset(("site-packages", "dist-packages"))
 
 
@@ -221,8 +220,8 @@ def _distribution() -> str:
     if spec is None or spec.origin is None:
         return ""
     versions = Path(spec.origin).parents[1].glob("rclpy-*-info")
-    majors = (path.name.removeprefix("rclpy-").partition(".")[0] for path in versions)
-    return next((_RELEASES[major] for major in majors if major in _RELEASES), "")
+    names = (ros_release(path.name.removeprefix("rclpy-")) for path in versions)
+    return next(filter(None, names), "")
 
 
 def _namespaces(folders: list[str]) -> list[str]:

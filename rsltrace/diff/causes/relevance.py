@@ -19,7 +19,7 @@ from rsltrace.diff.facts.evidence import Setting, SettingKind
 from rsltrace.trace.format import METADATA_CODE, METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.finding import GuardMode, NondeterminismSource
-from rsltrace.trace.model.texts import printable
+from rsltrace.trace.model.texts import printable, ros_release
 from rsltrace.trace.reader import Trace
 
 # What differs outside of the events and the job: the environment, the code, the entities of the
@@ -29,6 +29,10 @@ from rsltrace.trace.reader import Trace
 
 
 _ENTITIES_MAX = 50
+
+
+_FIRST = ("python", "rclpy")
+"""What may change anything; other packages matter to who uses them."""
 
 
 def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
@@ -42,12 +46,19 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         (SettingKind.ENVIRONMENT, a.environment, b.environment),
     ):
         is_code = kind is SettingKind.CODE
-        for name in sorted({*of_a, *of_b}):
+        for name in sorted({*of_a, *of_b}, key=lambda name: (name not in _FIRST, name)):
             if of_a.get(name) != of_b.get(name) and not (is_code and same_code(a, b, name)):
                 file = name.removeprefix("file:")
                 kind_of_it = kind if file == name else SettingKind.FILE
-                found.append(Setting(kind_of_it, file, of_a.get(name), of_b.get(name)))
+                value_a, value_b = (_with_release(name, of.get(name)) for of in (of_a, of_b))
+                found.append(Setting(kind_of_it, file, value_a, value_b))
     return tuple(found)
+
+
+def _with_release(name: str, version: str | None) -> str | None:
+    """Return ``7.1.5 (jazzy)`` for rclpy's version, that of others as it is."""
+    release = ros_release(version) if name == "rclpy" and version else ""
+    return f"{version} ({release})" if release else version
 
 
 def _edits(trace: Trace) -> str | None:

@@ -14,6 +14,14 @@ _DIGITS = 6
 _DIGITS_MAX = 17
 
 
+_ROS_RELEASES = {"3": "humble", "4": "iron", "7": "jazzy", "8": "rolling", "9": "kilted"}
+
+
+def ros_release(version: str) -> str:
+    """Return the release of ROS 2 that has this version of rclpy, or ""."""
+    return _ROS_RELEASES.get(version.partition(".")[0], "")
+
+
 class Stamp(int):
     """A simulated time (ns) of a run that starts at ``start_ns``: as text it counts from there."""
 

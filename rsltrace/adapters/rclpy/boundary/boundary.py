@@ -297,6 +297,8 @@ class RclpyBoundary:
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
         return EventHandle(parent, event_type)
 
+    QoSEvent = EventHandle  # its name up to Humble
+
     def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
         node.require_up("failed to create action server")
         return ActionServerHandle(node, *arguments)
@@ -526,13 +528,17 @@ def _service_types(ends: Iterable[ServiceEndpoint]) -> list[tuple[str, list[str]
 
 
 def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:
+    from rclpy.topic_endpoint_info import TopicEndpointInfo
+
     _, text = endpoint.type.describe()
     value = bytes.fromhex(text.removeprefix("RIHS01_")) if text.startswith("RIHS01_") else b""
+    type_hash = {"version": 1 if value else 0, "value": value or bytes(32)}
+    has_hash = hasattr(TopicEndpointInfo, "topic_type_hash")  # from Iron on
     return {
         "node_name": endpoint.node.name,
         "node_namespace": endpoint.node.namespace,
         "topic_type": endpoint.type_name,
-        "topic_type_hash": {"version": 1 if value else 0, "value": value or bytes(32)},
+        **({"topic_type_hash": type_hash} if has_hash else {}),
         "endpoint_type": endpoint_type,
         "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
         "qos_profile": profile_of(endpoint.qos),

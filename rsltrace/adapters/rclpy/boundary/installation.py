@@ -18,6 +18,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from functools import wraps
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec, module_from_spec
+from operator import attrgetter
 from pathlib import Path
 from types import FrameType, ModuleType
 from typing import Any, NoReturn, cast
@@ -253,10 +254,22 @@ def _quick(real: Callable[[Any, Any], None]) -> Any:
     return publish
 
 
+@contextmanager
+def callback_as_attribute() -> Iterator[None]:
+    """Let subscriptions have ``_callback`` within the ``with`` block, as they have from Iron on."""
+    from rclpy.subscription import Subscription
+
+    with ExitStack() as stack:
+        if not hasattr(Subscription, "callback"):
+            Subscription._callback = property(attrgetter("callback"))
+            stack.callback(delattr, Subscription, "_callback")
+        yield
+
+
 # Each release of ROS 2 adds a few names to the extension. If rclpy's Python code uses one that is
 # missing here, the run is refused before it starts.
 
-KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
+KNOWN = "Humble (rclpy 3.3), Jazzy (7.1) and Kilted (9.1)"
 _USED = re.compile(rb"_rclpy\.([A-Za-z]\w*)")
 _DECLARED = re.compile(r"^(?:class (?P<kind>\w+)|    def (?P<method>[A-Za-z]\w*)\()", re.MULTILINE)
 _UNUSED = {"add_to_waitset"}  # executors get no wait set here
@@ -280,8 +293,10 @@ def check_release(replacement: Any, handles: Mapping[str, type], package: Path) 
 
 def missing_parts(replacement: Any, handles: Mapping[str, type], package: Path) -> list[str]:
     """Return the names of the extension that rclpy's sources use and that are missing, sorted."""
+    # The first only has an example; handles refuse the second, nodes on asyncio, by name.
     files = set(package.rglob("*.py")) - {package / "impl" / "implementation_singleton.py"}
-    sources = b"\n".join(path.read_bytes() for path in files)  # that one only has an example
+    files.difference_update((package / "experimental").rglob("*.py"))
+    sources = b"\n".join(path.read_bytes() for path in files)
     names = set()
     for found in _USED.finditer(sources):
         before = sources[sources.rfind(b"\n", 0, found.start()) + 1 : found.start()]
@@ -322,6 +337,11 @@ def boundary() -> RclpyBoundary:
     """
     global _installed
     if _installed is None:
+        if "t" in getattr(sys, "abiflags", ""):
+            raise SetupError(
+                "rsltrace cannot run nodes on a free-threaded build of Python, where threads "
+                "run at once: use the ordinary build of the same version"
+            )
         ours = RclpyBoundary(_extension())
         if ours.real is None:
             sys.modules[NAME] = cast(ModuleType, ours)
@@ -387,7 +407,7 @@ def installed() -> Iterator[RclpyBoundary]:
     ours = boundary()
     _bind(ours)
     try:
-        with quick_log_callers(), quick_id_texts(), quick_publish():
+        with quick_log_callers(), quick_id_texts(), quick_publish(), callback_as_attribute():
             yield ours
     finally:
         _bind(ours.real or ours)

@@ -7,7 +7,9 @@ memory: a handle is destroyed at once, and using it afterwards raises what rclpy
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
+
+from rsltrace.errors import UnsupportedError
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -44,6 +46,16 @@ class Destroyable:
     def pointer(self) -> int:
         """A number that is unique among living handles (rclpy's wait sets compare these)."""
         return id(self)
+
+    def set_on_new_message_callback(self, callback: object) -> NoReturn:
+        """Refuse rclpy's experimental nodes on asyncio, which take what arrives by themselves."""
+        raise UnsupportedError(
+            "rclpy's experimental AsyncNode and AsyncioExecutor cannot be simulated yet: use "
+            "rclpy.node.Node; its callbacks may be coroutines, and mains may run asyncio loops"
+        )
+
+    set_on_new_request_callback = set_on_new_response_callback = set_on_new_message_callback
+    set_on_reset_callback = set_on_new_message_callback
 
 
 class Handle(Destroyable):

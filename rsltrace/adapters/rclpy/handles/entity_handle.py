@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 Alarm = Callable[[], None]
 """Called whenever something arrives for an entity."""
 
+EVENTS = ("_EventHandler__event", "_QoSEventHandler__event")
+"""Where the waitable of a QoS event has its handle, from Iron on and before."""
+
 _LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
 
 

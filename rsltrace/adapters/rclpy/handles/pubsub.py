@@ -8,7 +8,12 @@ from typing import Any, NoReturn
 from rsltrace.adapters.rclpy.concurrency.blocking_calls import wait
 from rsltrace.adapters.rclpy.concurrency.code_lines import CallSites
 from rsltrace.adapters.rclpy.concurrency.tasks import is_awaited, run_callback, start_callback
-from rsltrace.adapters.rclpy.handles.entity_handle import Alarm, EntityHandle, ReceiverHandle
+from rsltrace.adapters.rclpy.handles.entity_handle import (
+    EVENTS,
+    Alarm,
+    EntityHandle,
+    ReceiverHandle,
+)
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.adapters.rclpy.handles.qos_profiles import qos_of
 from rsltrace.adapters.rclpy.messages.codec import codec_for
@@ -186,7 +191,8 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         """Look up how to run a new callback; user code may replace it at any time."""
         self._callback = wrapper._callback
         self._coroutine = is_awaited(self.runtime, wrapper._callback)
-        self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
+        kind = getattr(wrapper, "_callback_type", None)  # from Iron on
+        self._with_info = getattr(kind, "name", "MessageOnly") != "MessageOnly"
 
     def forget_callback(self) -> None:
         """Look up how to run the callback again."""
@@ -273,9 +279,10 @@ class EventHandle(QosEvent, EntityHandle):
 
     def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
         for waitable in node.waitables:
-            handle = getattr(waitable, "_EventHandler__event", None)
-            if handle is not None:
-                yield handle, waitable
+            for name in EVENTS:
+                handle = getattr(waitable, name, None)
+                if handle is not None:
+                    yield handle, waitable
 
     def activate(self) -> None:
         self.trigger()

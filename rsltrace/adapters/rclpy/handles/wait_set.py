@@ -17,7 +17,7 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import SimEvent
 from rsltrace.adapters.rclpy.concurrency.tasks import executor_of, start_coroutine
 from rsltrace.adapters.rclpy.handles.context import ContextHandle
 from rsltrace.adapters.rclpy.handles.destroyable import Handle
-from rsltrace.adapters.rclpy.handles.entity_handle import Alarm
+from rsltrace.adapters.rclpy.handles.entity_handle import EVENTS, Alarm
 from rsltrace.adapters.rclpy.handles.node import NodeHandle
 from rsltrace.simulation.middleware.entity import Runnable, on_no_executor
 from rsltrace.trace.model.event import NO_EVENT, EventKind
@@ -194,7 +194,7 @@ _WATCH: dict[str, Callable[[Any, Alarm], Any]] = {
 # Waitables of user code (``node.add_waitable``) add their entities to a wait set once, and are
 # ready whenever one of these is. rclpy's own (actions, QoS events) have handles instead.
 
-OWN_WAITABLES = ("_EventHandler__event", "_handle", "_client_handle")
+OWN_WAITABLES = (*EVENTS, "_handle", "_client_handle")
 """Attributes by which rclpy's own waitables hold their handles."""
 
 _KINDS = {
