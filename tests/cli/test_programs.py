@@ -182,7 +182,7 @@ def test_the_same_bag_the_same_result(workspace: Path, command: Command) -> None
         ("-- pytest launched.py", "a launch_testing file cannot run in simulated time"),
         ("--bag nosuch -- ros2 run duo ear", "there is no bag nosuch (record --export-bag"),
         ("-- ros2 run duo eat", "package 'duo' has no executable 'eat'; did you mean 'ear'?"),
-        ("-- ros2 run due ear", "there is no package 'due'; did you mean 'duo'?"),
+        ("-- ros2 run due ear", "the command line: there is no package 'due'; did you mean 'duo'?"),
     ],
 )
 def test_what_is_no_program(workspace: Path, command: Command, line: str, message: str) -> None:

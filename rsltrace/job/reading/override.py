@@ -25,6 +25,8 @@ from rsltrace.job.values.problem import Loc, describe
 
 _STEP = re.compile(r'"([^"]*)"|\'([^\']*)\'|([^.=\'"\[\]]+)|\[([0-9]+|\+)\]')
 _APPEND = "+"
+_PROGRAM = re.compile(r"(nodes|launch|bags)\.\+=\{")
+"""What a program, ``--launch`` or ``--bag`` on a command line becomes."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ def apply_override(root: YamlValue, label: str, override: str, *, folder: str) -
     The value is YAML; null takes the key away. List entries are given by index, by
     a node's name, or as ``+`` for a new one at the end. Paths start at ``folder``.
     """
+    label = "the command line" if _PROGRAM.match(override) else label
     shown = YamlSource(label, override, folder, is_option=True)
     steps, at = _steps(shown)
     if steps[0].text in ("base", "include"):
