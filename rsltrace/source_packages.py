@@ -29,12 +29,11 @@ class SourcePackage:
     def interfaces(self) -> tuple[Path, ...]:
         """The ``.msg``, ``.srv`` and ``.action`` files, relative to ``folder``, sorted.
 
-        Each lies in a folder of the name of its kind, as rosidl wants it.
+        Each lies below a folder of the name of its kind.
         """
         found = []
         for folder in _walk(self.folder, inside=True):
-            kind = folder.name
-            if kind in _KINDS:
+            for kind in set(_KINDS).intersection(folder.relative_to(self.folder).parts):
                 found += [path for path in folder.glob(f"*.{kind}") if path.is_file()]
         return tuple(sorted(path.relative_to(self.folder) for path in found))
 
