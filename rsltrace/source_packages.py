@@ -29,12 +29,11 @@ class SourcePackage:
     def interfaces(self) -> tuple[Path, ...]:
         """The ``.msg``, ``.srv`` and ``.action`` files, relative to ``folder``, sorted.
 
-        Each lies in a folder of the name of its kind, as rosidl wants it.
+        Each lies below a folder of the name of its kind.
         """
         found = []
         for folder in _walk(self.folder, inside=True):
-            kind = folder.name
-            if kind in _KINDS:
+            for kind in set(_KINDS).intersection(folder.relative_to(self.folder).parts):
                 found += [path for path in folder.glob(f"*.{kind}") if path.is_file()]
         return tuple(sorted(path.relative_to(self.folder) for path in found))
 
@@ -48,21 +47,24 @@ def source_packages(folders: Iterable[Path]) -> dict[str, SourcePackage]:
     return found
 
 
-def workspace_of(file: Path) -> Path | None:
-    """Return the folder of the workspace that a file's package lies in; None if it has none.
+def workspaces_of(file: Path) -> list[Path]:
+    """Return the folders of the workspace that a file's package lies in; none if it has none.
 
-    That is a ``src`` or a checkout around the package; else the package itself.
+    That is a ``src`` around the package; else a checkout or the package itself, and around it the
+    working directory, where colcon searches.
     """
     above = file.resolve().parents
     own = next((folder for folder in above[:_DEPTH_MAX] if (folder / _MARK).is_file()), None)
     if own is None:
-        return None
-    for folder in (own, *list(own.parents)[:_DEPTH_MAX]):
+        return []
+    around = own.parents[:_DEPTH_MAX]
+    for folder in (own, *around):
         if folder != own and folder.name == "src":
-            return folder
+            return [folder]
         if (folder / ".git").exists():
-            return folder
-    return own
+            own = folder
+            break
+    return [own, *(folder for folder in around if folder in own.parents and folder == Path.cwd())]
 
 
 def _around(folder: Path) -> Iterator[SourcePackage]:

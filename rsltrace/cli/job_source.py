@@ -234,7 +234,7 @@ def job_words(
         spec: dict[str, Any] = {"file": str(launch), "arguments": given}
         if skip:
             spec["skip_unsupported"] = True
-        changes.append(f"launch.+={json.dumps(spec, ensure_ascii=False)}")
+        changes.append(("--launch", f"launch.+={json.dumps(spec, ensure_ascii=False)}"))
     ros = click.get_current_context().meta.get(_META, [])
     changes += [f"ros_arguments.+={json.dumps(word)}" for word in _with_paths(ros, named.parent)]
     return named, changes, None if files else "{}"

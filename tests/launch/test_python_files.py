@@ -386,6 +386,19 @@ return LaunchDescription([
         specs_of(launched)
 
 
+def test_a_file_of_a_package_that_is_not_there(read: Any) -> None:
+    text = """
+from ament_index_python.packages import get_package_share_directory
+open(os.path.join(get_package_share_directory('arm'), 'arm.urdf'))
+"""
+    with pytest.raises(JobError) as caught:
+        read(text)
+    assert str(caught.value) == (
+        f"a.launch.py:{BODY + 1}: there is no package 'arm': it is neither installed nor among the "
+        "sources here"
+    )
+
+
 def test_a_package_that_may_be_missing(read: Any) -> None:
     launched = read(
         """

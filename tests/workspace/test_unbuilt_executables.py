@@ -14,7 +14,7 @@ from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.adapters.workspace.installs import executables, modules
 from rsltrace.errors import JobError
 from rsltrace.run.plans.executables import find_executable, why_not_runnable
-from rsltrace.source_packages import SourcePackage, workspace_of
+from rsltrace.source_packages import SourcePackage, workspaces_of
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -345,14 +345,19 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
             assert str(caught.value) == f"job.yaml:1:1: {why_not_runnable(*target.split('/'))}"
 
 
-def test_the_workspace_around_a_launch_file(tmp_path: Path) -> None:
+def test_the_workspace_around_a_launch_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _write(tmp_path, {"ws/src/p/package.xml": "", "git/.git/x": "", "git/a/p/package.xml": ""})
     _write(tmp_path, {"alone/p/package.xml": "", "none/launch/x": ""})
-    for file, around in [
-        ("ws/src/p/launch/x", "ws/src"),
-        ("git/a/p/launch/x", "git"),
-        ("alone/p/launch/x", "alone/p"),
-        ("none/launch/x", None),
+    for file, folder, around in [
+        ("ws/src/p/launch/x", "ws", ["ws/src"]),
+        ("git/a/p/launch/x", "alone", ["git"]),
+        ("git/a/p/launch/x", "git", ["git"]),
+        ("git/a/p/launch/x", ".", ["git", "."]),
+        ("alone/p/launch/x", "git", ["alone/p"]),
+        ("alone/p/launch/x", "alone", ["alone/p", "alone"]),
+        ("none/launch/x", ".", []),
     ]:
-        found = workspace_of(tmp_path / file)
-        assert found == (None if around is None else tmp_path / around)
+        monkeypatch.chdir(tmp_path / folder)
+        assert workspaces_of(tmp_path / file) == [tmp_path / one for one in around]

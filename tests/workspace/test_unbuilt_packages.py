@@ -269,7 +269,7 @@ def test_only_what_is_imported_is_made_and_what_is_ready_is_kept(
         "far/msg/Unused.msg": "moon_msgs/Rock rock\n",
         "near/package.xml": "<package><name>near_msgs</name></package>",
         "near/msg/HTTPBox2D.msg": "far_msgs/Leaf[2] leaves\nInner inner\n",
-        "near/msg/Inner.msg": "std_msgs/Header header\n",
+        "near/msg/parts/Inner.msg": "std_msgs/Header header\n",
         "near/msg/Other.msg": "time t\n",
         "near/srv/Ask.srv": "Inner inner\n---\n",
         **{f"near/action/{name}.action": "---\n---\n" for name in "ABCDEFG"},

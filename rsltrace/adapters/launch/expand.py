@@ -24,7 +24,7 @@ from rsltrace.adapters.workspace.imports import unbuilt_packages
 from rsltrace.child_processes import rsltrace_command
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
-from rsltrace.source_packages import source_packages, workspace_of
+from rsltrace.source_packages import source_packages, workspaces_of
 from rsltrace.terminal import tell
 
 # Reads launch files in a process of their own: Python ones are programs.
@@ -138,8 +138,8 @@ def expand(
     if not programs:
         return _expand(job, None, why_not, is_process)
     folders = [job.resolve(folder) for folder in job.search_path]
-    around = [workspace_of(job.resolve(spec.file)) for spec in job.launch]
-    new = [f for f in dict.fromkeys(around) if f is not None and f not in folders]
+    around = [f for spec in job.launch for f in workspaces_of(job.resolve(spec.file))]
+    new = [folder for folder in dict.fromkeys(around) if folder not in folders]
     with unbuilt_packages([*folders, *new]):
         expanded = _expand(job, [*folders, *new], why_not, is_process)
     job = expanded.job

@@ -41,7 +41,7 @@ def main() -> str | None:
             _put(made, into)
             os.write(1, READY.encode())
         except Exception as error:
-            path = Path(one["folder"], one["file"])
+            path = Path(one["path"])
             line = _faulty_line(one["package"], path)
             place = f"{path}:{line}" if line else str(path)
             return f"\n{json.dumps({'place': place, 'error': _text_of(error)})}"
@@ -64,11 +64,11 @@ def _make(one: Mapping[str, str], order: Mapping[str, Any], into: Path) -> None:
     from rosidl_adapter import convert_to_idl
     from rosidl_pycommon import generate_files
 
-    package, folder, file = one["package"], Path(one["folder"]), Path(one["file"])
+    package, file = one["package"], Path(one["file"])
     share, site = into / "share" / package, into / "site-packages" / package
     (share / file.parent).mkdir(parents=True)
-    (share / file).write_bytes((folder / file).read_bytes())
-    idl = convert_to_idl(folder, package, file, share)
+    (share / file).write_bytes(Path(one["path"]).read_bytes())
+    idl = convert_to_idl(share, package, file, share)
     arguments = {
         "package_name": package,
         "output_dir": str(site),

@@ -134,7 +134,7 @@ class InterfaceMaker:
 
     def names(self, kind: str) -> dict[str, str]:
         """Return what ``package.kind`` offers, each with the interface that it belongs to."""
-        stems = [file.stem for file in self._package.interfaces if file.parent.name == kind]
+        stems = [file.stem for file in self._package.interfaces if file.suffix == f".{kind}"]
         return {f"{stem}{end}": stem for stem in stems for end in EXPORTS[kind]}
 
     def module_of(self, kind: str, stem: str) -> Path:
@@ -149,7 +149,7 @@ class InterfaceMaker:
         """
         needed: dict[tuple[str, Path], InterfaceMaker] = {}
         for file in self._package.interfaces:
-            if file.parent.name == kind and file.stem in stems:
+            if file.suffix == f".{kind}" and file.stem in stems:
                 self._collect(file, needed, ())
         if needed:
             names = [stem for stem in stems if any(file.stem == stem for _, file in needed)]
@@ -166,7 +166,7 @@ class InterfaceMaker:
     ) -> None:
         """Put an interface into ``needed``, after those that it uses."""
         own = (self._package.name, file)
-        if own in needed or self.module_of(file.parent.name, file.stem).is_file():
+        if own in needed or self.module_of(file.suffix[1:], file.stem).is_file():
             return
         path = self._package.folder / file
         for line, package, name in used_types(path.read_text("utf-8", "replace")):
@@ -211,7 +211,7 @@ class InterfaceMaker:
         (into / "share" / name).mkdir(parents=True)
         (site / "__init__.py").touch()
         (site / f"{name}_s__rosidl_typesupport_c.py").write_text(_NOT_COMPILED)
-        for kind in sorted({file.parent.name for file in self._package.interfaces}):
+        for kind in sorted({file.suffix[1:] for file in self._package.interfaces}):
             (site / kind).mkdir()
             (site / kind / "__init__.py").write_text(_WHEN_IMPORTED)
 
@@ -222,11 +222,11 @@ def _order(needed: Mapping[tuple[str, Path], InterfaceMaker]) -> dict[str, Any]:
     shares = {}
     interfaces = []
     for (name, file), maker in needed.items():
-        folder = maker._package.folder / file.parent.parent
+        path = maker._package.folder / file
         shares[name] = maker.prefix / "share" / name
-        place = {"package": name, "folder": str(folder), "file": f"{file.parent.name}/{file.name}"}
+        place = {"package": name, "path": str(path), "file": f"{file.suffix[1:]}/{file.name}"}
         interfaces.append({**place, "into": str(maker.prefix)})
-        text = (maker._package.folder / file).read_text("utf-8", "replace")
+        text = path.read_text("utf-8", "replace")
         for other in {*_USED_BY_ALL, *_PACKAGE.findall(text)}:
             share, others_maker = _installed_share(other), maker._makers.get(other)
             if share is not None:

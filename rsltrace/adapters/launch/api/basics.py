@@ -302,6 +302,8 @@ def as_job_error(error: BaseException, where: str) -> JobError:
 
     The line is the last one that is not of rsltrace, Python or a library; else ``where``.
     """
+    from rsltrace.adapters.launch.api.packages import missing_file
+
     if isinstance(error, JobError):
         return error if error.where else JobError(str(error), where=where)
     if isinstance(error, SyntaxError) and error.filename and error.lineno:
@@ -321,7 +323,8 @@ def as_job_error(error: BaseException, where: str) -> JobError:
     if isinstance(error, (SubstitutionFailure, ValueError)) and said:
         return JobError(said, where=where)
     name = type(error).__name__
-    return JobError(f"{name}: {said}" if said else name, where=where)
+    said = missing_file(error) or (f"{name}: {said}" if said else name)
+    return JobError(said, where=where)
 
 
 __all__ = [

@@ -30,6 +30,13 @@ def missing_package(path: str | os.PathLike[str]) -> str | None:
     return parts[3] if is_missing else None
 
 
+def missing_file(error: BaseException) -> str | None:
+    """Return what to say of an error if it is about a file of a package that is not there."""
+    file = error.filename if isinstance(error, OSError) else None
+    package = missing_package(file) if isinstance(file, str) else None
+    return None if package is None else f"there is no package {package!r}: {_WHY}"
+
+
 def names_missing_package(value: object) -> str | None:
     """Return a package that is not there, if a text (or one in a list) names a path in it."""
     for item in value if isinstance(value, (list, tuple)) else (value,):
@@ -114,6 +121,7 @@ def _is_caught_by_caller() -> bool:
 
 
 __all__ = [
+    "missing_file",
     "missing_package",
     "missing_packages_allowed",
     "names_missing_package",
