@@ -101,6 +101,7 @@ def test_callbacks_have_the_names_that_rclcpp_tells_its_tracepoints(
         ("component: p\n    container: /c", "expected package/plugin"),
         ("component: p/n::C\n    container: /c\n    arguments: [x]", "a component takes 'param"),
         ("program: x\n    respawn: {times: 0}", "must be at least 1"),
+        ("node: a:B\n    instant_sleep: true", "only a process can sleep in no time"),
     ],
 )
 def test_entries_that_make_no_sense_are_refused(tmp_path: Path, entry: str, expected: str) -> None:

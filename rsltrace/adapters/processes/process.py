@@ -49,7 +49,7 @@ _GRACE_S = 5.0
 _WAITER = struct.Struct("<IIqI")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
-_HELLO = struct.Struct("<qQI")
+_HELLO = struct.Struct("<qQII")
 _SHOWN = struct.Struct("<qI")
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
@@ -80,12 +80,21 @@ class Process:
     ``things`` are its nodes, endpoints and timers.
     """
 
-    def __init__(self, adapter: ProcessRun, name: str, key: str, *, log_failure: bool) -> None:
+    def __init__(
+        self,
+        adapter: ProcessRun,
+        name: str,
+        key: str,
+        *,
+        log_failure: bool,
+        instant_sleep: bool = False,
+    ) -> None:
         self.adapter = adapter
         self.dispatcher = adapter.domain.dispatcher
         self.name = name
         self.key = key
         self.log_failure = log_failure
+        self.instant_sleep = instant_sleep
         self.entity_id = 0
         self.announced = True
         self.begun_ns = 0
@@ -362,7 +371,8 @@ class Process:
 
     def _hello(self, fields: RecordReader) -> bytes:
         adapter, now_ns = self.adapter, self.dispatcher.loop.now_ns
-        return _HELLO.pack(now_ns, adapter.seed_of(self.key), adapter.clock is not None)
+        seed, own_clocks = adapter.seed_of(self.key), adapter.clock is not None
+        return _HELLO.pack(now_ns, seed, own_clocks, self.instant_sleep)
 
     def _clock(self, fields: RecordReader) -> bytes:
         """Answer what a clock shows: that of a node, or of the running one."""
