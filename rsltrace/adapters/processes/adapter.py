@@ -27,8 +27,8 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 class ProcessProgram:
     """What to start as a process: the whole command line, and what it finds around it.
 
-    It has the same addresses in every run if it is ``pinned``; ``instant_sleep``: its sleeps take no
-    simulated time.
+    It has the same addresses in every run if it is ``pinned``; its sleeps take no simulated time
+    with ``instant_sleep``.
     """
 
     argv: Sequence[str]

@@ -16,9 +16,6 @@ namespace rsltrace {
 
 namespace {
 
-// After a hundred waits that find something, and none of it is taken, a millisecond passes.
-constexpr unsigned LOOK_WEIGHT = 100;
-
 // Give the set of ids a number, the same as last time if it is the same set.
 const WaitSet &numbered(const Wanted &wanted) {
   static std::uint32_t count = 0;
