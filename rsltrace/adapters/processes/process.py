@@ -35,7 +35,7 @@ from rsltrace.adapters.processes.wire import (
     gid_of,
     packed_qos,
 )
-from rsltrace.errors import NodeError
+from rsltrace.errors import NodeError, RunError
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
@@ -140,6 +140,7 @@ class Process:
             RecordKind.TIMER_NEXT: self._timer_next,
             RecordKind.WAIT_SET: self._wait_set,
             RecordKind.ALIVE: self._alive,
+            RecordKind.UNSEEN: self._unseen,
             RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
@@ -445,3 +446,18 @@ class Process:
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()
+
+    def _unseen(self, fields: RecordReader) -> None:
+        """Take note of a publisher whose messages do not leave the process.
+
+        :raises RunError: if a rule of the job goes by them.
+        """
+        publisher = self.things[fields.number()]
+        topic = publisher.topic
+        text = (
+            f"messages on {topic} stay in process {self.name} and are in no trace: it publishes "
+            "them with use_intra_process_comms, switch that off"
+        )
+        if publisher.observers is not None and publisher.observers.watchers:
+            raise RunError(f"{text}; a rule of the job goes by {topic}")
+        self.adapter.domain.outcome.notes.append(text)

@@ -175,6 +175,7 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
     waiter.deadline_ns = deadline_ns;
     waiter.what = what;
     say_passed();
+    say_unseen();
     say_deadlines(wanted.timers);
     waiter.set = &numbered(wanted);
     for (const auto &one : wanted.conditions) one.condition->waiters.push_back(&waiter);
