@@ -31,7 +31,10 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   std_msgs__msg__UInt64__init(&message);
   message.data = ++counted;
   if (strcmp(action, "address") == 0) message.data = (uint64_t)(uintptr_t)timer;
-  CHECK(rcl_publish(&count_publisher, &message, NULL));
+  // As rclcpp does with use_intra_process_comms: "both" if somebody outside of the process listens.
+  if (strcmp(action, "intra") == 0 || strcmp(action, "both") == 0)
+    ros_trace_rclcpp_intra_publish(&count_publisher, &message);
+  if (strcmp(action, "intra") != 0) CHECK(rcl_publish(&count_publisher, &message, NULL));
   if (counted == 5 && strcmp(action, "crash") == 0) raise(SIGSEGV);
   if (counted == 5 && strcmp(action, "kill") == 0) raise(SIGKILL);
   if (counted == 5 && strcmp(action, "exit") == 0) _exit(7);

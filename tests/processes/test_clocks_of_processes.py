@@ -104,3 +104,17 @@ def test_a_wrong_clock_shows_a_process_what_it_shows_a_node_here(
     here = _shown(tmp_path, "teller", clock, "")
     assert here == _shown(tmp_path, "teller", clock, ", isolated: true")
     assert len(here[0]) == 29
+
+
+@pytest.mark.parametrize(("instant", "ms"), [("false", [113, 124]), ("true", [100, 111])])
+def test_a_sleep_takes_simulated_time_unless_the_job_says_that_it_takes_none(
+    tmp_path: Path, instant: str, ms: list[int]
+) -> None:
+    """Waits with a timeout take their time anyhow."""
+    (tmp_path / "teller.py").write_text(NODE)
+    entry = f"script: teller.py, arguments: [a], isolated: true, instant_sleep: {instant}"
+    (tmp_path / "job.yaml").write_text(f"nodes: [{{{entry}}}]\nstop: {{duration: 150ms}}\n")
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        stamps = [stamp // 1_000_000 for stamp, _, _ in trace.messages("/a/shown")]
+    assert stamps == [0, 100, *ms]

@@ -89,3 +89,11 @@ def test_a_process_that_polls_the_graph_sees_what_comes(
     (publisher, _), (service, _) = said
     assert 100 <= publisher <= 120
     assert 200 <= service <= publisher + 250  # rclpy looks every quarter of a second
+
+
+def test_time_passes_for_who_asks_the_same_of_the_graph_again_and_again(tmp_path: Path) -> None:
+    busy = POLLS.replace("rclpy.spin_once(node, timeout_sec=0.02)", "pass")
+    (tmp_path / "busy.py").write_text(busy)
+    said = _said(tmp_path, "/said", "script: changes.py", "script: busy.py, isolated: true")
+    assert said[0][1] == "publisher"
+    assert 100 <= said[0][0] <= 101

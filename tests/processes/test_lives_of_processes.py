@@ -89,6 +89,27 @@ def test_callbacks_have_the_names_that_rclcpp_tells_its_tracepoints(
     assert echo.detail["callback"] == "Counter::echo(UInt64)"
 
 
+@pytest.mark.parametrize(("action", "notes"), [("intra", 1), ("both", 0)])
+def test_topics_whose_messages_do_not_leave_a_process_are_named(
+    compiled: Compiled, tmp_path: Path, action: str, notes: int
+) -> None:
+    result = _run(tmp_path, compiled("counter.c"), f"    arguments: ['100', {action}]")
+    unseen = [note for note in result.notes if "messages on /count stay in process" in note]
+    assert (result.error, len(unseen)) == (None, notes)
+    assert bool(_counts(tmp_path / "t.mcap")) is not bool(notes)
+
+
+def test_a_rule_for_a_topic_whose_messages_do_not_leave_a_process_is_refused(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    node = f"{{program: {compiled('counter.c')}, arguments: ['100', intra]}}"
+    (tmp_path / "job.yaml").write_text(f"nodes: [{node}]\nstop: {{topic: /count, duration: 1s}}\n")
+    result = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
+    assert "use_intra_process_comms, switch that off; a rule of the job goes by /count" in str(
+        result.error
+    )
+
+
 @pytest.mark.parametrize(
     ("entry", "expected"),
     [
@@ -101,6 +122,7 @@ def test_callbacks_have_the_names_that_rclcpp_tells_its_tracepoints(
         ("component: p\n    container: /c", "expected package/plugin"),
         ("component: p/n::C\n    container: /c\n    arguments: [x]", "a component takes 'param"),
         ("program: x\n    respawn: {times: 0}", "must be at least 1"),
+        ("node: a:B\n    instant_sleep: true", "only a process can sleep in no time"),
     ],
 )
 def test_entries_that_make_no_sense_are_refused(tmp_path: Path, entry: str, expected: str) -> None:

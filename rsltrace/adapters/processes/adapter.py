@@ -27,13 +27,15 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 class ProcessProgram:
     """What to start as a process: the whole command line, and what it finds around it.
 
-    It has the same addresses in every run if it is ``pinned``.
+    It has the same addresses in every run if it is ``pinned``; its sleeps take no simulated time
+    with ``instant_sleep``.
     """
 
     argv: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
     pinned: bool = True
+    instant_sleep: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,9 @@ class ProcessAdapter:
     ) -> None:
         """Start a process and let it run up to its first wait, as one event."""
         domain = self.domain
-        process = Process(self, name, key, log_failure=log_failure)
+        process = Process(
+            self, name, key, log_failure=log_failure, instant_sleep=program.instant_sleep
+        )
         process.begun_ns = domain.loop.now_ns
         process.entity_id = domain.entities.new_id()
         domain.entities.pending.append(process)

@@ -324,6 +324,7 @@ def program(
     search_path: Sequence[str] = (),
     prefixes: Sequence[str] = (),
     pinned: bool = True,
+    instant_sleep: bool = False,
 ) -> ProcessProgram:
     """Return a command as a process of the run: with variables of ``surroundings`` but for those of
     ``environment``.
@@ -348,7 +349,7 @@ def program(
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
     known = [*libraries, *_listed(around, "LD_LIBRARY_PATH")]
     around["LD_LIBRARY_PATH"] = os.pathsep.join([*known, *_not_in(known, around)])
-    return ProcessProgram(list(command), around, folder, pinned)
+    return ProcessProgram(list(command), around, folder, pinned, instant_sleep)
 
 
 def _not_in(known: Sequence[str], environment: Mapping[str, str]) -> list[str]:

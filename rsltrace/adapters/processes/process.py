@@ -35,7 +35,7 @@ from rsltrace.adapters.processes.wire import (
     gid_of,
     packed_qos,
 )
-from rsltrace.errors import NodeError
+from rsltrace.errors import NodeError, RunError
 from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
@@ -49,7 +49,7 @@ _GRACE_S = 5.0
 _WAITER = struct.Struct("<IIqI")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
-_HELLO = struct.Struct("<qQI")
+_HELLO = struct.Struct("<qQII")
 _SHOWN = struct.Struct("<qI")
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
@@ -80,12 +80,21 @@ class Process:
     ``things`` are its nodes, endpoints and timers.
     """
 
-    def __init__(self, adapter: ProcessRun, name: str, key: str, *, log_failure: bool) -> None:
+    def __init__(
+        self,
+        adapter: ProcessRun,
+        name: str,
+        key: str,
+        *,
+        log_failure: bool,
+        instant_sleep: bool = False,
+    ) -> None:
         self.adapter = adapter
         self.dispatcher = adapter.domain.dispatcher
         self.name = name
         self.key = key
         self.log_failure = log_failure
+        self.instant_sleep = instant_sleep
         self.entity_id = 0
         self.announced = True
         self.begun_ns = 0
@@ -131,6 +140,7 @@ class Process:
             RecordKind.TIMER_NEXT: self._timer_next,
             RecordKind.WAIT_SET: self._wait_set,
             RecordKind.ALIVE: self._alive,
+            RecordKind.UNSEEN: self._unseen,
             RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
@@ -362,7 +372,8 @@ class Process:
 
     def _hello(self, fields: RecordReader) -> bytes:
         adapter, now_ns = self.adapter, self.dispatcher.loop.now_ns
-        return _HELLO.pack(now_ns, adapter.seed_of(self.key), adapter.clock is not None)
+        seed, own_clocks = adapter.seed_of(self.key), adapter.clock is not None
+        return _HELLO.pack(now_ns, seed, own_clocks, self.instant_sleep)
 
     def _clock(self, fields: RecordReader) -> bytes:
         """Answer what a clock shows: that of a node, or of the running one."""
@@ -435,3 +446,18 @@ class Process:
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()
+
+    def _unseen(self, fields: RecordReader) -> None:
+        """Take note of a publisher whose messages do not leave the process.
+
+        :raises RunError: if a rule of the job goes by them.
+        """
+        publisher = self.things[fields.number()]
+        topic = publisher.topic
+        text = (
+            f"messages on {topic} stay in process {self.name} and are in no trace: it publishes "
+            "them with use_intra_process_comms, switch that off"
+        )
+        if publisher.observers is not None and publisher.observers.watchers:
+            raise RunError(f"{text}; a rule of the job goes by {topic}")
+        self.adapter.domain.outcome.notes.append(text)

@@ -63,6 +63,7 @@ class RecordKind(IntEnum):
     CLOCK = 29
     READY = 30
     DROPPED = 31
+    UNSEEN = 32
 
 
 class CommandKind(IntEnum):

@@ -38,10 +38,11 @@ _ONLY_A_PROCESS = {
     "environment": "only a process has an environment of its own: 'program', or 'isolated: true'",
     "working_directory": "only a process has a folder of its own: 'program', or 'isolated: true'",
     "respawn": "only a process is started again: 'program', or 'isolated: true'",
+    "instant_sleep": "only a process can sleep in no time: 'program', or 'isolated: true'",
 }
 _RARE = (
     *("start_after", "stdin", "isolated", "environment", "working_directory", "respawn"),
-    *("required", "container", "extra_arguments"),
+    *("instant_sleep", "required", "container", "extra_arguments"),
 )
 """Keys that are written down only where they say something."""
 
@@ -143,6 +144,12 @@ class NodeSpec(JobPart):
         description="Delay after which an ended process starts again.",
         examples=["1s", {"delay": "500ms", "times": 3}],
     )
+    instant_sleep: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether `sleep`, `nanosleep`, `std::this_thread::sleep_for` and the like take "
+        "no simulated time in a process.",
+        examples=[True],
+    )
     required: Annotated[bool, check(flag)] = Field(
         default=False,
         description="Whether the run ends with this entry. Not for a `node`.",
@@ -221,6 +228,7 @@ class NodeSpec(JobPart):
             environment: dict[str, str] = ...,
             working_directory: str | os.PathLike[str] | None = None,
             respawn: RespawnSpec | dict[str, Any] | TimeLike | None = None,
+            instant_sleep: bool = False,
             required: bool = False,
             name: str | None = None,
             namespace: str | None = None,
@@ -286,7 +294,7 @@ class NodeSpec(JobPart):
             raise JobProblem(
                 "the guard is for Python code in the process of the run", ("guard",), at_key=True
             )
-        for key in ("environment", "working_directory", "respawn"):
+        for key in _ONLY_A_PROCESS:
             if getattr(self, key) and not (self.is_process or kind == "executable"):
                 raise JobProblem(_ONLY_A_PROCESS[key], (key,), at_key=True)
         if self.required and kind in ("node", "component"):

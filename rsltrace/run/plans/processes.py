@@ -77,6 +77,7 @@ class ProcessPrograms:
             search_path=self.search_path,
             prefixes=self.prefixes,
             pinned=self._job.guard.pins,
+            instant_sleep=spec.instant_sleep,
         )
 
     @cached_property

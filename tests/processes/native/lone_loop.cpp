@@ -47,6 +47,7 @@ std::int64_t now_ns() { return now; }
 std::uint64_t times_let_go() { return idles; }
 std::int64_t shown_ns(std::uint32_t, bool) { return now; }
 std::uint64_t seed() { return 42; }
+bool has_instant_sleep() { return false; }
 
 void report(const std::string &text) { std::fprintf(stderr, "report: %s\n", text.c_str()); }
 

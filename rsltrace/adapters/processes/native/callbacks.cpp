@@ -1,5 +1,6 @@
 // Names of callbacks, and whose timers are: rclcpp tells both to tracetools, rcl knows neither.
 #include <rcl/node.h>
+#include <rcl/publisher.h>
 #include <rcl/service.h>
 #include <rcl/subscription.h>
 
@@ -92,6 +93,14 @@ RSLTRACE_EXPORT void ros_trace_rclcpp_service_callback_added(const void *handle,
   if (!linked()) return;
   const std::uint32_t id = service_id(handle);
   if (id != 0) callbacks()[callback] = id;
+}
+
+RSLTRACE_EXPORT void ros_trace_rclcpp_intra_publish(const void *publisher, const void *) {
+  static const auto rmw_handle =
+      rcl<decltype(rcl_publisher_get_rmw_handle)>("rcl_publisher_get_rmw_handle");
+  if (!linked()) return;
+  const auto *found = rmw_handle(static_cast<const rcl_publisher_t *>(publisher));
+  if (found != nullptr) stayed_here(*static_cast<Endpoint *>(found->data));
 }
 
 // rclcpp makes the text only if it is wanted.

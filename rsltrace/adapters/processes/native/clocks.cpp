@@ -48,7 +48,7 @@ timespec to_timespec(std::int64_t ns) {
 // Returns 0, or EINTR with what is left.
 int sleep_until(Thread &thread, std::int64_t deadline_ns, timespec *left, const char *what) {
   pthread_testcancel();
-  if (deadline_ns <= now_ns()) {
+  if (deadline_ns <= now_ns() || has_instant_sleep()) {
     yield(thread);
     return 0;
   }

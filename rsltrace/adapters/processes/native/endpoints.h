@@ -34,6 +34,7 @@ struct Endpoint {
   MessageCodec type;        // of a topic, or of requests
   MessageCodec other_type;  // of responses
   std::int64_t requests = 0;  // how many a client has sent
+  bool is_unseen = false;     // the loop knows that it misses messages of this publisher
 };
 
 void remember(Endpoint *endpoint);
@@ -42,6 +43,10 @@ void forget(std::uint32_t id);
 std::size_t depth_of(const rmw_qos_profile_t &qos);
 // Put what the loop has sent into the endpoint's inbox; a full one drops its oldest.
 void deliver(std::uint32_t id, Reader &reader);
+// A publisher has given a message to others of this process: who waits then tells the loop of it,
+// unless it is published, too.
+void stayed_here(Endpoint &publisher);
+void say_unseen();
 // Take the oldest item: from the inbox, or from what waits in the loop. False: there is none.
 bool take(Endpoint &endpoint, Item &item);
 // How many endpoints it is connected to.

@@ -32,6 +32,7 @@ int link_fd = -1;
 std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
 bool own_clocks = false;
+bool sleeps_are_instant = false;
 std::uint64_t lets_go = 0;
 std::size_t filled = 0;  // bytes of what has been received
 
@@ -176,6 +177,7 @@ void begin() {
   time_ns = reader.number<std::int64_t>();
   seed_of_process = reader.number<std::uint64_t>();
   own_clocks = reader.number<std::uint32_t>() != 0;
+  sleeps_are_instant = reader.number<std::uint32_t>() != 0;
 }
 
 }  // namespace
@@ -195,6 +197,8 @@ std::int64_t now_ns() { return time_ns; }
 std::uint64_t seed() { return seed_of_process; }
 
 bool has_own_clocks() { return own_clocks; }
+
+bool has_instant_sleep() { return sleeps_are_instant; }
 
 std::uint64_t times_let_go() { return lets_go; }
 

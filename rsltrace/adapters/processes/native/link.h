@@ -53,6 +53,8 @@ std::int64_t shown_ns(std::uint32_t node = 0, bool look = false);
 // Whether the job has such clocks, and then whose one is that is made now (0: nobody's).
 bool has_own_clocks();
 std::uint32_t owner_of_new_clock();
+// Whether sleeps take no simulated time.
+bool has_instant_sleep();
 std::uint64_t seed();
 
 // Append a record to the batch that the loop takes with the next wait or question, or if the process

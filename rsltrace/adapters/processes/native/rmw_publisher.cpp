@@ -1,18 +1,27 @@
 // Publishers: messages leave as canonical CDR.
 #include <rmw/get_network_flow_endpoints.h>
 
+#include <map>
+
 #include "rmw_common.h"
 
 using namespace rsltrace;
 
 namespace {
 
+// By their numbers: what is said must not go by addresses.
+std::map<std::uint32_t, Endpoint *> &kept_here() {
+  static auto *all = new std::map<std::uint32_t, Endpoint *>;
+  return *all;
+}
+
 Endpoint &endpoint(const rmw_publisher_t *publisher) {
   return *static_cast<Endpoint *>(publisher->data);
 }
 
-void publish(const Endpoint &from, const std::uint8_t *data, std::size_t size) {
+void publish(Endpoint &from, const std::uint8_t *data, std::size_t size) {
   if (!linked()) return;
+  kept_here().erase(from.id);
   Writer body;
   body.number(from.id);
   body.raw(data, size);
@@ -20,6 +29,20 @@ void publish(const Endpoint &from, const std::uint8_t *data, std::size_t size) {
 }
 
 }  // namespace
+
+void rsltrace::stayed_here(Endpoint &publisher) {
+  if (!publisher.is_unseen) kept_here()[publisher.id] = &publisher;
+}
+
+void rsltrace::say_unseen() {
+  for (const auto &[id, publisher] : kept_here()) {
+    publisher->is_unseen = true;
+    Writer body;
+    body.number(id);
+    say(Say::UNSEEN, body);
+  }
+  kept_here().clear();
+}
 
 RSLTRACE_EXPORT rmw_publisher_t *rmw_create_publisher(
     const rmw_node_t *node, const rosidl_message_type_support_t *type_support, const char *topic,
@@ -57,6 +80,7 @@ RSLTRACE_EXPORT rmw_publisher_t *rmw_create_publisher(
 RSLTRACE_EXPORT rmw_ret_t rmw_destroy_publisher(rmw_node_t *node, rmw_publisher_t *publisher) {
   RSLTRACE_OURS(node);
   RSLTRACE_OURS(publisher);
+  kept_here().erase(endpoint(publisher).id);
   forget(endpoint(publisher).id);
   delete &endpoint(publisher);
   const rcutils_allocator_t allocator = rcutils_get_default_allocator();

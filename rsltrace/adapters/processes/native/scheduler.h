@@ -142,6 +142,8 @@ class Outside {
 void yield(Thread &thread);
 // A look that did not wait. Too many of them at one instant, and a millisecond passes.
 void look(Thread &thread, unsigned weight);
+// Of a question to the loop: after a hundred of these a millisecond passes.
+constexpr unsigned LOOK_WEIGHT = 100;
 
 long do_futex(Thread &thread, const long *arguments);  // futex.cpp: by who has the baton, not inside
 

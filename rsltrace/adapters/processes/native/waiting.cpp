@@ -16,9 +16,6 @@ namespace rsltrace {
 
 namespace {
 
-// After a hundred waits that find something, and none of it is taken, a millisecond passes.
-constexpr unsigned LOOK_WEIGHT = 100;
-
 // Give the set of ids a number, the same as last time if it is the same set.
 const WaitSet &numbered(const Wanted &wanted) {
   static std::uint32_t count = 0;
@@ -178,6 +175,7 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
     waiter.deadline_ns = deadline_ns;
     waiter.what = what;
     say_passed();
+    say_unseen();
     say_deadlines(wanted.timers);
     waiter.set = &numbered(wanted);
     for (const auto &one : wanted.conditions) one.condition->waiters.push_back(&waiter);

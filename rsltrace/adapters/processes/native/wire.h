@@ -44,6 +44,7 @@ enum class Say : std::uint32_t {
   CLOCK,
   READY,
   DROPPED,
+  UNSEEN,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
