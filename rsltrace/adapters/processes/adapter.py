@@ -27,13 +27,16 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 class ProcessProgram:
     """What to start as a process: the whole command line, and what it finds around it.
 
-    It has the same addresses in every run if it is ``pinned``.
+    Its addresses are ``fixed`` (the same in every run, where the system allows that), random, or,
+    with None, what those of this process would be. If ``noise``, a seed, is not 0, its heap is
+    fragmented first.
     """
 
     argv: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
-    pinned: bool = True
+    fixed: bool | None = True
+    noise: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +93,9 @@ class ProcessAdapter:
         def begin() -> None:
             on_start()
             argv, environment, folder = program.argv, program.environment, program.folder
+            fixed, noise = program.fixed, program.noise
             process.begin(
-                lambda: ProcessHandle(argv, environment, folder, name, fixed=program.pinned)
+                lambda: ProcessHandle(argv, environment, folder, name, fixed=fixed, noise=noise)
             )
 
         domain.dispatcher.run_outside(

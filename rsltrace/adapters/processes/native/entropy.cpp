@@ -10,6 +10,8 @@
 #include <cstdlib>
 #include <cstring>
 #include <random>
+#include <utility>
+#include <vector>
 
 #include "entropy.h"
 #include "real.h"
@@ -73,6 +75,20 @@ void exchange_start_bytes() {
   for (std::size_t i = 0; bytes != nullptr && i < 2; ++i) {
     const std::uint64_t word = split_mix(state);
     std::memcpy(bytes + i * sizeof word, &word, sizeof word);
+  }
+}
+
+void fragment_heap(std::uint64_t seed) {
+  constexpr std::size_t BLOCKS = 4000, SIZE_MAX_BYTES = 2000;
+  std::vector<void *> blocks(BLOCKS);
+  for (void *&block : blocks) {
+    const std::size_t size = 1 + split_mix(seed) % SIZE_MAX_BYTES;
+    block = std::malloc(size);
+    if (block != nullptr) std::memset(block, 1 + static_cast<int>(split_mix(seed) % UINT8_MAX), size);
+  }
+  for (std::size_t left = BLOCKS; left > BLOCKS / 2; --left) {  // the others stay
+    std::swap(blocks[split_mix(seed) % left], blocks[left - 1]);
+    std::free(blocks[left - 1]);
   }
 }
 

@@ -17,6 +17,7 @@
 #include <algorithm>
 
 #include "endpoints.h"
+#include "entropy.h"
 #include "guard_conditions.h"
 #include "shared.h"
 #include "threads.h"
@@ -153,7 +154,8 @@ void begin() {
   int fd = -1;
   int parent = 0;
   int files[2] = {-1, -1};
-  if (link == nullptr || sscanf(link, "%d:%d:%d:%d", &fd, &parent, &files[0], &files[1]) != 4) return;
+  unsigned noise = 0;
+  if (link == nullptr || sscanf(link, "%d:%d:%d:%d:%u", &fd, &parent, &files[0], &files[1], &noise) < 4) return;
   if (getppid() != parent) {
     if (has_no_peer(fd)) lost();  // rsltrace was killed before this process got here
     return;                       // started by a process of the run: outside of it
@@ -176,6 +178,7 @@ void begin() {
   time_ns = reader.number<std::int64_t>();
   seed_of_process = reader.number<std::uint64_t>();
   own_clocks = reader.number<std::uint32_t>() != 0;
+  if (noise != 0) fragment_heap(noise);
 }
 
 }  // namespace
