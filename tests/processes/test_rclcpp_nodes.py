@@ -15,6 +15,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace.adapters.processes.build import find_compiler, find_ros
+from rsltrace.diff import diff_files
+from rsltrace.diff.report import render
 from rsltrace.job import load_job
 from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
@@ -190,3 +192,32 @@ stop: {duration: 1s}
 """
     error = str(_run(tmp_path, job).error)
     assert "/c cannot load nowhere/nowhere::Class: " in error
+
+
+def test_what_a_callback_draws_is_named_with_its_line(tmp_path: Path) -> None:
+    program = _compile("draws.cpp", tmp_path / "draws", ["-g"])
+    line_of = {
+        text: number
+        for number, text in enumerate((SOURCES / "draws.cpp").read_text().splitlines(), 1)
+    }
+    draws, reads, publishes = (
+        next(f"draws.cpp:{line_of[text]}" for text in line_of if part in text)
+        for part in ("std::random_device", "getpid()", "publish(")
+    )
+    job = f"nodes: [{{program: {program}{{}}}}]\nstop: {{duration: 2s}}\n"
+    for number in range(2):
+        _run(tmp_path, job.format("") + f"seed: {number}\n", f"{number}.mcap")
+        _run(tmp_path, job.format(", arguments: [pid]"), f"pid{number}.mcap")
+    of_seed = render(diff_files(str(tmp_path / "0.mcap"), str(tmp_path / "1.mcap")))
+    assert "drew std::random_device() (" in of_seed
+    assert f"at {draws}" in " ".join(of_seed.split())
+    assert f"message on /drawn (std_msgs/msg/UInt64), at {publishes}" in of_seed
+    of_pid = render(diff_files(str(tmp_path / "pid0.mcap"), str(tmp_path / "pid1.mcap")))
+    assert "likely cause: /draws read getpid() (" in " ".join(of_pid.split())
+    assert f"at {reads}" in of_pid
+    assert "guard: {state: record}" not in of_pid
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        calls = {(count.call, count.node) for count in trace.guarded}
+        timer = next(e for e in trace.entities.values() if e.kind is EntityKind.TIMER)
+    assert {("rand()", "/draws"), ("time()", "/draws")} <= calls
+    assert timer.source.startswith("draws.cpp:")

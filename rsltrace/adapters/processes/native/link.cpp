@@ -34,6 +34,7 @@ std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
 bool own_clocks = false;
 std::uint64_t lets_go = 0;
+std::uint32_t ready_id = 0;
 std::size_t filled = 0;  // bytes of what has been received
 
 // What the process has said and the loop has not taken: its length, then whole records. The loop
@@ -201,6 +202,8 @@ bool has_own_clocks() { return own_clocks; }
 
 std::uint64_t times_let_go() { return lets_go; }
 
+std::uint32_t last_ready() { return ready_id; }
+
 void say(Say kind, const Writer &body) {
   if (!linked()) return;
   const std::uint32_t head[2] = {static_cast<std::uint32_t>(kind),
@@ -291,7 +294,7 @@ void idle(Waiter *const *waiters, std::size_t count, bool outside) {
   const auto thread = reader.number<std::uint32_t>();
   Ready ready;
   ready.kind = static_cast<Wake>(reader.number<std::uint32_t>());
-  ready.id = reader.number<std::uint32_t>();
+  ready.id = ready_id = reader.number<std::uint32_t>();
   if (ready.kind == Wake::ENTITY) deliver(ready.id, reader);
   if (ready.kind == Wake::TIMER) timer_may_run(ready.id);
   if (ready.kind == Wake::GRAPH) graph_has_changed();

@@ -1,6 +1,7 @@
 // Publishers: messages leave as canonical CDR.
 #include <rmw/get_network_flow_endpoints.h>
 
+#include "call_sites.h"
 #include "rmw_common.h"
 
 using namespace rsltrace;
@@ -13,6 +14,7 @@ Endpoint &endpoint(const rmw_publisher_t *publisher) {
 
 void publish(const Endpoint &from, const std::uint8_t *data, std::size_t size) {
   if (!linked()) return;
+  note_sender(from.id);
   Writer body;
   body.number(from.id);
   body.raw(data, size);

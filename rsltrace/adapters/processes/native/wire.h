@@ -44,6 +44,8 @@ enum class Say : std::uint32_t {
   CLOCK,
   READY,
   DROPPED,
+  DRAW,
+  SENDER,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
