@@ -13,6 +13,7 @@ from dataclasses import asdict
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
+from rsltrace.adapters.processes.process import Process
 from rsltrace.conditions.evaluation import (
     TextPositions,
     UnsupportedExpression,
@@ -331,6 +332,19 @@ def graph(run: StoppedRun) -> dict[str, Any]:
     return values
 
 
+def processes(run: StoppedRun) -> list[dict[str, Any]]:
+    """Return the programs that take part: their numbers, nodes and the lines of their callbacks."""
+    found: dict[int, dict[str, Any]] = {}
+    for node in run.session.world.domain.graph.nodes:
+        if isinstance(node.process, Process):
+            things, pid = node.process.things.values(), node.process.child.pid
+            sources = [getattr(thing, "source", "") for thing in things]
+            lines = list(dict.fromkeys(filter(None, sources)))
+            one = found.setdefault(pid, {"pid": pid, "nodes": [], "callbacks": lines})
+            one["nodes"].append(node.fully_qualified_name)
+    return list(found.values())
+
+
 def message(run: StoppedRun) -> dict[str, Any] | None:
     """Return the input message of the current (or next) callback."""
     received = run.view.received()
@@ -351,6 +365,7 @@ INSPECTED: dict[str, Callable[[StoppedRun], Any]] = {
     "stacks": stacks,
     "graph": graph,
     "message": message,
+    "processes": processes,
     "source": lambda run: source(run.view, run.ledger),
 }
 

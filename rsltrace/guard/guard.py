@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 from weakref import WeakKeyDictionary
 
 from rsltrace.errors import GuardError
@@ -291,6 +291,31 @@ class Guard:
             Finding(event, entity, node, source, GuardMode.VIRTUAL, call, describe(), stack)
         )
 
+    def note_process_answer(
+        self, source: NondeterminismSource, call: str, answer: str, stack: str, node: str
+    ) -> None:
+        """Keep in the trace what compiled code drew or read: the run answers all but process ids,
+        which are a finding.
+
+        :raises GuardError: if the job says that it is an error.
+        """
+        mode = self._policy.modes.get(source, DEFAULT_MODES[source])
+        if source is not NondeterminismSource.PID:
+            mode = GuardMode.VIRTUAL
+            counts = self._answered[source].setdefault(call, {})
+            counts[node] = counts.get(node, 0) + 1
+        elif mode is _ALLOW:
+            return
+        else:
+            mode = reporting_mode(mode)
+            key = (source, mode, node, call)
+            self._found[key] = self._found.get(key, 0) + 1
+        event, entity = self.context.place()
+        if self._has_room(event):
+            self.on_finding(Finding(event, entity, node, source, mode, call, answer, stack))
+        if mode is _ERROR:
+            _refuse(source, call, stack.partition("\n")[0])
+
     def _has_room(self, event: int) -> bool:
         """Count one more finding of an event; return whether the trace takes it."""
         if event != self._event:
@@ -327,11 +352,7 @@ class Guard:
                 text = value if isinstance(value, str) else repr(value)
             self.on_finding(Finding(event, entity, node, source, mode, call, text, stack))
             if mode is _ERROR:
-                where = stack.partition("\n")[0] or module_of(frame)
-                raise GuardError(
-                    f"{call} at {where}: the job says 'guard: {{{source.value}: error}}'; "
-                    f"{ADVICE[source]}"
-                )
+                _refuse(source, call, stack.partition("\n")[0] or module_of(frame))
 
     def record(
         self,
@@ -457,6 +478,13 @@ ADVICE = {
     NondeterminismSource.ORDER: "sort it, or use a dict or a list",
 }
 """What to do instead, by source."""
+
+
+def _refuse(source: NondeterminismSource, call: str, where: str) -> NoReturn:
+    raise GuardError(
+        f"{call} at {where}: the job says 'guard: {{{source.value}: error}}'; {ADVICE[source]}"
+    )
+
 
 engaged: Callable[[], Guard | None] = engagement.engaged
 engage = engagement.engage

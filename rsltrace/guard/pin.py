@@ -32,6 +32,10 @@ THREAD_VARIABLES = (
 )
 PINNED_VARIABLES = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREAD_VARIABLES, "1")}
 
+MEMORY_NOISE = "RSLTRACE_MEMORY_NOISE"
+"""How ``verify`` perturbs the memory of compiled processes, which ``record`` keeps the same: a seed
+for allocations before the program's own, and 1 for random addresses (``123:1``)."""
+
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BY_WHEELS = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 """ROS's wheels set this once they have started Python again with their folders."""

@@ -238,6 +238,8 @@ class RunSession:
         stack.enter_context(frozen_gc())  # the guard has looked at what there is
         self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
+        if self._guarded.guard is not None:
+            self._processes.note_answer = self._guarded.guard.note_process_answer
         with self._guarded.engaged():
             self._import_targets()
         check_bag_types(self.job, self._bags)

@@ -22,7 +22,7 @@ from typing import Any
 
 from rsltrace.adapters.workspace.cache import same_place
 from rsltrace.child_processes import Done, Processes, how_ended, rsltrace_command
-from rsltrace.guard.pin import THREAD_VARIABLES
+from rsltrace.guard.pin import MEMORY_NOISE, THREAD_VARIABLES
 from rsltrace.trace.format import METADATA_STATES
 
 HASH_SEED = "hash seed"
@@ -288,6 +288,8 @@ def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
         env["TZ"] = values[TIME_ZONE]
     if HEAP in values:
         env["PADDING"] = "p" * (int(values[HEAP]) % 4000)
+    if HEAP in values or ADDRESSES in values:
+        env[MEMORY_NOISE] = f"{values.get(HEAP, '0')}:{int(ADDRESSES in values)}"
     if THREAD_COUNT in values:
         env.update(dict.fromkeys(THREAD_VARIABLES, values[THREAD_COUNT]))
     if KERNEL in values:

@@ -179,6 +179,8 @@ class Session:
     step = go_to = None  # nothing gets so far
 
     def inspect(self, what: str) -> object:
+        if what == "processes":
+            return [{"pid": 7, "nodes": ["/ear"], "callbacks": ["src/ear.cpp:24", "ear.cpp:9"]}]
         return {"links": []} if what == "graph" else [{"name": "/robot/ekf"}, {"name": "/ear"}]
 
     def node(self, name: str) -> dict[str, str]:
@@ -204,6 +206,7 @@ def shell(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], DebugPrompt]:
         ("p/x speed", "there are no formats"),
         ("who-changed speed", "give a node and an attribute"),
         ("when", "when what?"),
+        ("gdb", "no C or C++ process runs /ekf"),
     ],
 )
 def test_what_is_typed_wrong_ends_a_script_with_2(
@@ -213,6 +216,14 @@ def test_what_is_typed_wrong_ends_a_script_with_2(
     shown = capsys.readouterr()
     assert says in shown.err
     assert shown.out.splitlines()[-1] == f"(rsltrace) {line}"
+
+
+def test_gdb_gets_breakpoints_in_the_callbacks_of_a_node(
+    shell: Callable[[str], DebugPrompt], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert shell("gdb ear").run() == 0
+    command = "gdb -p 7 -ex 'break src/ear.cpp:24' -ex 'break ear.cpp:9' -ex continue"
+    assert command in capsys.readouterr().out.splitlines()
 
 
 def test_a_script_ends_where_it_ends(

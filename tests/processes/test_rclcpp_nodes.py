@@ -6,6 +6,7 @@ It is in no wheel. With a ROS 2 that is sourced (``AMENT_PREFIX_PATH``) these te
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +15,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
+from rsltrace import DebugSession
 from rsltrace.adapters.processes.build import find_compiler, find_ros
+from rsltrace.diff import diff_files
+from rsltrace.diff.report import render
 from rsltrace.job import load_job
 from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
@@ -190,3 +194,68 @@ stop: {duration: 1s}
 """
     error = str(_run(tmp_path, job).error)
     assert "/c cannot load nowhere/nowhere::Class: " in error
+
+
+def test_what_a_callback_draws_is_named_with_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # below it places would be paths
+    program = _compile("draws.cpp", tmp_path / "draws", ["-g"])
+    line_of = {
+        text: number
+        for number, text in enumerate((SOURCES / "draws.cpp").read_text().splitlines(), 1)
+    }
+    draws, reads, publishes = (
+        next(f"draws.cpp:{line_of[text]}" for text in line_of if part in text)
+        for part in ("std::random_device", "getpid()", "publish(")
+    )
+    job = f"nodes: [{{program: {program}, arguments: [WHAT]}}]\nstop: {{duration: 2s}}\n"
+    for number in range(2):
+        _run(tmp_path, f"{job}seed: {number}\n", f"{number}.mcap")
+        _run(tmp_path, job.replace("WHAT", "pid"), f"pid{number}.mcap")
+    of_seed = render(diff_files(str(tmp_path / "0.mcap"), str(tmp_path / "1.mcap")))
+    assert "drew std::random_device() (" in of_seed
+    assert f"at {draws}" in " ".join(of_seed.split())
+    assert f"message on /drawn (std_msgs/msg/UInt64), at {publishes}" in of_seed
+    of_pid = render(diff_files(str(tmp_path / "pid0.mcap"), str(tmp_path / "pid1.mcap")))
+    assert "likely cause: /draws read getpid() (" in " ".join(of_pid.split())
+    assert f"at {reads}" in of_pid
+    assert "guard: {state: record}" not in of_pid
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        calls = {(count.call, count.node) for count in trace.guarded}
+        timer = next(e for e in trace.entities.values() if e.kind is EntityKind.TIMER)
+    assert {("rand()", "/draws"), ("time()", "/draws")} <= calls
+    assert timer.source.startswith("draws.cpp:")
+
+
+@pytest.mark.skipif(shutil.which("gdb") is None, reason="needs gdb")
+def test_gdb_stops_in_the_callback_of_an_event(tmp_path: Path) -> None:
+    program = _compile("tracker.cpp", tmp_path / "tracker", ["-g"])
+    _run(tmp_path, f"nodes: [{{program: {program}}}]\nstop: {{duration: 3s}}\n")
+    with DebugSession(tmp_path / "t.mcap", trust=True) as session:
+        index = session.run_to("1.4s").position.index
+        (found,) = session.inspect("processes")
+        assert found["nodes"] == ["/tracker"]
+        (line,) = found["callbacks"]
+        words = [f"break {line}", "continue", "up", "bt 1", "detach"]
+        command = ["gdb", "-nx", "-batch", "-p", str(found["pid"])]
+        with subprocess.Popen(
+            [*command, *(word for one in words for word in ("-ex", one))],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        ) as gdb:
+            assert gdb.stdout is not None
+            said = ""
+            for text in gdb.stdout:
+                said += text
+                if "not permitted" in text:
+                    gdb.kill()
+                    pytest.skip("this system lets nobody attach to a process")
+                if text.startswith("Breakpoint 1"):
+                    break
+            position = session.step().position
+            said += gdb.stdout.read()
+        assert position.index == index + 1
+    assert "hit Breakpoint 1" in said
+    assert line.partition(":")[0] in said.partition("hit Breakpoint 1")[2]

@@ -19,6 +19,7 @@ from rsltrace.simulation.middleware.events.event import OutsideEvent
 from rsltrace.simulation.middleware.events.failure import end_run, record_exception
 from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.trace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.finding import NondeterminismSource
 
 _EVERY_PROCESS_ENDED = "every process has ended"
 
@@ -27,14 +28,16 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 class ProcessProgram:
     """What to start as a process: the whole command line, and what it finds around it.
 
-    It has the same addresses in every run if it is ``pinned``; its sleeps take no simulated time
-    with ``instant_sleep``.
+    Its addresses are ``fixed`` (the same in every run, where the system allows that), random, or,
+    with None, what those of this process would be. If ``noise``, a seed, is not 0, its heap is
+    fragmented first. Its sleeps take no simulated time with ``instant_sleep``.
     """
 
     argv: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
-    pinned: bool = True
+    fixed: bool | None = True
+    noise: int = 0
     instant_sleep: bool = False
 
 
@@ -52,9 +55,10 @@ Log = Callable[[int, str, str], None]
 
 class ProcessAdapter:
     """The processes of one run. ``on_end`` is called with the key of each that has ended;
-    ``follows_clock`` says of a node whether /clock drives its ROS time. ``clock`` is there if nodes
-    have clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it
-    says what is shown, and whether that stays so throughout the event."""
+    ``follows_clock`` says of a node whether /clock drives its ROS time. ``note_answer`` takes what
+    code has drawn or read (source, call, answer, stack, node). ``clock`` is there if nodes have
+    clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it says
+    what is shown, and whether that stays so throughout the event."""
 
     def __init__(self, domain: Domain, interfaces: TypeLookup, *, seed: int, log: Log) -> None:
         self.domain = domain
@@ -64,6 +68,8 @@ class ProcessAdapter:
         self.processes: list[Process] = []
         self.follows_clock: Callable[[str], bool] = lambda node: False
         self.clock: Callable[[str | None, bool], tuple[int, bool]] | None = None
+        self.note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
+        self.note_answer = lambda source, call, answer, stack, node: None
         self.on_end: Callable[[str], None] = lambda key: None
         self._seed = seed
 
@@ -84,7 +90,12 @@ class ProcessAdapter:
         """Start a process and let it run up to its first wait, as one event."""
         domain = self.domain
         process = Process(
-            self, name, key, log_failure=log_failure, instant_sleep=program.instant_sleep
+            self,
+            name,
+            key,
+            log_failure=log_failure,
+            program=program.argv[0],
+            instant_sleep=program.instant_sleep,
         )
         process.begun_ns = domain.loop.now_ns
         process.entity_id = domain.entities.new_id()
@@ -94,8 +105,9 @@ class ProcessAdapter:
         def begin() -> None:
             on_start()
             argv, environment, folder = program.argv, program.environment, program.folder
+            fixed, noise = program.fixed, program.noise
             process.begin(
-                lambda: ProcessHandle(argv, environment, folder, name, fixed=program.pinned)
+                lambda: ProcessHandle(argv, environment, folder, name, fixed=fixed, noise=noise)
             )
 
         domain.dispatcher.run_outside(

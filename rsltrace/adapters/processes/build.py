@@ -25,6 +25,7 @@ from rsltrace.adapters.workspace.cache import cached_folder, key_of
 from rsltrace.child_processes import kill_group
 from rsltrace.errors import SetupError
 from rsltrace.fast_dataclass import dataclass
+from rsltrace.guard.pin import MEMORY_NOISE
 
 SOURCES = Path(__file__).parent / "native"
 _STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"
@@ -349,7 +350,12 @@ def program(
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
     known = [*libraries, *_listed(around, "LD_LIBRARY_PATH")]
     around["LD_LIBRARY_PATH"] = os.pathsep.join([*known, *_not_in(known, around)])
-    return ProcessProgram(list(command), around, folder, pinned, instant_sleep)
+    fixed = True if pinned else None
+    noise, _, random = around.pop(MEMORY_NOISE, "0:0").partition(":")
+    fragments = 0
+    if needs_symbols:  # Python depends on addresses as the run's own process does
+        fixed, fragments = fixed if random == "0" else False, int(noise)
+    return ProcessProgram(list(command), around, folder, fixed, fragments, instant_sleep)
 
 
 def _not_in(known: Sequence[str], environment: Mapping[str, str]) -> list[str]:

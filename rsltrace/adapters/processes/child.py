@@ -162,8 +162,7 @@ class ProcessEnd:
 class ProcessHandle:
     """A running executable with the library in it, in a process group of its own.
 
-    Its addresses are the same in every run if they are ``fixed``, where the system allows that; if
-    not, they are what those of whoever starts rsltrace would be.
+    ``fixed`` and ``noise``: see ``ProcessProgram``.
 
     :raises JobError: if it cannot be started.
     """
@@ -175,7 +174,8 @@ class ProcessHandle:
         folder: Path | None,
         name: str,
         *,
-        fixed: bool = True,
+        fixed: bool | None = True,
+        noise: int = 0,
     ) -> None:
         self._name = name
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -187,9 +187,10 @@ class ProcessHandle:
             self._said, self._told = ProcessMessages("rsltrace-said"), SharedMemory("rsltrace-told")
             files = (there.fileno(), self._said.fd, self._told.fd)
             # Of one length: the environment lies on the stack, and what comes after it moves.
-            link = ":".join(f"{number:010d}" for number in (files[0], os.getpid(), *files[1:]))
+            numbers = (files[0], os.getpid(), *files[1:], noise)
+            link = ":".join(f"{number:010d}" for number in numbers)
             try:
-                with _fixed_addresses() if fixed else nullcontext():
+                with nullcontext() if fixed is None else _addresses(fixed):
                     self._process = subprocess.Popen(
                         list(argv),
                         env={**environment, "RSLTRACE_LINK": link},
@@ -300,11 +301,11 @@ class ProcessHandle:
 
 
 @contextmanager
-def _fixed_addresses() -> Iterator[None]:
-    """Let children have the same addresses in every run, where the system allows it."""
-    changed = fix_addresses(True)
+def _addresses(fixed: bool) -> Iterator[None]:
+    """Let children have fixed or random addresses, where the system allows it."""
+    changed = fix_addresses(fixed)
     try:
         yield
     finally:
         if changed:
-            fix_addresses(False)
+            fix_addresses(not fixed)

@@ -49,6 +49,7 @@ class HostProcess(Protocol):
     """The process that endpoints and timers are in, as they see it."""
 
     name: str
+    program: str
     dispatcher: Dispatcher
 
     def wants(self, thing: WaitableEntity) -> bool:
@@ -121,17 +122,27 @@ class _QueueEndpoint(Receiver):
         return (number, ready, item), data
 
 
+def with_source(source: str) -> dict[str, object]:
+    """Return the detail of an entity for the line of its callback, if that is known."""
+    return {"source": source} if source else {}
+
+
 class _CallbackEndpoint(_QueueEndpoint):
     """An endpoint whose callback has a name, if the process says it."""
 
     callback_name = ""
+    source = ""
 
-    def named_callback(self, name: str) -> None:
-        """Take note of what its callback is called."""
-        self.callback_name = name
+    def named_callback(self, name: str, source: str) -> None:
+        """Take note of what its callback is called, and of its line."""
+        self.callback_name, self.source = name, source
 
     def trace_detail(self) -> dict[str, object]:
-        return {**super().trace_detail(), "callback": self.callback_name}
+        return {
+            **super().trace_detail(),
+            "callback": self.callback_name,
+            **with_source(self.source),
+        }
 
 
 class ProcessSubscription(_CallbackEndpoint, Subscription):
@@ -247,12 +258,15 @@ class ProcessTimer(Timer):
         super().__init__(dispatcher, None, period_ns)
         self.process = process
         self.number = number
-        self.name = ""
+        self.name = self.source = ""
         self.is_callback = True
 
-    def named_callback(self, name: str) -> None:
-        """Take note of what its callback is called."""
-        self.name = name
+    def named_callback(self, name: str, source: str) -> None:
+        """Take note of what its callback is called, and of its line."""
+        self.name, self.source = name, source
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**super().trace_detail(), **with_source(self.source)}
 
     def due_at(self, deadline_ns: int) -> None:
         """Take note of when it is due, by what rcl says."""

@@ -21,6 +21,7 @@ from rsltrace.adapters.processes.process_entities import (
     ProcessEntities,
     WakingTimer,
 )
+from rsltrace.adapters.processes.source_lines import stack_text
 from rsltrace.adapters.processes.wire import (
     GO,
     GRAPH_ID,
@@ -40,6 +41,7 @@ from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind
+from rsltrace.trace.model.finding import NondeterminismSource
 from rsltrace.trace.model.texts import format_seconds
 
 _RESUME = int(EventKind.RESUME)
@@ -51,6 +53,8 @@ _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
 _HELLO = struct.Struct("<qQII")
 _SHOWN = struct.Struct("<qI")
+_SOURCES = (NondeterminismSource.RANDOM, NondeterminismSource.CLOCK, NondeterminismSource.PID)
+"""What is drawn, by the numbers of ``native/call_sites.h``."""
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(RecordKind.PUBLISH), int(RecordKind.WAIT)
 _number = HEAD.unpack_from
@@ -65,6 +69,7 @@ class ProcessRun(EntityFactory, Protocol):
 
     log: Callable[[int, str, str], None]
     follows_clock: Callable[[str], bool]
+    note_answer: Callable[[NondeterminismSource, str, str, str, str], None]
     clock: Callable[[str | None, bool], tuple[int, bool]] | None
 
     def seed_of(self, key: str) -> int:
@@ -87,12 +92,14 @@ class Process:
         key: str,
         *,
         log_failure: bool,
+        program: str = "",
         instant_sleep: bool = False,
     ) -> None:
         self.adapter = adapter
         self.dispatcher = adapter.domain.dispatcher
         self.name = name
         self.key = key
+        self.program = program
         self.log_failure = log_failure
         self.instant_sleep = instant_sleep
         self.entity_id = 0
@@ -141,6 +148,7 @@ class Process:
             RecordKind.WAIT_SET: self._wait_set,
             RecordKind.ALIVE: self._alive,
             RecordKind.UNSEEN: self._unseen,
+            RecordKind.DRAW: self._draw,
             RecordKind.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
@@ -443,6 +451,12 @@ class Process:
             timer.cancel()
         else:
             timer.due_at(deadline_ns)
+
+    def _draw(self, fields: RecordReader) -> None:
+        source, call, answer = _SOURCES[fields.number()], fields.text(), fields.text()
+        running = self._running_node()
+        node = running.key if running is not None else ""
+        self.adapter.note_answer(source, call, answer, stack_text(fields.frames()), node)
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()

@@ -16,6 +16,7 @@ from rsltrace.adapters.processes.endpoints import (
     ProcessTimer,
     RosoutPublisher,
 )
+from rsltrace.adapters.processes.source_lines import callback_place, stack_text
 from rsltrace.adapters.processes.wire import RecordKind, RecordReader, WakeReason, packed_item
 from rsltrace.simulation.loop.timer_queue import TimerState
 from rsltrace.simulation.middleware.domain import Domain
@@ -26,7 +27,7 @@ from rsltrace.simulation.middleware.interface import MessageType, ServiceType
 from rsltrace.simulation.middleware.participant import Participant, QosEvent, full_name
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.format import TOPIC_ROSOUT
-from rsltrace.trace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.model.event import NO_EVENT, CodeLine, EventKind
 
 # What lets a process go on besides messages and timers: the end of a wait, and the graph.
 
@@ -214,6 +215,7 @@ class ProcessEntities(dict[int, Any]):
         self._nodes: list[Participant] = []
         self._timers_named = 0
         self._made_in = -1
+        self._sent_from: set[tuple[int, int, str]] = set()
         self.records: dict[int, Callable[[RecordReader], None]] = {
             RecordKind.NODE: self._node,
             RecordKind.PUBLISHER: self._publisher,
@@ -224,6 +226,7 @@ class ProcessEntities(dict[int, Any]):
             RecordKind.QOS_EVENT: self._qos_event,
             RecordKind.TIMER_OF: self._timer_of,
             RecordKind.CALLBACK: self._callback,
+            RecordKind.SENDER: self._sender,
         }
 
     def _node(self, fields: RecordReader) -> None:
@@ -312,7 +315,24 @@ class ProcessEntities(dict[int, Any]):
 
     def _callback(self, fields: RecordReader) -> None:
         """Take note of the name of a callback, which rclcpp says."""
-        self[fields.number()].named_callback(fields.text())
+        end, name = self[fields.number()], fields.text()
+        end.named_callback(name, callback_place(self._process.program, name))
+
+    def _sender(self, fields: RecordReader) -> None:
+        """Record the line of code that is about to send by an endpoint, once for each callback."""
+        end, stack = self[fields.number()], stack_text(fields.frames())
+        dispatcher = self._process.dispatcher
+        recorder, (place, _, function) = (
+            dispatcher.recorder,
+            stack.partition("\n")[0].partition(" in "),
+        )
+        key = end.entity_id, dispatcher.event.entity, place
+        if recorder is None or isinstance(end, RosoutPublisher) or key in self._sent_from:
+            return
+        if function or not stack:  # with debug information, or no more looked up
+            self._sent_from.add(key)
+            line = CodeLine(recorder.index, end.entity_id, recorder.outputs, place, function)
+            recorder.code_line(line, dispatcher.loop.now_ns)
 
     @property
     def last_node(self) -> Participant | None:

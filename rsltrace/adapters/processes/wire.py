@@ -25,6 +25,7 @@ HEAD = struct.Struct("<I")
 RECORD = struct.Struct("<II")
 GO = struct.Struct("<IIqIII")
 """Length of what follows the first two, what it is, now, thread, what is ready, its number."""
+_ADDRESS = struct.Struct("<Q")
 _ITEM = struct.Struct("<qqQQ16sI")
 _QOS = struct.Struct("<IQIIqqIqI")
 
@@ -64,6 +65,8 @@ class RecordKind(IntEnum):
     READY = 30
     DROPPED = 31
     UNSEEN = 32
+    DRAW = 33
+    SENDER = 34
 
 
 class CommandKind(IntEnum):
@@ -122,6 +125,10 @@ class RecordReader:
     def text(self) -> str:
         """Read a text; what is no UTF-8 becomes an escape."""
         return self.blob().decode("utf-8", "backslashreplace")
+
+    def frames(self) -> list[tuple[str, int]]:
+        """Read a stack: files and addresses in them."""
+        return [(self.text(), self.unpack(_ADDRESS)[0]) for _ in range(self.number())]
 
     def rest(self) -> bytes:
         """Read what is left."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import select
+import shlex
 import socket
 import tempfile
 import threading
@@ -18,6 +19,7 @@ from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.commands import PromptCommands, PromptContext
 from rsltrace.errors import ConditionError, DebugError, did_you_mean
 from rsltrace.terminal import say
+from rsltrace.trace.words.entities import nodes_called
 
 _LOOK_S = 0.1
 
@@ -310,6 +312,23 @@ def _pdb(shell: PromptContext, rest: str) -> None:
     if raised:
         shell.show([f"the callback raised {raised}"])
     shell.show([show.position_line(shell.session.position)])
+
+
+@_add("gdb", usage="[NODE]", topic="looking")
+def _gdb(shell: PromptContext, rest: str) -> None:
+    """Show the command that attaches gdb to the C or C++ process of a node, for another terminal.
+
+    It stops in the next callback: "step" here runs that, and waits while gdb holds the process.
+    Going back starts the process anew: attach again.
+    """
+    node = rest or shell.node_here()
+    found = shell.session.inspect("processes")
+    if node is not None:
+        found = [one for one in found if nodes_called(node, one["nodes"])]
+    if len(found) != 1:
+        raise DebugError(f"no C or C++ process runs {node}" if node else "of which node? gdb NODE")
+    breaks = [word for line in found[0]["callbacks"] for word in ("-ex", f"break {line}")]
+    shell.show([shlex.join(["gdb", "-p", str(found[0]["pid"]), *breaks, "-ex", "continue"])])
 
 
 @_add("debugpy", usage="[PORT]", topic="looking")

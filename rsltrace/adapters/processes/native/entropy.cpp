@@ -10,7 +10,10 @@
 #include <cstdlib>
 #include <cstring>
 #include <random>
+#include <utility>
+#include <vector>
 
+#include "call_sites.h"
 #include "entropy.h"
 #include "real.h"
 #include "scheduler.h"
@@ -39,12 +42,24 @@ void fill(void *out, std::size_t length) {
   }
 }
 
+// The first bytes, for the trace.
+std::string shown(const void *drawn, std::size_t length) {
+  constexpr std::size_t SHOWN_BYTES = 8;
+  std::string text;
+  for (std::size_t i = 0; i < length && i < SHOWN_BYTES; ++i) {
+    char digits[3];
+    std::snprintf(digits, sizeof digits, "%02x", static_cast<const unsigned char *>(drawn)[i]);
+    text += digits;
+  }
+  return text + (length > SHOWN_BYTES ? "…" : "");
+}
+
 bool is_device(const char *path) {
   return path != nullptr && (std::strcmp(path, "/dev/urandom") == 0 || std::strcmp(path, "/dev/random") == 0);
 }
 
 // A file with what the device would give; -1 if this process is not simulated or it cannot be made.
-int open_device(const char *path) {
+int open_device(const char *path, const void *caller) {
   if (!is_device(path) || me() == nullptr) return -1;
   const int file = memfd_create("rsltrace-random", MFD_CLOEXEC);
   if (file < 0) return -1;
@@ -55,6 +70,7 @@ int open_device(const char *path) {
     close(file);
     return -1;
   }
+  if (is_own_code(caller)) note_answer(Source::RANDOM, path, shown(bytes.data(), bytes.size()), caller);
   return file;
 }
 
@@ -76,6 +92,20 @@ void exchange_start_bytes() {
   }
 }
 
+void fragment_heap(std::uint64_t seed) {
+  constexpr std::size_t BLOCKS = 4000, SIZE_MAX_BYTES = 2000;
+  std::vector<void *> blocks(BLOCKS);
+  for (void *&block : blocks) {
+    const std::size_t size = 1 + split_mix(seed) % SIZE_MAX_BYTES;
+    block = std::malloc(size);
+    if (block != nullptr) std::memset(block, 1 + static_cast<int>(split_mix(seed) % UINT8_MAX), size);
+  }
+  for (std::size_t left = BLOCKS; left > BLOCKS / 2; --left) {  // the others stay
+    std::swap(blocks[split_mix(seed) % left], blocks[left - 1]);
+    std::free(blocks[left - 1]);
+  }
+}
+
 }  // namespace rsltrace
 
 using namespace rsltrace;
@@ -83,12 +113,14 @@ using namespace rsltrace;
 RSLTRACE_EXPORT ssize_t getrandom(void *out, size_t length, unsigned flags) {
   if (me() == nullptr) return REAL(getrandom)(out, length, flags);
   fill(out, length);
+  RSLTRACE_NOTE(Source::RANDOM, "getrandom()", shown(out, length));
   return static_cast<ssize_t>(length);
 }
 
 RSLTRACE_EXPORT int getentropy(void *out, size_t length) {
   if (me() == nullptr || length > 256) return REAL(getentropy)(out, length);
   fill(out, length);
+  RSLTRACE_NOTE(Source::RANDOM, "getentropy()", shown(out, length));
   return 0;
 }
 
@@ -97,7 +129,9 @@ RSLTRACE_EXPORT std::uint32_t arc4random() noexcept {
   using Function = std::uint32_t();
   static auto *libc = reinterpret_cast<Function *>(real("arc4random"));
   if (me() == nullptr && libc != nullptr) return libc();
-  return static_cast<std::uint32_t>(draw());
+  const auto drawn = static_cast<std::uint32_t>(draw());
+  RSLTRACE_NOTE(Source::RANDOM, "arc4random()", std::to_string(drawn));
+  return drawn;
 }
 
 RSLTRACE_EXPORT void arc4random_buf(void *out, size_t length) noexcept {
@@ -105,6 +139,7 @@ RSLTRACE_EXPORT void arc4random_buf(void *out, size_t length) noexcept {
   static auto *libc = reinterpret_cast<Function *>(real("arc4random_buf"));
   if (me() == nullptr && libc != nullptr) return libc(out, length);
   fill(out, length);
+  RSLTRACE_NOTE(Source::RANDOM, "arc4random_buf()", shown(out, length));
 }
 
 RSLTRACE_EXPORT std::uint32_t arc4random_uniform(std::uint32_t bound) noexcept {
@@ -113,6 +148,7 @@ RSLTRACE_EXPORT std::uint32_t arc4random_uniform(std::uint32_t bound) noexcept {
   std::uint32_t drawn;
   do drawn = arc4random();
   while (drawn < least);
+  RSLTRACE_NOTE(Source::RANDOM, "arc4random_uniform()", std::to_string(drawn % bound));
   return drawn % bound;
 }
 
@@ -122,11 +158,14 @@ RSLTRACE_EXPORT unsigned rsltrace_random_device(std::random_device *device) __as
 RSLTRACE_EXPORT unsigned rsltrace_random_device(std::random_device *device) {
   using Function = unsigned(std::random_device *);
   static auto *original = reinterpret_cast<Function *>(real("_ZNSt13random_device9_M_getvalEv"));
-  return me() == nullptr ? original(device) : static_cast<unsigned>(draw());
+  if (me() == nullptr) return original(device);
+  const auto drawn = static_cast<unsigned>(draw());
+  RSLTRACE_NOTE(Source::RANDOM, "std::random_device()", std::to_string(drawn));
+  return drawn;
 }
 
 #define RSLTRACE_OPEN(name, ...)                                            \
-  if (const int file = open_device(path); file >= 0) return file;           \
+  if (const int file = open_device(path, __builtin_return_address(0)); file >= 0) return file; \
   va_list rest;                                                             \
   va_start(rest, flags);                                                    \
   const mode_t mode = (flags & (O_CREAT | O_TMPFILE)) != 0 ? va_arg(rest, mode_t) : 0; \
@@ -139,11 +178,11 @@ RSLTRACE_EXPORT int openat(int folder, const char *path, int flags, ...) { RSLTR
 RSLTRACE_EXPORT int openat64(int folder, const char *path, int flags, ...) { RSLTRACE_OPEN(openat64, folder, path); }
 
 RSLTRACE_EXPORT FILE *fopen(const char *path, const char *mode) {
-  const int file = open_device(path);
+  const int file = open_device(path, __builtin_return_address(0));
   return file >= 0 ? fdopen(file, "r") : REAL(fopen)(path, mode);
 }
 
 RSLTRACE_EXPORT FILE *fopen64(const char *path, const char *mode) {
-  const int file = open_device(path);
+  const int file = open_device(path, __builtin_return_address(0));
   return file >= 0 ? fdopen(file, "r") : REAL(fopen64)(path, mode);
 }

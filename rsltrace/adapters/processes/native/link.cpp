@@ -17,6 +17,7 @@
 #include <algorithm>
 
 #include "endpoints.h"
+#include "entropy.h"
 #include "guard_conditions.h"
 #include "shared.h"
 #include "threads.h"
@@ -34,6 +35,7 @@ std::uint64_t seed_of_process = 0;
 bool own_clocks = false;
 bool sleeps_are_instant = false;
 std::uint64_t lets_go = 0;
+std::uint32_t ready_id = 0;
 std::size_t filled = 0;  // bytes of what has been received
 
 // What the process has said and the loop has not taken: its length, then whole records. The loop
@@ -154,12 +156,14 @@ void begin() {
   int fd = -1;
   int parent = 0;
   int files[2] = {-1, -1};
-  if (link == nullptr || sscanf(link, "%d:%d:%d:%d", &fd, &parent, &files[0], &files[1]) != 4) return;
+  unsigned noise = 0;
+  if (link == nullptr || sscanf(link, "%d:%d:%d:%d:%u", &fd, &parent, &files[0], &files[1], &noise) < 4) return;
   if (getppid() != parent) {
     if (has_no_peer(fd)) lost();  // rsltrace was killed before this process got here
     return;                       // started by a process of the run: outside of it
   }
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
+  prctl(PR_SET_PTRACER, PR_SET_PTRACER_ANY);  // gdb may attach where Yama lets only parents do that
   if (!said.open(far(files[0])) || !told.open(far(files[1]))) leave(120);
   link_fd = far(fd);
   signal(SIGINT, SIG_DFL);  // a run in the background of a shell, or under nohup, is no other run
@@ -178,6 +182,7 @@ void begin() {
   seed_of_process = reader.number<std::uint64_t>();
   own_clocks = reader.number<std::uint32_t>() != 0;
   sleeps_are_instant = reader.number<std::uint32_t>() != 0;
+  if (noise != 0) fragment_heap(noise);
 }
 
 }  // namespace
@@ -201,6 +206,8 @@ bool has_own_clocks() { return own_clocks; }
 bool has_instant_sleep() { return sleeps_are_instant; }
 
 std::uint64_t times_let_go() { return lets_go; }
+
+std::uint32_t last_ready() { return ready_id; }
 
 void say(Say kind, const Writer &body) {
   if (!linked()) return;
@@ -292,7 +299,7 @@ void idle(Waiter *const *waiters, std::size_t count, bool outside) {
   const auto thread = reader.number<std::uint32_t>();
   Ready ready;
   ready.kind = static_cast<Wake>(reader.number<std::uint32_t>());
-  ready.id = reader.number<std::uint32_t>();
+  ready.id = ready_id = reader.number<std::uint32_t>();
   if (ready.kind == Wake::ENTITY) deliver(ready.id, reader);
   if (ready.kind == Wake::TIMER) timer_may_run(ready.id);
   if (ready.kind == Wake::GRAPH) graph_has_changed();

@@ -47,6 +47,8 @@ bool linked();
 std::int64_t now_ns();
 // How often the process was let go on.
 std::uint64_t times_let_go();
+// The entity or timer for which it was let go on last; 0 for none.
+std::uint32_t last_ready();
 // What clocks show to the program: simulated time, unless the job has other clocks for its nodes.
 // `node` is whose clock it is (0: of who runs); a `look` at a clock of ROS may make it advance.
 std::int64_t shown_ns(std::uint32_t node = 0, bool look = false);

@@ -3,6 +3,7 @@
 
 #include <map>
 
+#include "call_sites.h"
 #include "rmw_common.h"
 
 using namespace rsltrace;
@@ -22,6 +23,7 @@ Endpoint &endpoint(const rmw_publisher_t *publisher) {
 void publish(Endpoint &from, const std::uint8_t *data, std::size_t size) {
   if (!linked()) return;
   kept_here().erase(from.id);
+  note_sender(from.id);
   Writer body;
   body.number(from.id);
   body.raw(data, size);

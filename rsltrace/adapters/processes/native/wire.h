@@ -45,6 +45,8 @@ enum class Say : std::uint32_t {
   READY,
   DROPPED,
   UNSEEN,
+  DRAW,
+  SENDER,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from

@@ -1,0 +1,26 @@
+// The lines of the program's own code that draw, look at clocks and publish: addresses here, lines there.
+#pragma once
+
+#include <cstdint>
+#include <string>
+
+namespace rsltrace {
+
+// The numbers are those of ../process.py.
+enum class Source : std::uint32_t { RANDOM = 0, CLOCK = 1, PID = 2 };
+
+// Whether a call comes from the program's own code: none of ROS, libc or the C++ library.
+bool is_own_code(const void *caller);
+// Put into the trace what the program's own code got from a call. `caller` is where it returns to.
+void note_answer(Source source, const char *call, const std::string &answer, const void *caller);
+// Say from where an endpoint is about to send, the first times from each callback.
+void note_sender(std::uint32_t id);
+
+}  // namespace rsltrace
+
+// Only what the program itself calls is worth a text.
+#define RSLTRACE_NOTE(source, call, answer)                                        \
+  do {                                                                             \
+    const void *caller = __builtin_return_address(0);                              \
+    if (is_own_code(caller)) note_answer(source, call, answer, caller);            \
+  } while (false)
