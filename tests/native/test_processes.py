@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
 from tests.native.running import COMMAND, environment, events_of, job, record
+from tests.processes.conftest import compiled
+
+__all__ = ["compiled"]
 
 pytestmark = [
     pytest.mark.ros,
@@ -39,11 +42,28 @@ stop: {duration: 4s}
 """
 
 
-@pytest.fixture(scope="module")
-def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Trace, dict[str, Any]]]:
+IN_C = """
+nodes:
+  - {main: robot_mains:count, arguments: [a], name: a, parameters: {first: 100000}}
+  - {program: PROGRAM, arguments: [b, "200000", "10"], name: b}
+  - {program: PROGRAM, arguments: [c, "300000", "13"], name: c}
+  - {main: robot_mains:count, arguments: [d], name: d, parameters: {first: 400000, period: 0.1}}
+stop: {duration: 4s}
+"""
+
+
+@pytest.fixture(scope="module", params=[FOUR, IN_C], ids=["Python", "C"])
+def four(
+    tmp_path_factory: pytest.TempPathFactory,
+    request: pytest.FixtureRequest,
+    compiled: Callable[[str], Path],
+) -> Iterator[tuple[Trace, dict[str, Any]]]:
     """A run of four processes, which all hear each other, and what they counted themselves."""
     folder = tmp_path_factory.mktemp("four")
-    done = record(folder, FOUR)
+    text = request.param
+    if "PROGRAM" in text:
+        text = text.replace("PROGRAM", str(compiled("../native/counting.c")))
+    done = record(folder, text)
     assert done.returncode == 0, done.stderr
     counted = {name: json.loads((folder / name).read_text()) for name in "abcd"}
     with Trace.open(folder / "run.mcap") as trace:
