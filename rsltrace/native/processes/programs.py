@@ -170,8 +170,10 @@ _NO_NUMBER = 2**64 - 1
 @dataclass(slots=True)
 class _Frame:
     """A callback that is known by what it took. It ends where its thread takes the next one or
-    waits, unless tracetools say where it began (``callback``) and ended."""
+    waits, unless tracetools say where it began (``callback``) and ended: a service responds after
+    that."""
 
+    entity: ObservedEntity
     callback: int | None = None
     ended_ns: int = 0
 
@@ -218,6 +220,8 @@ class ProgramSpans:
         self._entities: dict[int, ObservedEntity] = {}
         self._threads: dict[int, _Thread] = {}
         self._callbacks: dict[int, ObservedEntity] = {}
+        self._called: dict[int, ReceivedInput | None] = {}
+        """The calls of timers whose callbacks say themselves when they begin."""
         self._last_node: ObservedEntity | None = None
         self._timers = 0
         self._wall_ns = time.time_ns() - now_ns()
@@ -243,6 +247,7 @@ class ProgramSpans:
             (callback,) = fields.unpack(_POINTER)
             if (entity := self._entities.get(fields.number())) is not None:
                 self._callbacks[callback] = entity
+                self._called[entity.id] = None
         elif record.kind == RecordKind.NAME:
             (callback,) = fields.unpack(_POINTER)
             self._named(callback, fields.text())
@@ -272,7 +277,9 @@ class ProgramSpans:
             for thread in self._threads.values():
                 self.recorder.enter(thread.local)
                 if thread.sending is not None:
-                    self._sent(thread, 1, self._wall_ns, thread.sending[1].sequence)
+                    self._sent(thread, 1, self.recorder.time_ns(), thread.sending[1].sequence)
+                while thread.frames and thread.frames[-1].ended_ns:
+                    self._pop(thread)
         return self.recorder.finished_until(patience_ns)
 
     def _enter(self, record: Record) -> _Thread:
@@ -382,7 +389,10 @@ class ProgramSpans:
         number, wall_ns, due_ns = record.fields.unpack(_CALLED)
         if (entity := self._entities.get(number)) is not None:
             taken = ReceivedInput(entity, ready_ns=due_ns, observer_ns=record.spent_ns)
-            self._begin(thread, wall_ns, entity, taken)
+            if entity.id in self._called:
+                self._called[entity.id] = taken
+            else:
+                self._begin(thread, wall_ns, entity, taken)
 
     def _begin(
         self, thread: _Thread, wall_ns: int, entity: ObservedEntity, taken: ReceivedInput | None
@@ -391,15 +401,16 @@ class ProgramSpans:
         self._at(wall_ns)
         kind = EventKind.ACTION if _ACTION in entity.name else _EVENTS[entity.kind]
         self.recorder.begin(int(kind), entity, taken)
-        thread.frames.append(_Frame())
+        thread.frames.append(_Frame(entity))
 
     def _begun(self, thread: _Thread, callback: int, wall_ns: int) -> None:
+        entity = self._callbacks.get(callback)
+        if entity is None:
+            return
         top = thread.frames[-1] if thread.frames else None
-        if top is None or top.callback is not None:  # what it gets came not through the middleware
-            entity = self._callbacks.get(callback)
-            if entity is None:
-                return
-            self._begin(thread, wall_ns, entity, None)
+        if top is None or top.callback is not None or top.entity is not entity:
+            taken = self._called.get(entity.id)  # None: what it gets did not come from rmw
+            self._begin(thread, wall_ns, entity, taken)
             top = thread.frames[-1]
         top.callback = callback
 
@@ -409,6 +420,8 @@ class ProgramSpans:
         while thread.frames[-1].callback != callback:
             self._pop(thread)
         thread.frames[-1].ended_ns = record.steady_ns
+        if thread.frames[-1].entity.kind is not EntityKind.SERVICE:
+            self._pop(thread)
 
     def _close(self, thread: _Thread) -> None:
         """End what is over in a thread: what has a begin but no end goes on."""

@@ -379,6 +379,15 @@ void bracket(Kind kind, const void *callback) {
   add(kind, body, now_ns());
 }
 
+// The callback at an address is an entity's.
+void belongs(const void *callback, const Found &entity) {
+  if (entity == nullptr) return;
+  Writer body;
+  body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
+  body.number(entity->id);
+  add(Kind::CALLBACK, body, now_ns());
+}
+
 void called(std::uint32_t timer, std::int64_t due_ns) {
   Writer body;
   body.number(timer);
@@ -389,7 +398,8 @@ void called(std::uint32_t timer, std::int64_t due_ns) {
 
 thread_local bool is_within = false;  // one function of rcl's calls the other
 
-// Note the call of a timer. Its callback runs within it if rcl knows it, after it in rclcpp.
+// Note the call of a timer. Its callback runs within it if rcl knows it; in rclcpp it runs after it,
+// perhaps in another thread.
 template <typename Call>
 rcl_ret_t call_timer(const rcl_timer_t *timer, Call really) {
   const Found found = is_within ? nullptr : find(timer);
@@ -413,15 +423,6 @@ rcl_ret_t call_timer(const rcl_timer_t *timer, Call really) {
   else if (told == RCL_RET_OK)
     called(found->id, due_ns);
   return told;
-}
-
-// The callback at an address is an entity's.
-void belongs(const void *callback, const Found &entity) {
-  if (entity == nullptr) return;
-  Writer body;
-  body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
-  body.number(entity->id);
-  add(Kind::CALLBACK, body, now_ns());
 }
 
 void named(const void *callback, const char *symbol) {
@@ -631,10 +632,12 @@ EXPORT rcl_ret_t rcl_timer_init2(rcl_timer_t *timer, rcl_clock_t *clock, rcl_con
   const rcl_ret_t told =
       REAL(rcl_timer_init2)(timer, clock, context, period, callback, allocator, autostart);
   if (told != RCL_RET_OK || !ring().is_open()) return told;
+  const Found entity = new_entity(timer);
   Writer body;
-  body.number(new_entity(timer)->id);
+  body.number(entity->id);
   body.number(period);
   add(Kind::TIMER, body, now_ns());
+  if (callback != nullptr) belongs(timer, entity);
   return told;
 }
 
