@@ -260,6 +260,22 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
             assert words in {output.entity for output in outputs if output.kind == 1}
 
 
+def test_all_that_a_killed_program_has_done_is_kept(
+    tmp_path: Path, command: Any, compiled: Callable[[str], Path]
+) -> None:
+    program = f"{{program: {compiled('counter.c')}, arguments: ['10', kill], on_exception: log}}"
+    done = record(tmp_path, f"nodes: [{program}, {{node: robot:Talker}}]\nstop: {{duration: 2s}}\n")
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        trace.check()
+        counts = [trace.decode("/count", data).data for _, _, data in trace.messages("/count")]  # type: ignore[attr-defined]
+        assert counts == [1, 2, 3, 4, 5]
+        assert len(callbacks(trace, "counter", "timer 1", EventKind.TIMER)) == 5
+        assert "which was killed by SIGKILL at " in trace.result["missing"]
+    shown = command("info", "run.mcap").stdout
+    assert "  missing  " in shown
+
+
 def started(folder: Path, text: str) -> tuple[subprocess.Popen[str], int]:
     """Start a run with a main that ends by nothing; return it, and the number of that process."""
     process = subprocess.Popen(

@@ -93,6 +93,7 @@ class RecordFile:
         self._head = memoryview(self._map)[:_HEAD_SIZE].cast("Q")  # each read as a whole
         if self._head[0] != _MAGIC:
             raise ValueError("nothing has been written")
+        path.unlink()  # it is there for as long as it is mapped
         self.until_ns = 0
         """There are no other records of before."""
 
@@ -227,8 +228,6 @@ class ProgramSpans:
         self._wall_ns = time.time_ns() - now_ns()
         """The system clock less the steady one, as last seen."""
         self.unreadable = 0
-        self.lost = 0
-        """Records that the process had no room for."""
         self._log_type = get_message_class("rcl_interfaces/msg/Log")
 
     def add(self, record: Record) -> None:
@@ -436,7 +435,6 @@ class ProgramSpans:
 
     def _missing(self) -> None:
         """End everything: nobody knows what has come in between."""
-        self.lost += 1
         for thread in self._threads.values():
             self.recorder.enter(thread.local)
             if thread.sending is not None:
@@ -533,6 +531,11 @@ class ObservedProgram:
         at = len(found) if is_over else sum(span.start_ns < until_ns for span in found)
         self._early = found[at:]
         return found[:at], until_ns
+
+    @property
+    def unobserved(self) -> int:
+        """How many processes could not make a file."""
+        return len(list(self._folder.iterdir()))
 
     @property
     def lost(self) -> int:

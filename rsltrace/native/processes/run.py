@@ -378,6 +378,7 @@ class MultiProcessRun(NativeRun):
     def _ended(self, child: ObservedProcess, status: int) -> None:
         """Take note of the end of a process."""
         self._look_at(child, is_over=True)
+        self._look_for_missing(child, status)
         if child in self._told:
             self.merge.end(self._told[child][1])
         what, how = child.what, how_ended(status)
@@ -404,6 +405,19 @@ class MultiProcessRun(NativeRun):
             self.stop(Stop(f"{what.key} has ended, which the run requires"))
         if what.order.plays_bags and not has_stop(self.job):
             self.stop(Stop("end of the bag"))
+
+    def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
+        """Take note of what the trace lacks, or may lack, of a process that has ended."""
+        name, program = child.what.name, self._programs.get(child)
+        if program is not None and program.lost:
+            self.missing.append(f"{program.lost} records of {name}, for which there was no room")
+        if program is not None and program.unobserved:
+            self.missing.append(
+                f"{program.unobserved} processes of {name}: no room for files in {self._folder}"
+            )
+        if child.has_begun and status < 0 and status != -signal.SIGINT:
+            what = "the last 50 ms" if program is None else "what each thread was just doing"
+            self.missing.append(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
 
     @property
     def _at(self) -> str:
