@@ -341,9 +341,18 @@ def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
     ]
     assert deaf in children
     assert len(children) == 2
+    deadline = time.monotonic() + 60
+    while not has_events(tmp_path / "run.mcap") and time.monotonic() < deadline:
+        time.sleep(0.1)
     process.kill()
     process.communicate()
     assert all(map(is_gone, children))
+    assert has_events(tmp_path / "run.mcap")
+
+
+def has_events(path: Path) -> bool:
+    with Trace.open(path) as trace:
+        return trace.event_count > 0
 
 
 def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:

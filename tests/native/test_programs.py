@@ -155,3 +155,7 @@ def test_a_file_is_read_around_its_end_and_without_what_is_being_written(
     file._head[4] = 0
     assert file.read() == []
     assert file.until_ns == 1000
+    file._head[2] += 32
+    file._map[4096:] = bytes(CAPACITY)
+    with pytest.raises(ValueError, match="has written over its records"):
+        file.read()

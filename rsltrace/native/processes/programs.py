@@ -130,6 +130,8 @@ def _records(data: memoryview) -> Iterator[Record]:
     at = 0
     while at < len(data):
         size, kind, steady_ns, thread, spent_ns = _RECORD.unpack_from(data, at)
+        if size < _RECORD.size:
+            raise ValueError("the process has written over its records")
         fields = RecordReader(data[at + _RECORD.size : at + size])
         yield Record(kind, steady_ns, thread, spent_ns, fields)
         at += (size + 7) // 8 * 8

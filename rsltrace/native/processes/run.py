@@ -324,7 +324,13 @@ class MultiProcessRun(NativeRun):
         program = self._programs.get(child)
         if program is None or child not in self._told:
             return
-        found, until_ns = program.read(is_over=is_over)
+        try:
+            found, until_ns = program.read(is_over=is_over)
+        except Exception as error:
+            del self._programs[child]
+            self.merge.end(self._told[child][1])
+            self.missing.append(f"what {child.what.name} did from {self._at} s on: {error}")
+            return
         self._counts[child] = program.counts
         self._add(self._told[child][1], found, until_ns)
 
