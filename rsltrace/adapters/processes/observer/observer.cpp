@@ -124,7 +124,8 @@ class Ring {
     if (file < 0) return;
     // Not sparse: on a full disk a process would be killed as it writes.
     if (posix_fallocate(file, 0, HEAD + CAPACITY) == 0) {
-      void *found = mmap(nullptr, HEAD + CAPACITY, PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+      void *found = mmap(nullptr, HEAD + CAPACITY, PROT_READ | PROT_WRITE,
+                         MAP_SHARED | MAP_POPULATE, file, 0);
       if (found != MAP_FAILED) {
         head_ = static_cast<Head *>(found);
         head_->capacity = CAPACITY;
