@@ -65,6 +65,8 @@ def native_lines(trace: Trace) -> list[str]:
         rows.append(("  ignored keys of the job", printable(described["ignored"])))
     if levels := trace.result.get("thread_priorities"):
         rows.append(("  real-time priorities", printable(levels)))
+    if missing := trace.result.get("missing"):
+        rows.append(("  missing", printable(missing)))
     observer, pen = (trace.result.get(key, "") for key in ("observer_ns", "pen_ns"))
     if observer.isdigit() and pen.isdigit():
         text = f"{format_duration(int(observer))} per callback in its thread (median), and "

@@ -103,6 +103,8 @@ class NativeRun:
         self.ending: Stop | None = None
         self.stopped = threading.Event()
         self.levels: dict[str, int] = {}
+        self.missing: list[str] = []
+        """What the trace lacks, or may lack."""
         self.begun_ns = 0
         self.ended_ns = 0
         self._lock = threading.Lock()
@@ -243,6 +245,7 @@ class NativeRun:
                 "callback_ns": str(callback_ns),
                 "unknown_causes": str(self.span_writer.causes.unknown),
                 **self._levels(),
+                **({"missing": "; ".join(self.missing)} if self.missing else {}),
             },
             replace=self.begun_ns > 0 or exit_code == 0,
         )

@@ -43,9 +43,9 @@ class ObservedEntity:
 class ObservedEntities:
     """Gives out ids, and finds what belongs to one of rclpy's handles or wrappers."""
 
-    def __init__(self, tell: Callable[[Entity], object]) -> None:
+    def __init__(self, tell: Callable[[Entity], object], ids: count[int] | None = None) -> None:
         self._tell = tell
-        self._ids = count(1)
+        self._ids = count(1) if ids is None else ids
         self._lock = threading.Lock()
         self._of: WeakKeyDictionary[Any, ObservedEntity] = WeakKeyDictionary()
         self._news: list[ObservedEntity] | None = None

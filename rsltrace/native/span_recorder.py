@@ -129,6 +129,14 @@ class SpanRecorder:
         self.activity_ns = 0
         """When something was last sent, steady."""
 
+    def now_ns(self) -> int:
+        """Read the steady clock."""
+        return now_ns()
+
+    def time_ns(self) -> int:
+        """Read the system clock."""
+        return time.time_ns()
+
     def begin(
         self,
         kind: int,
@@ -188,7 +196,7 @@ class SpanRecorder:
                 self._close(span)
             span.outputs.append(output)
             if begun_ns:
-                span.observer_ns += now_ns() - begun_ns
+                span.observer_ns += self.now_ns() - begun_ns
             return span, len(span.outputs) - 1
 
     def sending(self) -> CallbackSpan:
@@ -206,9 +214,9 @@ class SpanRecorder:
             span.sending -= 1
             if output is not None:
                 span.outputs.append(output)
-                self.activity_ns = now_ns()
+                self.activity_ns = self.now_ns()
                 if begun_ns:
-                    span.observer_ns += now_ns() - begun_ns
+                    span.observer_ns += self.now_ns() - begun_ns
             if span.owner is None:
                 self._close(span)
 
@@ -234,14 +242,14 @@ class SpanRecorder:
                 if first.sending and patience_ns is not None:
                     break
                 if not first.end_ns:
-                    if patience_ns is not None and now_ns() - first.start_ns < patience_ns:
+                    if patience_ns is not None and self.now_ns() - first.start_ns < patience_ns:
                         break
                     first.flags |= _SUSPENDED
                     self._close(first)
                     if first.owner is not None:
                         first.owner.span = None
                 taken.append(spans.popleft())
-            return taken, spans[0].start_ns if spans else now_ns()
+            return taken, spans[0].start_ns if spans else self.now_ns()
 
     def _stack(self) -> list[RunningCallback]:
         try:
@@ -278,10 +286,10 @@ class SpanRecorder:
     def _open(
         self, kind: int, entity: ObservedEntity | None, owner: RunningCallback | None
     ) -> CallbackSpan:
-        span = CallbackSpan(kind, entity, now_ns(), time.time_ns(), self._local.thread, owner)
+        span = CallbackSpan(kind, entity, self.now_ns(), self.time_ns(), self._local.thread, owner)
         self._spans.append(span)
         return span
 
     def _close(self, span: CallbackSpan) -> None:
-        span.end_ns = now_ns()
+        span.end_ns = self.now_ns()
         self.count += 1

@@ -94,6 +94,8 @@ class CauseIndex:
 
 
 _EVERY_S = 0.05
+_KEPT_EVERY_NS = NS_PER_S
+"""How much of a run that is killed is not in its trace, at most."""
 _PREFIX = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPONSE}
 
 
@@ -155,8 +157,12 @@ class SpanWriter(threading.Thread):
 
     def run(self) -> None:
         try:
+            kept_ns = time.monotonic_ns()
             while not self._over.wait(_EVERY_S):
                 self.write(CUT_AFTER_NS)
+                if time.monotonic_ns() - kept_ns >= _KEPT_EVERY_NS:
+                    self._recorder.writer.flush()
+                    kept_ns = time.monotonic_ns()
                 self.cpu_ns = time.thread_time_ns()
         except BaseException as error:
             self.error = error

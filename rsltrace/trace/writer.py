@@ -277,6 +277,11 @@ class TraceWriter:
         channel_id = self._own_channel(TOPIC_TIMINGS, SCHEMA_TIMING)
         return self.add_payload(channel_id, stamp_ns, CDR_HEADER + packed)
 
+    def flush(self) -> None:
+        """Write the events that there are: they stay if this process is killed."""
+        if self._rests:
+            self._write_segment()
+
     def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
         """Write the rest and the indexes, and close the file.
 

@@ -1,7 +1,8 @@
 """Whether the observer loses anything, over many runs: ``python -m tests.native.many_runs``.
 
 Nodes count what they do; the trace has to have the same. Every other run has a process for each
-entry, the rest all of them in one.
+entry, the rest all of them in one. With ``--program`` all runs have two nodes in C: ``counting.c``,
+compiled.
 """
 
 from __future__ import annotations
@@ -24,6 +25,14 @@ nodes:
   - node: robot_mains:Counting
     arguments: {name: c, first: 300000}
     parameters: {told: c, period: 0.013}
+  - {node: robot_mains:Counting, arguments: {name: d, first: 400000}, parameters: {told: d}}
+stop: {duration: 2s}
+"""
+IN_C = """
+nodes:
+  - {node: robot_mains:Counting, arguments: {name: a, first: 100000}, parameters: {told: a}}
+  - {program: PROGRAM, arguments: [b, "200000", "10"], name: b}
+  - {program: PROGRAM, arguments: [c, "300000", "13"], name: c}
   - {node: robot_mains:Counting, arguments: {name: d, first: 400000}, parameters: {told: d}}
 stop: {duration: 2s}
 """
@@ -79,12 +88,14 @@ def main() -> None:
     """Run and compare, and print what came of it."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=50)
-    runs = parser.parse_args().runs
+    parser.add_argument("--program", default="")
+    options = parser.parse_args()
+    runs, job = options.runs, IN_C.replace("PROGRAM", options.program) if options.program else JOB
     totals: dict[str, Counter[str]] = defaultdict(Counter)
     for number in range(runs):
         with tempfile.TemporaryDirectory() as name:
-            words = ["--processes"] if number % 2 else []
-            done = record(Path(name), JOB, "--quiet", *words)
+            words = ["--processes"] if number % 2 or options.program else []
+            done = record(Path(name), job, "--quiet", *words)
             assert done.returncode == 0, done.stderr
             kind = "one process" if not words else "four processes"
             totals[kind]["runs"] += 1

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import time
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,9 @@ from rsltrace.trace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.native import callback_figures, timings
 from rsltrace.trace.reader import Trace
 from tests.native.running import COMMAND, environment, events_of, job, record
+from tests.processes.conftest import compiled
+
+__all__ = ["compiled"]
 
 pytestmark = [
     pytest.mark.ros,
@@ -39,11 +42,28 @@ stop: {duration: 4s}
 """
 
 
-@pytest.fixture(scope="module")
-def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Trace, dict[str, Any]]]:
+IN_C = """
+nodes:
+  - {main: robot_mains:count, arguments: [a], name: a, parameters: {first: 100000}}
+  - {program: PROGRAM, arguments: [b, "200000", "10"], name: b}
+  - {program: PROGRAM, arguments: [c, "300000", "13"], name: c}
+  - {main: robot_mains:count, arguments: [d], name: d, parameters: {first: 400000, period: 0.1}}
+stop: {duration: 4s}
+"""
+
+
+@pytest.fixture(scope="module", params=[FOUR, IN_C], ids=["Python", "C"])
+def four(
+    tmp_path_factory: pytest.TempPathFactory,
+    request: pytest.FixtureRequest,
+    compiled: Callable[[str], Path],
+) -> Iterator[tuple[Trace, dict[str, Any]]]:
     """A run of four processes, which all hear each other, and what they counted themselves."""
     folder = tmp_path_factory.mktemp("four")
-    done = record(folder, FOUR)
+    text = request.param
+    if "PROGRAM" in text:
+        text = text.replace("PROGRAM", str(compiled("../native/counting.c")))
+    done = record(folder, text)
     assert done.returncode == 0, done.stderr
     counted = {name: json.loads((folder / name).read_text()) for name in "abcd"}
     with Trace.open(folder / "run.mcap") as trace:
@@ -240,6 +260,22 @@ def test_a_process_that_fails_is_named_and_the_trace_is_kept(
             assert words in {output.entity for output in outputs if output.kind == 1}
 
 
+def test_all_that_a_killed_program_has_done_is_kept(
+    tmp_path: Path, command: Any, compiled: Callable[[str], Path]
+) -> None:
+    program = f"{{program: {compiled('counter.c')}, arguments: ['10', kill], on_exception: log}}"
+    done = record(tmp_path, f"nodes: [{program}, {{node: robot:Talker}}]\nstop: {{duration: 2s}}\n")
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        trace.check()
+        counts = [trace.decode("/count", data).data for _, _, data in trace.messages("/count")]  # type: ignore[attr-defined]
+        assert counts == [1, 2, 3, 4, 5]
+        assert len(callbacks(trace, "counter", "timer 1", EventKind.TIMER)) == 5
+        assert "which was killed by SIGKILL at " in trace.result["missing"]
+    shown = command("info", "run.mcap").stdout
+    assert "  missing  " in shown
+
+
 def started(folder: Path, text: str) -> tuple[subprocess.Popen[str], int]:
     """Start a run with a main that ends by nothing; return it, and the number of that process."""
     process = subprocess.Popen(
@@ -305,9 +341,18 @@ def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
     ]
     assert deaf in children
     assert len(children) == 2
+    deadline = time.monotonic() + 60
+    while not has_events(tmp_path / "run.mcap") and time.monotonic() < deadline:
+        time.sleep(0.1)
     process.kill()
     process.communicate()
     assert all(map(is_gone, children))
+    assert has_events(tmp_path / "run.mcap")
+
+
+def has_events(path: Path) -> bool:
+    with Trace.open(path) as trace:
+        return trace.event_count > 0
 
 
 def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:

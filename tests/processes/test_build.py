@@ -23,12 +23,13 @@ def _building_in(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(build, "cached_folder", make_here)
 
 
+@pytest.mark.parametrize("sources", [(), build.OBSERVER], ids=["simulated", "native"])
 def test_the_library_is_built_without_a_warning(
-    compiled: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    sources: tuple[Path, ...], compiled: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     _building_in(tmp_path, monkeypatch)
     said: list[str] = []
-    built = build.library(said.append, ["-Wall", "-Wextra", "-Werror"])
+    built = build.library(said.append, ["-Wall", "-Wextra", "-Werror"], sources)
     assert built.path.exists()
     assert built.python_symbols.exists()
     assert len(said) == 1

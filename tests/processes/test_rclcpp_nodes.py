@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from tests.native.running import record
 
 SOURCES = Path(__file__).parent / "rclcpp_nodes"
 PREFIXES = [Path(one) for one in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if one]
@@ -109,6 +111,34 @@ def test_executors_do_what_rclcpp_does_and_each_run_is_the_same(
         timers = [e.name for e in trace.entities.values() if e.kind is EntityKind.TIMER]
     assert timers == ["Talker::Talker()::{lambda()#1}", "Talker::Talker()::{lambda()#2}",
                       "Listener::Listener()::{lambda()#2}"]  # fmt: skip
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("executor", ["single", "multi", "events"])
+def test_native_runs_have_every_callback_with_its_cause(
+    nodes: Path, tmp_path: Path, executor: str
+) -> None:
+    text = f"nodes: [{{program: {nodes}, arguments: [{executor}]}}]\nstop: {{duration: 3s}}\n"
+    done = record(tmp_path, text)
+    assert done.returncode == 0, done.stderr
+    heard = [text for _, _, text in _logs(tmp_path / "run.mcap") if text.startswith("heard")]
+    assert len(heard) > 20
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        names = {entity.id: entity.name for entity in trace.entities.values()}
+        events = [trace.event(index) for index in range(trace.event_count)]
+        runs = Counter((names[event.entity], event.kind) for event in events)
+        sent = [trace.outputs_of(one.index) for one in events if one.kind is EventKind.TIMER]
+        counts = [o for outputs in sent for o in outputs if names[o.entity] == "/count"]
+        assert runs["/count", EventKind.SUBSCRIPTION] == 2 * len(heard)
+        assert runs["Talker::Talker()::{lambda()#1}", EventKind.TIMER] in range(25, 31)
+        assert len(counts) - len(heard) in {0, 1}
+        responses = [
+            [names[output.entity] for output in trace.outputs_of(event.index)]
+            for event in events
+            if (names[event.entity], event.kind) == ("/enable", EventKind.SERVICE)
+        ]
+        assert responses == [["/enable"]] * runs["/enable", EventKind.CLIENT]
+        assert trace.result["unknown_causes"] == "0"
 
 
 @pytest.mark.parametrize("call", ["some", "all", "once"])

@@ -28,6 +28,11 @@ from rsltrace.fast_dataclass import dataclass
 from rsltrace.guard.pin import MEMORY_NOISE
 
 SOURCES = Path(__file__).parent / "native"
+OBSERVER = (
+    Path(__file__).parent / "observer" / "observer.cpp",
+    *(SOURCES / name for name in ("typesupport.cpp", "typesupport.h", "wire.h")),
+)
+"""The sources of the library that observes processes of native runs."""
 _STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"
 _NAME = "librmw_rsltrace.so"
 _STUB = "librsltrace_python_symbols.so"
@@ -104,13 +109,16 @@ class PreloadLibrary:
     ros: RosInstallation
 
 
-def library(note: Callable[[str], None], extra: Sequence[str] = ()) -> PreloadLibrary:
+def library(
+    note: Callable[[str], None], extra: Sequence[str] = (), sources: Sequence[Path] = ()
+) -> PreloadLibrary:
     """Return the library; it is built if it has not been, and ``note`` is given one line then.
+    ``sources`` are those of another one.
 
     :raises SetupError: if a compiler or headers are missing, or the compiler refuses the sources.
     """
     ros, compiler = find_ros(), find_compiler()
-    sources = sorted(SOURCES.glob("*.[ch]*"))
+    sources = sources or sorted(SOURCES.glob("*.[ch]*"))
     command = [*compiler, *_options(), *extra]
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
     name = key_of(

@@ -153,7 +153,7 @@ def _become(order: EntryOrder, link: Link) -> None:
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     try:
-        os.execvp(order.command[0], order.command)
+        os.execvpe(order.command[0], order.command, order.environment or os.environ)
     except OSError as error:
         said = f"{order.command[0]} cannot be started: {error.strerror}"
         link.send("error", "JobError", said)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from rsltrace.native.processes.wire import EntryOrder, Frame, Link
 
 _MAIN = "rsltrace.native.processes.child"
 _LOOK_S = 0.2
+_LOOK_AT_PROGRAMS_S = 0.05
 _REAPED_WITHIN_S = 10.0
 """A process that was killed, or has closed its socket, is gone after a moment."""
 
@@ -110,7 +112,10 @@ class ObservedProcess(threading.Thread):
 
     def _status(self) -> int:
         if self.what.order.command:  # it has let go of the socket to become something else
-            return self._process.wait()
+            while (status := self._process.poll()) is None:
+                self._told(self, ("look",))
+                time.sleep(_LOOK_AT_PROGRAMS_S)
+            return status
         try:
             return self._process.wait(_REAPED_WITHIN_S)
         except subprocess.TimeoutExpired:

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 
-from rsltrace.adapters.processes.build import is_python
+from rsltrace.adapters.processes.build import (
+    OBSERVER,
+    PreloadLibrary,
+    find_ros,
+    is_python,
+    library,
+    program,
+)
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate
@@ -19,9 +27,9 @@ THE_BAGS = "the bags"
 """The name of the process that plays them."""
 
 
-def starts_of(job: Job, like: EntryOrder) -> list[ProcessStart]:
+def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[ProcessStart]:
     """Return what to start, in the order of the job, with orders like the given one; whoever plays
-    its bags comes last.
+    its bags comes last. ``note`` is told what cannot be observed, and why.
 
     :raises JobError: a program, or the folder that it is to run in, is not there.
     """
@@ -29,14 +37,33 @@ def starts_of(job: Job, like: EntryOrder) -> list[ProcessStart]:
     observed = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
     like = replace(like, job=observed, module_path=tuple(sys.path))
     starts = []
+    observer: PreloadLibrary | None = None
+    why_not = ""
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         where = spec.origin or locate(job, ("nodes", index, spec.kind))
         command = _command(observed, index, processes, where)
+        variables = None
+        if command and observer is None and not why_not:
+            try:
+                observer = library(note, sources=OBSERVER)
+            except SetupError as error:
+                why_not = str(error)
+                note(f"programs are not observed: {why_not}")
+        if command and observer is not None:
+            variables = program(
+                command,
+                observer,
+                surroundings=os.environ,
+                environment=spec.environment,
+                folder=None,
+                search_path=processes.search_path,
+                prefixes=processes.prefixes,
+            ).environment
         starts.append(
             ProcessStart(
                 spec.target,
                 key,
-                replace(like, index=index, command=command),
+                replace(like, index=index, command=command, environment=variables),
                 _environment(spec, processes, is_program=bool(command)),
                 processes.folder(spec, where),
                 spec.node is None,
@@ -79,8 +106,6 @@ def _environment(spec: NodeSpec, processes: ProcessPrograms, *, is_program: bool
         return around
     libraries = []
     try:
-        from rsltrace.adapters.processes.build import find_ros
-
         libraries = [str(path) for path in find_ros().libraries if path.is_relative_to(sys.prefix)]
     except SetupError:
         pass  # what is sourced has said it itself

@@ -8,8 +8,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from rsltrace import errors
@@ -28,6 +30,7 @@ from rsltrace.native.native_run import (
 )
 from rsltrace.native.processes.children import ObservedProcess, ProcessStart
 from rsltrace.native.processes.plans import start_rules, starts_of
+from rsltrace.native.processes.programs import FOLDER, ObservedProgram
 from rsltrace.native.processes.wire import EntryOrder, Frame, SpanDecoder
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.native.support import check_loopback, domain
@@ -206,6 +209,8 @@ class MultiProcessRun(NativeRun):
         self.children: list[ObservedProcess] = []
         self._ids, self._threads = count(1), count(1)
         self._told: dict[ObservedProcess, tuple[SpanDecoder, ProcessSpans]] = {}
+        self._programs: dict[ObservedProcess, ObservedProgram] = {}
+        self._folder = Path(stack.enter_context(TemporaryDirectory(prefix="rsltrace-")))
         self._counts: dict[ObservedProcess, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
@@ -222,7 +227,7 @@ class MultiProcessRun(NativeRun):
         stack.callback(self._kill_all)
         kind = EXECUTORS[self.options.executor]
         like = EntryOrder(self.job, 0, kind, echo, self.options.policy, self.rules)
-        starts = starts_of(self.job, like)
+        starts = starts_of(self.job, like, self.note)
         for start in starts:
             self._start(start)
         self._wait_until_ready()
@@ -237,17 +242,28 @@ class MultiProcessRun(NativeRun):
             self.note(
                 f"--policy has no effect in mains, which spin for themselves: {', '.join(mains)}"
             )
-        if unobserved := [one.name for one in starts if one.order.command]:
+        if unobserved := [
+            one.name for one in starts if one.order.command and one.order.environment is None
+        ]:
             described["not observed"] = ", ".join(unobserved)
             self.note(
-                f"not observed, since not in Python: {', '.join(unobserved)}; what these send is "
-                "seen where it arrives, and its cause is unknown"
+                f"not observed: {', '.join(unobserved)}; what these send is seen where it arrives, "
+                "and its cause is unknown"
             )
         self.create(stack, output, self.merge, described, self._sources, force=force)
         self.watch_stop_topics(self._on_message)
 
     def _start(self, start: ProcessStart) -> ObservedProcess:
+        order, program = start.order, None
+        if order.environment is not None:
+            folder = self._folder / str(len(self.children))
+            folder.mkdir()
+            variables = {**order.environment, FOLDER: str(folder)}
+            start = replace(start, order=replace(order, environment=variables))
+            program = ObservedProgram(start.name, folder, self._ids, self._threads)
         child = ObservedProcess(start, self._hear, self._ended)
+        if program is not None:
+            self._programs[child] = program
         self.children.append(child)
         return child
 
@@ -266,6 +282,8 @@ class MultiProcessRun(NativeRun):
         what, *values = frame
         if what == "spans":
             self._hear_spans(child, *values)
+        elif what == "look":
+            self._look_at(child)
         elif what == "ready":
             self._sources.update({name: Path(path) for name, path in values[0].items()})
             child.is_ready.set()
@@ -299,6 +317,24 @@ class MultiProcessRun(NativeRun):
         reader.define(definitions)
         found = [reader.span(values) for values in spans]
         self._counts[child] = counts
+        self._add(source, found, until_ns)
+
+    def _look_at(self, child: ObservedProcess, *, is_over: bool = False) -> None:
+        """Take what a program has done."""
+        program = self._programs.get(child)
+        if program is None or child not in self._told:
+            return
+        try:
+            found, until_ns = program.read(is_over=is_over)
+        except Exception as error:
+            del self._programs[child]
+            self.merge.end(self._told[child][1])
+            self.missing.append(f"what {child.what.name} did from {self._at} s on: {error}")
+            return
+        self._counts[child] = program.counts
+        self._add(self._told[child][1], found, until_ns)
+
+    def _add(self, source: ProcessSpans, found: list[CallbackSpan], until_ns: int) -> None:
         if self._rules:
             self.starts.look_at(found)
         if self._on_message:
@@ -347,6 +383,8 @@ class MultiProcessRun(NativeRun):
 
     def _ended(self, child: ObservedProcess, status: int) -> None:
         """Take note of the end of a process."""
+        self._look_at(child, is_over=True)
+        self._look_for_missing(child, status)
         if child in self._told:
             self.merge.end(self._told[child][1])
         what, how = child.what, how_ended(status)
@@ -373,6 +411,19 @@ class MultiProcessRun(NativeRun):
             self.stop(Stop(f"{what.key} has ended, which the run requires"))
         if what.order.plays_bags and not has_stop(self.job):
             self.stop(Stop("end of the bag"))
+
+    def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
+        """Take note of what the trace lacks, or may lack, of a process that has ended."""
+        name, program = child.what.name, self._programs.get(child)
+        if program is not None and program.lost:
+            self.missing.append(f"{program.lost} records of {name}, for which there was no room")
+        if program is not None and program.unobserved:
+            self.missing.append(
+                f"{program.unobserved} processes of {name}: no room for files in {self._folder}"
+            )
+        if child.has_begun and status < 0 and status != -signal.SIGINT:
+            what = "the last 50 ms" if program is None else "what each thread was just doing"
+            self.missing.append(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
 
     @property
     def _at(self) -> str:

@@ -10,7 +10,7 @@ import pickle
 import socket
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import astuple, dataclass
 from itertools import count
 from typing import Any
@@ -49,6 +49,9 @@ class EntryOrder:
     policy: str | None = None
     rules: tuple[PriorityRule, ...] | None = None
     command: tuple[str, ...] = ()
+    environment: Mapping[str, str] | None = None
+    """The variables of that program, with the library that observes it; None: it has those of its
+    process, and is not observed."""
     plays_bags: bool = False
     module_path: tuple[str, ...] = ()
     """Where the run finds modules."""
