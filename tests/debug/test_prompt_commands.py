@@ -47,6 +47,7 @@ EVENT = {
         ("fin", "finish"),
         ("until", "run-to"),
         ("rs", "reverse-step"),
+        ("back", "reverse-step"),
         ("reverse-n", "reverse-next"),
         ("rc", "reverse-continue"),
         ("g", "goto"),
@@ -213,6 +214,15 @@ def test_what_is_typed_wrong_ends_a_script_with_2(
     shown = capsys.readouterr()
     assert says in shown.err
     assert shown.out.splitlines()[-1] == f"(rsltrace) {line}"
+
+
+def test_commands_of_the_command_line_that_are_not_run_are_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    commands = ["break", "blah", "where", "step 2"]
+    assert DebugPrompt(Session(), commands).run() == 2  # type: ignore[arg-type]
+    assert capsys.readouterr().err.splitlines()[-1] == "not run: where; step 2"
 
 
 def test_a_script_ends_where_it_ends(
