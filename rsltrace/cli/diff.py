@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,9 +12,10 @@ import click
 from rsltrace.cli.completion import complete_files
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
-from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
+from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceError, TraceFormatError
 from rsltrace.terminal import say, tell
 from rsltrace.trace.exports.output_file import check_not_input
+from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.diff.report.line import Line
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github", "html")
+_CI_FORMATS = ("junit", "github")
 _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 200
 _ONE_LINE = 10_000
 _HEIGHT_MIN = 21
@@ -211,7 +213,7 @@ def _diff(
     if output is not None:
         check_not_input(output, [Path(one) for one in (golden, *others) if "://" not in one])
     done: list[Diff | BagDiff] = []
-    trouble = False
+    errors: dict[str, str] = {}
     for other in others:
         try:
             # The golden trace is not checked again for each of the others.
@@ -228,16 +230,16 @@ def _diff(
                 if done[-1].failed or failed:
                     run.fails(failed or done[-1].sentence)
         except RsltraceError as error:
-            if len(others) == 1 and not done:
+            if len(others) == 1 and form not in _CI_FORMATS:
                 raise
             # One unreadable file must not hide the results of the others.
             tell(f"rsltrace: error: {error}")
-            trouble = True
-    if done:
-        print_diffs(done, form, options, output)
+            errors[f"{other} agrees with {golden}"] = str(error)
+    if done or form in _CI_FORMATS:
+        print_diffs(done, form, options, output, errors)
     from rsltrace.diff.exit_codes import exit_code_of_several
 
-    return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
+    return EXIT_USAGE if errors else exit_code_of_several(one.exit_code for one in done)
 
 
 def _which(a: str, others: Sequence[str], again: str) -> int:
@@ -273,6 +275,11 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
         for trace, wanted in ((trace_a, check_a), (trace_b, check)):
+            if not (trace.complete or trace.event_count):
+                raise TraceError(
+                    f"{printable(trace.name)} is truncated before its first event, so there is "
+                    "nothing to compare; record the job again"
+                )
             if wanted:
                 with working(f"checking {trace.name}"):
                     trace.check()
@@ -294,19 +301,26 @@ def _opened(place: str) -> Trace:
 
 
 def print_diffs(
-    diffs: Sequence[Diff | BagDiff], form: str, options: DiffOptions, output: Path | None
+    diffs: Sequence[Diff | BagDiff],
+    form: str,
+    options: DiffOptions,
+    output: Path | None,
+    errors: Mapping[str, str] | None = None,
 ) -> None:
-    """Print diffs in a form; on a terminal, text has its size and colours."""
+    """Print diffs in a form, with the ``errors`` of what could not be compared in those of CI; on a
+    terminal, text has its size and colours."""
     from rsltrace.diff.report import render, report_lines
     from rsltrace.diff.report.line import plain_text
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
-        write_text(output, _rendered(diffs, form, options))
+        write_text(output, _rendered(diffs, form, options, errors))
+        if not diffs:
+            return
         first = plain_text(report_lines(one_or_all, options, width=_ONE_LINE)).splitlines()[0]
         say(_encodable(first))
     elif form != "text":
-        say(_rendered(diffs, form, options), end="")
+        say(_rendered(diffs, form, options, errors), end="")
     elif sys.stdout.isatty():
         width, height = _screen()
         _show(report_lines(one_or_all, options, width=width, height=height))
@@ -314,11 +328,20 @@ def print_diffs(
         say(_encodable(render(one_or_all, "text", options)), end="")
 
 
-def _rendered(diffs: Sequence[Diff | BagDiff], form: str, options: DiffOptions) -> str:
+def _rendered(
+    diffs: Sequence[Diff | BagDiff],
+    form: str,
+    options: DiffOptions,
+    errors: Mapping[str, str] | None,
+) -> str:
     if form == "html":
         from rsltrace_viewer.pages.diff_page import diff_page
 
         return diff_page(diffs, options)
+    if form in _CI_FORMATS and errors:
+        from rsltrace.diff.report.ci import github, junit
+
+        return (junit if form == "junit" else github)(diffs, options, errors)
     from rsltrace.diff.report import render
 
     return render(diffs, form, options)

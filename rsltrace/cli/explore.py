@@ -239,7 +239,7 @@ def explore(
                 timeout_s=timeout,
                 fork_ns=-1 if fork_after is None else fork_after[1],
             )
-            end = _SearchReport(search, source, folder, strategy, form)
+            end = _SearchReport(search, source, folder, strategy, form, quiet=quiet)
             interrupted = False
             with search, _pool(source, job, jobs, cluster) as pool:
                 try:
@@ -252,7 +252,7 @@ def explore(
                         end.report(job)
                     raise
         if minimize and not interrupted:
-            end.make_small(job, timeout, quiet=quiet)
+            end.make_small(job, timeout)
         _set_result(record, search)
         end.report(job)
         if interrupted:
@@ -337,21 +337,29 @@ class _SearchReport:
     """The report of a search: what is printed, and the page in its folder."""
 
     def __init__(
-        self, search: Explorer, source: JobSource, folder: Path, strategy: str, form: str
+        self,
+        search: Explorer,
+        source: JobSource,
+        folder: Path,
+        strategy: str,
+        form: str,
+        *,
+        quiet: bool,
     ) -> None:
         self._search = search
         self._source = source
         self._folder = folder
         self._strategy = strategy
         self._form = form
+        self._quiet = quiet
         self._small: dict[str, ReducedFailure] = {}
 
-    def make_small(self, job: Job, timeout_s: float | None, *, quiet: bool) -> None:
+    def make_small(self, job: Job, timeout_s: float | None) -> None:
         """Minimize one run of each cause."""
         from rsltrace.search.explore.small.causes import reduce_failures
 
         def on_begin(cause: str) -> None:
-            if not quiet:
+            if not self._quiet:
                 tell(f"minimizing: {cause}")
 
         self._small = reduce_failures(
@@ -413,7 +421,9 @@ class _SearchReport:
                 "are kept there; continue with --resume"
             ) from None
         if self._form == "text":
-            for line in search_lines(search, source, self._folder, caution=explored.caution):
+            for line in search_lines(
+                search, source, self._folder, caution=explored.caution, quiet=self._quiet
+            ):
                 say(line)
             self._say_small()
         elif self._form == "flaky":

@@ -41,7 +41,8 @@ from rsltrace.trace.words.code import entity_places, places_text
 from rsltrace.trace.words.kinds import kind_label
 from rsltrace.trace.words.phrases import table
 
-NO_DIGEST = "none: no two native runs have the same times"
+_NO_DIGEST = "none: no two native runs have the same times"
+_NO_EVENTS = "none: the file is cut before its first event"
 _FORMATS = ("text", "json", "html")
 _CLOCKS = ("wall_ns", "steady_ns", "mode", "ignored")
 
@@ -208,11 +209,17 @@ def _facts(trace: Trace, counts: TraceCounts) -> list[tuple[str, str]]:
         ("state", _state(trace)),
         *(() if trace.complete or native else (("next", _TRUNCATED),)),
         *(("waiting", text) for text in _waits(trace)),
-        ("digest", NO_DIGEST if native else trace.digest),
+        ("digest", _digest(trace) or (_NO_DIGEST if native else _NO_EVENTS)),
         time,
         ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
         ("outputs", _by_kind(trace.output_count, counts.output_kinds, OutputKind)),
     ]
+
+
+def _digest(trace: Trace) -> str | None:
+    """Return the digest of a run, None if it has none."""
+    has_events = trace.complete or trace.event_count
+    return trace.digest if has_events and not is_native(trace) else None
 
 
 def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
@@ -338,7 +345,7 @@ def _as_json(trace: Trace, counts: TraceCounts) -> dict[str, Any]:
         "format_version": FORMAT_VERSION,
         "library": trace.header.library,
         "complete": trace.complete,
-        "digest": None if is_native(trace) else trace.digest,
+        "digest": _digest(trace),
         "native": native_json(trace) if is_native(trace) else None,
         "start_ns": trace.start_ns,
         "end_ns": trace.end_ns,

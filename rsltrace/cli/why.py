@@ -17,7 +17,7 @@ from rsltrace.trace.words.phrases import path_word
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.argument("node")
-@click.argument("what", metavar="TOPIC|CALLBACK")
+@click.argument("what", metavar="TOPIC|CALLBACK", default="")
 @click.option(
     "--at",
     type=RunTimeParam(),
@@ -30,6 +30,7 @@ def why(trace: Path, node: str, what: str, at: TimeInRun | None, as_json: bool) 
 
     TOPIC is that of a subscription, or the name of a service or client; CALLBACK is the function
     of one of these or of a timer (Planner.on_scan, or on_scan), or the number of an entity.
+    Without either, those of the node are listed.
 
     Without --at, the whole run is looked at: the first message that the callback did not get, else
     the one it got latest. The line of code is that of what is to blame.

@@ -20,6 +20,8 @@ from rsltrace.run.stop_rules import given_rules
 from rsltrace.simulation.chance.channel import QUIET_TOPICS, NetworkPlan
 from rsltrace.simulation.middleware.entity import Receiver
 from rsltrace.simulation.middleware.events.event import NameRegistry, NameRequester
+from rsltrace.simulation.middleware.qos.policies import Durability
+from rsltrace.simulation.middleware.subscription import Subscription
 from rsltrace.trace.model.finding import QueueDrops
 from rsltrace.trace.model.operation import NODE_SERVICES
 from rsltrace.trace.model.texts import format_duration
@@ -41,8 +43,12 @@ def queue_drops(counts: Counts) -> list[QueueDrops]:
 
 
 def drop_notes(counts: Counts) -> list[str]:
-    """Return one note that names the queues that dropped most."""
-    most = sorted(counts.items(), key=lambda item: (-item[1], item[0][0].entity_id))
+    """Return one note that names the queues that dropped most.
+
+    Who asks for the latest value alone, as an action client does of its goals' status, gets it.
+    """
+    lost = (item for item in counts.items() if item[0][1] or not _wants_the_latest(item[0][0]))
+    most = sorted(lost, key=lambda item: (-item[1], item[0][0].entity_id))
     if not most:
         return []
     parts = [
@@ -53,6 +59,13 @@ def drop_notes(counts: Counts) -> list[str]:
     if len(most) > _TOLD:
         parts.append(f"{len(most) - _TOLD} more (rsltrace info lists them)")
     return [f"full queues dropped their oldest messages: {'; '.join(parts)}"]
+
+
+def _wants_the_latest(receiver: Receiver) -> bool:
+    latched = (
+        isinstance(receiver, Subscription) and receiver.qos.durability is Durability.TRANSIENT_LOCAL
+    )
+    return latched and receiver.keep == 1
 
 
 # rcl itself applies the rules, so their forms (`~/x`, `node:x`, `rosservice://x`) mean what they do

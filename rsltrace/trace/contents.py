@@ -20,7 +20,7 @@ from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_ROSOUT
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.event import NO_SEQUENCE, Output, OutputKind
+from rsltrace.trace.model.event import NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.trace.model.texts import NS_PER_S
 from rsltrace.trace.reader import Trace
 
@@ -57,13 +57,18 @@ class TraceCounts:
 
     events: dict[int, Occurrences] = field(default_factory=dict)
     outputs: dict[int, Occurrences] = field(default_factory=dict)
+    starts: dict[int, Occurrences] = field(default_factory=dict)
+    """The events of ``events`` in which no coroutine continues."""
     event_kinds: Counter[int] = field(default_factory=Counter)
     output_kinds: Counter[int] = field(default_factory=Counter)
 
     def rate_hz(self, entity: int) -> float | None:
         """The rate at which an entity ran or, if it never runs (publishers), sent."""
-        series = self.events.get(entity) or self.outputs.get(entity)
+        series = self.starts.get(entity) or self.events.get(entity) or self.outputs.get(entity)
         return series.rate_hz if series else None
+
+
+_CONTINUES = (EventKind.TASK, EventKind.RESUME)
 
 
 def count_trace(trace: Trace) -> TraceCounts:
@@ -75,6 +80,8 @@ def count_trace(trace: Trace) -> TraceCounts:
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         stamps = events["stamp"]
         add_occurrences(counts.events, events["entity"], stamps)
+        starts = ~np.isin(events["kind"], _CONTINUES)
+        add_occurrences(counts.starts, events["entity"][starts], stamps[starts])
         own = outputs[outputs["kind"] != _ENTITY]
         owners = (own["event"] - events["index"][0]).astype(np.intp)
         add_occurrences(counts.outputs, own["entity"], stamps[owners])

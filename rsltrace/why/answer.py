@@ -53,6 +53,9 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
     own = [one for one in nodes if one.name == called[0]]
     ids = {one.id for one in own}
     there = [e for e in trace.entities.values() if e.node in ids and e.kind in WITH_CALLBACK]
+    if not asked:
+        listed = ", ".join(dict.fromkeys(_names_of(there))) or "none"
+        raise TraceError(printable(f"name a topic or callback of {called[0]}; there are {listed}"))
     found = [one for one in there if _is_meant(one, asked)]
     if len({filter_of(e) or (e.kind, e.name, e.detail.get("callback")) for e in found}) > 1:
         listed = ", ".join(f"{e.id} ({e.kind.label} {e.name}: {_callbacks(e)[-1]})" for e in found)
@@ -75,9 +78,14 @@ def find_target(history: RunHistory, node: str, asked: str, at_ns: int | None) -
         names = tuple(printable(one.name) for one in near)
         place = next((one.source for one in near if one.source), own[-1].source)
         return NotReceived(printable(topic), names, question=question, place=place)
-    callbacks = [str(one.detail.get("callback") or one.name) for one in there]
-    names_there = [*(one.name for one in received), *callbacks]
-    return _fail(trace, f"callback of {called[0]}", asked, names_there)
+    return _fail(trace, f"callback of {called[0]}", asked, _names_of(there))
+
+
+def _names_of(entities: list[Entity]) -> list[str]:
+    """Return the topics and callbacks of entities, without those that rclpy made."""
+    own = [one for one in entities if not is_built_in(one)]
+    callbacks = [str(one.detail.get("callback") or one.name) for one in own]
+    return [*(one.name for one in own if one.kind in SENDERS), *callbacks]
 
 
 def _callbacks(entity: Entity) -> list[str]:
@@ -88,7 +96,8 @@ def _callbacks(entity: Entity) -> list[str]:
 def _is_meant(entity: Entity, asked: str) -> bool:
     callbacks = _callbacks(entity)
     names = {entity.name, str(entity.id), *callbacks, *(c.rpartition(".")[2] for c in callbacks)}
-    return asked in names or f"/{asked}" == entity.name
+    name = f"/{asked.lstrip('/')}"
+    return asked in names or entity.name == name or entity.name.startswith(f"{name}/_action/")
 
 
 def _not_begun(history: RunHistory, node: str) -> Reason | None:

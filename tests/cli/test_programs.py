@@ -250,3 +250,11 @@ def test_flaky_says_that_a_test_never_failed(workspace: Path, command: Command) 
     assert done.returncode == 0
     assert done.stdout.startswith("it never failed in 4 runs, ")
     assert "name the test after '--'" in command("flaky").stderr
+    text = _RACE.replace("order() == [0, 1]", "not order()")
+    (workspace / "test_wrong.py").write_text(text)
+    done = command(
+        "flaky", "--budget", "1", "--jobs", "1", "-q", "--", "pytest", "-q", "test_wrong.py"
+    )
+    assert done.returncode == 1
+    assert done.stdout.splitlines()[1] == "it fails without a search, too, so it is not flaky"
+    assert "simulated time stops exactly" in done.stdout

@@ -47,6 +47,7 @@ EVENT = {
         ("fin", "finish"),
         ("until", "run-to"),
         ("rs", "reverse-step"),
+        ("back", "reverse-step"),
         ("reverse-n", "reverse-next"),
         ("rc", "reverse-continue"),
         ("g", "goto"),
@@ -224,6 +225,15 @@ def test_gdb_gets_breakpoints_in_the_callbacks_of_a_node(
     assert shell("gdb ear").run() == 0
     command = "gdb -p 7 -ex 'break src/ear.cpp:24' -ex 'break ear.cpp:9' -ex continue"
     assert command in capsys.readouterr().out.splitlines()
+
+
+def test_commands_of_the_command_line_that_are_not_run_are_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
+    commands = ["break", "blah", "where", "step 2"]
+    assert DebugPrompt(Session(), commands).run() == 2  # type: ignore[arg-type]
+    assert capsys.readouterr().err.splitlines()[-1] == "not run: where; step 2"
 
 
 def test_a_script_ends_where_it_ends(

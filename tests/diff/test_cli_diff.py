@@ -131,6 +131,33 @@ def test_one_unreadable_run_does_not_hide_the_others(
     assert "same-input-different-output" in done.stdout
 
 
+def test_a_trace_that_cannot_be_compared_is_an_error_for_ci(
+    diff: Callable[..., Done], command: Callable[..., Done], tmp_path: Path
+) -> None:
+    """A file that is missing, or cut before its first event, is trouble and no regression."""
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(A.read_bytes()[:3500])
+    done = diff(A, cut)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert f"{cut} is truncated before its first event" in done.stderr
+    facts = command("info", cut).stdout
+    assert "digest     none: the file is cut before its first event" in facts
+    assert json.loads(command("info", cut, "--json").stdout)["digest"] is None
+    for other in (cut, "gone.mcap"):
+        done = diff(A, other, "--format", "junit")
+        assert done.returncode == 2
+        suite = ElementTree.fromstring(done.stdout)
+        assert (suite.get("errors"), suite.get("failures")) == ("1", "0")
+        error = suite.find(".//testcase/error")
+        assert error is not None
+        assert str(other) in error.get("message", "")
+        done = diff(A, other, "--format", "github", "-o", tmp_path / "report")
+        assert done.returncode == 2
+        assert (tmp_path / "report").read_text().startswith("::error title=rsltrace%3A cannot ")
+    several = ElementTree.fromstring(diff(A, A, "gone.mcap", "--format", "junit").stdout)
+    assert (several.get("tests"), several.get("errors")) == ("2", "1")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

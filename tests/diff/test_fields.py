@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -526,3 +527,6 @@ def test_rounded_numbers_of_a_row_are_not_further_from_each_other_than_the_exact
     )
     assert event_differences_text([one]) == f"/t {text}"
     assert event_differences_text([one], brief=True) == brief
+    received = replace(one, position=-1)
+    assert event_differences_text([received]) == f"got /t {text}"
+    assert event_differences_text([received], brief=True) == f"got /t {brief}"

@@ -102,6 +102,7 @@ def test_a_search_that_is_killed_goes_on_where_it_was(
     done = subprocess.run([*words, "--resume"], capture_output=True, text=True, check=False)
     assert done.returncode == 1, done.stderr
     assert table.read_bytes().startswith(before)
+    assert "PCT:" not in done.stdout, "-q: the result alone"
     numbers = [json.loads(line)["trial"]["number"] for line in table.read_text().splitlines()]
     assert sorted(numbers) == list(range(24))
 

@@ -116,7 +116,7 @@ def test_a_search_forks_and_what_it_finds_is_repeated_from_the_beginning(
     write_job: Callable[[str, str], Path], tmp_path: Path, command: Callable[..., Any]
 ) -> None:
     job = write_job("forked", CHECKED)
-    words = ["--budget", 25, "--jobs", 1, "--fork-after", "0.45s", "-q"]
+    words = ["--budget", 25, "--jobs", 1, "--fork-after", "0.45s"]
     done = command("explore", job, *words, "-o", tmp_path / "found")
     assert done.returncode == 1, done.stderr
     assert re.search(r"^24 runs forked from the default run$", done.stdout, re.MULTILINE)

@@ -281,6 +281,14 @@ GOLDEN = {
               |            ^
         """,  # noqa: E501
     ),
+    "quotes in quotes": (
+        'nodes: [{node: m:N}]\nchecks:\n  - never: "/a: data > "a""\n',
+        """
+        job.yaml:3:25: not YAML: put a text that has quotes in it in single quotes: '…' (expected <block end>, but found '<scalar>')
+            3 |   - never: "/a: data > "a""
+              |                         ^
+        """,  # noqa: E501
+    ),
     "unclosed quote": (
         'nodes: [{node: "m:N}]\nseed: 1\n',
         """

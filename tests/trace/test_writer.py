@@ -78,6 +78,11 @@ def test_a_missing_folder_is_named_and_not_made(tmp_path: Path) -> None:
     assert not (tmp_path / "nowhere").exists()
 
 
+def test_a_folder_in_which_no_file_can_be_created_is_named() -> None:
+    with pytest.raises(OutputError, match=r"x\.mcap: no file can be created in /proc; choose"):
+        TraceWriter(Path("/proc/x.mcap"), force=False)
+
+
 @pytest.mark.parametrize("force", [False, True])
 def test_a_folder_is_no_file(tmp_path: Path, force: bool) -> None:
     with pytest.raises(OutputError, match="it is a folder"):

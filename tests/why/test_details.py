@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
 from hypothesis import given
@@ -11,6 +14,7 @@ from hypothesis import strategies as st
 from rsltrace.errors import TraceError
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.trace.model.finding import decode_drops
 from rsltrace.trace.reader import Trace
 from rsltrace.why.answer import why
 from rsltrace.why.filters import _spread
@@ -106,3 +110,62 @@ def test_a_callback_that_waited_for_several(
         assert before == (
             "timer Sends.tick of /sends did not run until then, as expected: first at 1.0 s"
         )
+
+
+_FIB = """
+from example_interfaces.action import Fibonacci
+from rclpy.action import ActionClient, ActionServer
+from rclpy.node import Node
+
+class Serves(Node):
+    def __init__(self):
+        super().__init__("serves")
+        self.server = ActionServer(self, Fibonacci, "/fib", self.execute)
+
+    def execute(self, goal):
+        goal.succeed()
+        return Fibonacci.Result()
+
+class Asks(Node):
+    def __init__(self):
+        super().__init__("asks")
+        self.client = ActionClient(self, Fibonacci, "/fib")
+        self.timer = self.create_timer(1.0, self.tick)
+
+    def tick(self):
+        self.client.send_goal_async(Fibonacci.Goal())
+"""
+_FIB_JOB = """
+nodes: [{node: fib:Serves}, {node: fib:Asks}]
+execution: {nodes: {/asks: 300ms}}
+stop: {duration: 5.5s}
+"""
+
+
+@pytest.mark.ros
+def test_an_action_is_found_by_its_name_and_counted_by_its_goals(
+    tmp_path: Path, command: Callable[..., CompletedProcess[str]]
+) -> None:
+    (tmp_path / "fib.py").write_text(_FIB)
+    (tmp_path / "job.yaml").write_text(_FIB_JOB)
+    result = run(load_job("job.yaml"), "run.mcap")
+    assert result.error is None
+    assert not any("full queues" in note for note in result.notes), "the latest status is enough"
+    entities = json.loads(command("info", "run.mcap", "--json").stdout)["entities"]
+    (goals,) = [
+        one
+        for one in entities
+        if (one["name"], one["kind"]) == ("/fib/_action/send_goal", "service")
+    ]
+    assert (goals["events"], goals["rate_hz"]) == (10, 1.0)
+    with Trace.open("run.mcap") as trace:
+        assert decode_drops(trace.result)
+        for name in ("fib", "/fib"):
+            with pytest.raises(
+                TraceError, match=r"several /?fib; .*service /fib/_action/send_goal"
+            ):
+                why(trace, "/serves", name)
+    asked = command("why", "run.mcap", "/asks")
+    assert asked.returncode == 2
+    assert "name a topic or callback of /asks; there are" in asked.stderr
+    assert ", Asks.tick" in asked.stderr

@@ -133,9 +133,10 @@ _FAILURE_LINES_MAX = 3
 
 
 def search_lines(
-    search: Explorer, source: JobSource, folder: Path, *, caution: str = ""
+    search: Explorer, source: JobSource, folder: Path, *, caution: str = "", quiet: bool = False
 ) -> Iterator[str]:
-    """Yield the lines of the summary; ``caution`` says what was not checked."""
+    """Yield the lines of the summary; ``caution`` says what was not checked. ``quiet``: without
+    how the search went."""
     tally = search.tally
     failed = sum(tally.failures.values())
     yield (
@@ -151,14 +152,21 @@ def search_lines(
     more = len(tally.failures) - _CAUSES_MAX
     if more > 0:
         yield f"and {_counted(more, 'more cause')}"
-    yield from search.strategy.coverage()
-    if tally.forked:
-        yield f"{_counted(tally.forked, 'run')} forked from the default run"
-    for why, count in tally.not_forked.most_common():
-        yield f"{_counted(count, 'run')} run from the start: {why}"
+    if not quiet:
+        yield from search.strategy.coverage()
+        if tally.forked:
+            yield f"{_counted(tally.forked, 'run')} forked from the default run"
+        for why, count in tally.not_forked.most_common():
+            yield f"{_counted(count, 'run')} run from the start: {why}"
     if search.is_exhausted:
         yield "every run has been tried"
     yield f"results: {folder}; report: {folder / 'report.html'}"
+
+
+_EXACT_TIME = (
+    "if it passes outside the simulation: simulated time stops exactly where a wait ends, and "
+    "messages due in that instant come after it"
+)
 
 
 def flaky_lines(
@@ -169,6 +177,9 @@ def flaky_lines(
     runs = f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different order')}"
     failed = sum(tally.failures.values())
     yield f"it failed in {failed} of {runs}" if failed else f"it never failed in {runs}"
+    if tally.plain is not None and tally.plain.failure is not None:
+        yield "it fails without a search, too, so it is not flaky"
+        yield _EXACT_TIME
     for key in _by_frequency(tally)[:_CAUSES_MAX]:
         failure, count, one = tally.first[key].failure, tally.failures[key], small.get(key)
         assert failure is not None

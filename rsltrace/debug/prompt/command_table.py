@@ -154,7 +154,7 @@ def _run_to(shell: PromptContext, rest: str) -> None:
 # -- going back ------------------------------------------------------------------------------------
 
 
-@_add("reverse-step", "rs", usage="[N]", topic="going back", repeats=True)
+@_add("reverse-step", "rs", "back", usage="[N]", topic="going back", repeats=True)
 def _reverse_step(shell: PromptContext, rest: str) -> None:
     """Go back one event, or N."""
     shell.stopped(shell.session.reverse_step(_count(rest)))

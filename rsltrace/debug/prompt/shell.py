@@ -32,7 +32,8 @@ class LineReader:
     """Reads ``first``, then stdin. ``is_script``: stdin is not a terminal."""
 
     def __init__(self, first: Sequence[str], complete: Completer) -> None:
-        self._first = list(first)
+        self.unread = list(first)
+        """Those of ``first`` that have not been read."""
         self._complete = complete
         self.is_script = sys.stdin is None or not sys.stdin.isatty()
         self._from_terminal = False
@@ -47,8 +48,8 @@ class LineReader:
         :raises KeyboardInterrupt: Ctrl-C at the prompt.
         """
         self._from_terminal = False
-        if self._first:
-            line: str | None = self._first.pop(0)
+        if self.unread:
+            line: str | None = self.unread.pop(0)
         elif self.is_script:
             line = sys.stdin.readline() if sys.stdin is not None else ""
             line = line.rstrip("\n") if line else None
@@ -183,6 +184,8 @@ class DebugPrompt:
             except RsltraceError as error:
                 tell(f"error: {error}")
                 if self._lines.is_script:
+                    if self._lines.unread:
+                        tell(f"not run: {'; '.join(self._lines.unread)}")
                     return error.exit_code
         return EXIT_DIVERGED if self.diverged else 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
@@ -17,10 +17,15 @@ from rsltrace.trace.words.phrases import as_sentence
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
-def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
-    """Return a JUnit test suite with one test case per comparison."""
+def junit(
+    diffs: Sequence[Diff | BagDiff], options: DiffOptions, errors: Mapping[str, str] | None = None
+) -> str:
+    """Return a JUnit test suite with one test case per comparison, and one for each of ``errors``:
+    what could not be compared, and why."""
+    errors = errors or {}
     failures = sum(diff.failed for diff in diffs)
-    counts = f'tests="{len(diffs)}" failures="{failures}" errors="0" skipped="0"'
+    tests = len(diffs) + len(errors)
+    counts = f'tests="{tests}" failures="{failures}" errors="{len(errors)}" skipped="0"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites {counts}>"]
     lines.append(f'  <testsuite name="rsltrace diff" {counts}>')
     for diff in diffs:
@@ -35,12 +40,19 @@ def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         else:
             lines.append(f"      <system-out>{report}</system-out>")
         lines.append("    </testcase>")
+    for what, why in errors.items():
+        lines.append(f'    <testcase classname="rsltrace.diff" name={_attribute(what)}>')
+        lines.append(f"      <error message={_attribute(why)}>{_xml(why)}</error>")
+        lines.append("    </testcase>")
     lines += ["  </testsuite>", "</testsuites>"]
     return "\n".join(lines) + "\n"
 
 
-def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
-    """Return workflow commands: an error per comparison that failed, a notice per other one."""
+def github(
+    diffs: Sequence[Diff | BagDiff], options: DiffOptions, errors: Mapping[str, str] | None = None
+) -> str:
+    """Return workflow commands: an error per comparison that failed or could not be made, a notice
+    per other one."""
     lines = []
     for diff in diffs:
         level = "error" if diff.failed else "notice"
@@ -57,6 +69,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
                     lines.append(
                         f"::notice {place},title=rsltrace%3A job differs::{command_data(change)}"
                     )
+    for what, why in (errors or {}).items():
+        title = command_property(printable(f"rsltrace: cannot check that {what}"))
+        lines.append(f"::error title={title}::{command_data(why)}")
     return "".join(f"{row}\n" for row in lines)
 
 

@@ -88,6 +88,8 @@ def _head(diff: Diff, width: int) -> list[Line]:
     agree = f"the first {diff.agreeing} events agree"
     if diff.agreeing < 2:
         agree = "the first event agrees" if diff.agreeing else "the first events already differ"
+    if diff.agrees_until_cut and not diff.agreeing:
+        agree = "no event could be compared"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
     if diff.native is not None:
         verdict = f"{diff.verdict.value}; times and fields named stamp are not compared"

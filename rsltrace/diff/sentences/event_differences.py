@@ -23,11 +23,12 @@ _AS_IT_IS = 7
 
 
 def event_differences_text(found: Sequence[MessageDifference], *, brief: bool = False) -> str:
-    """Return in what two events differ; ``brief``: without the topic where there is only one."""
+    """Return in what two events differ; ``brief``: without the topic where there is only one, which
+    they sent: of what they received, it says that it is that."""
     # As rows of one run do, with what an event did first.
     found = sorted(found, key=lambda one: one.position < 0)
     texts = [_message_text(one, brief=brief) for one in found[:_MESSAGES_MAX]]
-    if brief and len(texts) == 1:
+    if brief and len(texts) == 1 and found[0].position >= 0:
         return texts[0][1]
     if len(found) > _MESSAGES_MAX:
         texts.append(("…", f"{len(found) - _MESSAGES_MAX} more"))
@@ -37,9 +38,11 @@ def event_differences_text(found: Sequence[MessageDifference], *, brief: bool = 
 def _message_text(one: MessageDifference, *, brief: bool) -> tuple[str, str]:
     """Return what a message is of, and in what it differs."""
     is_log = one.kind is OutputKind.LOG
-    topic = "log" if is_log else "got" if one.position < 0 else one.topic
+    topic = "log" if is_log else one.topic
     if one.kind in _CALLS:
         topic = f"{_CALLS[one.kind]} {topic}"
+    if one.position < 0:
+        topic = f"got {topic}"
     if one.presence is not Presence.BOTH:
         return topic, shortened(f"{one.preview} {IN_ONE[one.presence]}".strip(), 80)
     if not one.fields:

@@ -289,6 +289,8 @@ def _mark_at(text: str, position: int) -> TextPosition:
 
 _ADVICE = {
     "mapping values are not allowed here": "check the indentation, or quote a text with ': ' in it",
+    "expected <block end>, but found '<scalar>'": "put a text that has quotes in it in single "
+    "quotes: '…'",
     "expected <block end>": "check the indentation: this does not line up with what is above",
     "found character '\\t'": "indent with spaces, not tabs",
     "but found another document": "a job file holds one document, without '---' in between",

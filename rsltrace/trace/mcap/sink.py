@@ -286,4 +286,6 @@ def _why_not_created(path: Path, error: OSError) -> str:
     if not folder.is_dir():
         return f"cannot write the trace {path}: {folder} is not a folder; choose another with -o"
     reason = error.strerror or str(error)
+    if error.errno == errno.ENOENT:
+        reason = f"no file can be created in {folder}"
     return f"cannot write the trace {path}: {reason}; choose another place with -o"
