@@ -20,6 +20,9 @@ from rsltrace.errors import JobError
 from rsltrace.job.reading.yaml_source import SourcePlace
 
 _OWN = os.path.dirname(os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__)))))
+NOWHERE = "/package-not-found"
+"""The prefix of packages that are not there."""
+WHY = "it is neither installed nor among the sources here"
 
 
 class SubstitutionFailure(RuntimeError):
@@ -297,13 +300,25 @@ def shown(path: str) -> str:
     return os.path.relpath(path) if below else path
 
 
+def missing_package(path: str | os.PathLike[str]) -> str | None:
+    """Return the package that a path lies in, if it is one that is not there."""
+    parts = Path(path).parts
+    is_missing = len(parts) > 3 and os.path.join(*parts[:2]) == NOWHERE
+    return parts[3] if is_missing else None
+
+
+def _missing_file(error: BaseException) -> str | None:
+    """Return what to say of an error if it is about a file of a package that is not there."""
+    file = error.filename if isinstance(error, OSError) else None
+    package = missing_package(file) if isinstance(file, str) else None
+    return None if package is None else f"there is no package {package!r}: {WHY}"
+
+
 def as_job_error(error: BaseException, where: str) -> JobError:
     """Return what went wrong in a launch file as an error of the job, with file and line.
 
     The line is the last one that is not of rsltrace, Python or a library; else ``where``.
     """
-    from rsltrace.adapters.launch.api.packages import missing_file
-
     if isinstance(error, JobError):
         return error if error.where else JobError(str(error), where=where)
     if isinstance(error, SyntaxError) and error.filename and error.lineno:
@@ -323,11 +338,13 @@ def as_job_error(error: BaseException, where: str) -> JobError:
     if isinstance(error, (SubstitutionFailure, ValueError)) and said:
         return JobError(said, where=where)
     name = type(error).__name__
-    said = missing_file(error) or (f"{name}: {said}" if said else name)
+    said = _missing_file(error) or (f"{name}: {said}" if said else name)
     return JobError(said, where=where)
 
 
 __all__ = [
+    "NOWHERE",
+    "WHY",
     "Action",
     "Condition",
     "LaunchContext",
@@ -339,6 +356,7 @@ __all__ = [
     "as_job_error",
     "as_substitutions",
     "calling_line",
+    "missing_package",
     "perform_substitutions",
     "shown",
     "visit_all",

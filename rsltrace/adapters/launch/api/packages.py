@@ -15,33 +15,23 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from rsltrace.adapters.launch.api.basics import LaunchContext, calling_line
+from rsltrace.adapters.launch.api.basics import (
+    NOWHERE,
+    WHY,
+    LaunchContext,
+    calling_line,
+    missing_package,
+)
 from rsltrace.job.reading.substitute import package_prefix
 
-_NOWHERE = "/package-not-found"
-_WHY = "it is neither installed nor among the sources here"
 _ASKED = ("get_package_share_directory", "get_package_share_path", "get_package_prefix")
-
-
-def missing_package(path: str | os.PathLike[str]) -> str | None:
-    """Return the package that a path lies in, if it is one that is not there."""
-    parts = Path(path).parts
-    is_missing = len(parts) > 3 and os.path.join(*parts[:2]) == _NOWHERE
-    return parts[3] if is_missing else None
-
-
-def missing_file(error: BaseException) -> str | None:
-    """Return what to say of an error if it is about a file of a package that is not there."""
-    file = error.filename if isinstance(error, OSError) else None
-    package = missing_package(file) if isinstance(file, str) else None
-    return None if package is None else f"there is no package {package!r}: {_WHY}"
 
 
 def names_missing_package(value: object) -> str | None:
     """Return a package that is not there, if a text (or one in a list) names a path in it."""
     for item in value if isinstance(value, (list, tuple)) else (value,):
-        if isinstance(item, str) and f"{_NOWHERE}/share/" in item:
-            return item.partition(f"{_NOWHERE}/share/")[2].partition("/")[0]
+        if isinstance(item, str) and f"{NOWHERE}/share/" in item:
+            return item.partition(f"{NOWHERE}/share/")[2].partition("/")[0]
     return None
 
 
@@ -61,7 +51,7 @@ def share_of(package: str) -> str:
 
 
 def _nowhere(package: str) -> str:
-    return _NOWHERE
+    return NOWHERE
 
 
 @contextmanager
@@ -88,7 +78,7 @@ def missing_packages_allowed(context: LaunchContext) -> Iterator[None]:
                 noted.add(package_name)
                 context.launched.ignored.append(
                     f"{context.where or calling_line()}: there is no package {package_name!r}: "
-                    f"{_WHY}; what wants something of it is left out"
+                    f"{WHY}; what wants something of it is left out"
                 )
             return _nowhere(package_name)
 
@@ -121,7 +111,6 @@ def _is_caught_by_caller() -> bool:
 
 
 __all__ = [
-    "missing_file",
     "missing_package",
     "missing_packages_allowed",
     "names_missing_package",
