@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from typing import Protocol
 
@@ -120,6 +120,7 @@ class Process:
         self._waking_soon = False
         self._last: WaitableEntity | None = None
         self._is_stopping = False
+        self._unseen_topics: list[str] = []
         self._graph = GraphChange(self)
         adapter.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
@@ -371,6 +372,10 @@ class Process:
 
     def vanish(self) -> None:
         """Destroy all that it has made."""
+        if self._unseen_topics:
+            note = self._unseen_note(self._unseen_topics)
+            self.adapter.domain.outcome.notes.append(note)
+            self._unseen_topics.clear()
         for waking in self._waking.values():
             waking.off()
         self.things.give_all_up()
@@ -467,11 +472,13 @@ class Process:
         :raises RunError: if a rule of the job goes by them.
         """
         publisher = self.things[fields.number()]
-        topic = publisher.topic
-        text = (
-            f"messages on {topic} stay in process {self.name} and are in no trace: it publishes "
-            "them with use_intra_process_comms, switch that off"
-        )
+        self._unseen_topics.append(publisher.topic)
         if publisher.observers is not None and publisher.observers.watchers:
-            raise RunError(f"{text}; a rule of the job goes by {topic}")
-        self.adapter.domain.outcome.notes.append(text)
+            topic = publisher.topic
+            raise RunError(f"{self._unseen_note([topic])}; a rule of the job goes by {topic}")
+
+    def _unseen_note(self, topics: Iterable[str]) -> str:
+        return (
+            f"messages on {', '.join(sorted(set(topics)))} stay in process {self.name} and are in "
+            "no trace: it publishes them with use_intra_process_comms, switch that off"
+        )
