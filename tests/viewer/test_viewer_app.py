@@ -9,7 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+from rsltrace_viewer.model.plots.series import Series
 from rsltrace_viewer.model.query.conditions import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal import screenshot
@@ -395,7 +397,13 @@ def test_plots(made: Path, drive: Drive) -> None:
         assert any("⠀" < c <= "⣿" for c in viewer.text)
         await viewer.press("escape", "end")
         assert "latency" in viewer.text
-        assert screen.query_one(PlotView).size.width > 40
+        view = screen.query_one(PlotView)
+        assert view.size.width > 40
+        view.styles.height = 4
+        view.show("two rows", [Series(np.arange(2.0), np.array([0.0, 8.0]))], None)
+        await viewer.settle()
+        labels = [view.render_line(row).text.split("┤")[0].strip() for row in (1, 2)]
+        assert labels == ["8", "0"], "not the middle at the top"
         await viewer.press("up", "j", "k", "q")
         assert not isinstance(viewer.app.screen, PlotScreen)
 

@@ -78,7 +78,8 @@ class PlotView(Widget):
             line = " " * _AXIS + left + right.rjust(max(width - _AXIS - len(left) - 1, 0))
             return Strip([Piece(fit(line, width), axis)], width)
         row = y - 1
-        value = {0: made.high, last - 2: made.low, (last - 2) // 2: (made.high + made.low) / 2}
+        # Of two rows, the first is the top, not the middle.
+        value = {(last - 2) // 2: (made.high + made.low) / 2, last - 2: made.low, 0: made.high}
         label = f"{value[row]:.5g}" if row in value else ""
         label = f"{value[row]:.3g}" if len(label) > _AXIS - 2 else label
         tick = "┤" if label else "│"

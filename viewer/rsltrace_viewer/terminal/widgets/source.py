@@ -58,7 +58,8 @@ class SourceView(VerticalScroll, can_focus=True):
                 for number, row in enumerate(rows, source.line)
             )
         )
-        above = 0 if source.at is None else source.at - source.line - self.size.height // 2
+        shown = source.at or min((n for n in source.sent if n >= source.line), default=source.line)
+        above = shown - source.line - self.size.height // 2
         self.scroll_to(0, max(above, 0), animate=False)
 
 
