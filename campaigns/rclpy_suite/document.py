@@ -17,8 +17,6 @@ checkout of rclpy (none of its code is kept here):
 - **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
   rclpy and its compiled parts, unmodified, on [the library of processes](../processes.md).
 
-`make rclpy-tests RCLPY=PATH` does it without the document.
-
 | rclpy {version} | here | process |
 |---|---|---|
 {counts}
@@ -28,6 +26,17 @@ checkout of rclpy (none of its code is kept here):
 | test | where | reason |
 |---|---|---|
 {rows}
+
+## Other releases
+
+Their suites **here**, on their own Python files and messages, without compiled parts, so not natively.
+
+| rclpy | Python | tests | pass | differs from Jazzy at the boundary |
+|---|---|---|---|---|
+| Humble, 3.3.15 | 3.10 | 413 | 413 | `QoSEvent` for `EventHandle`; `callback` of subscriptions; endpoints without type hash; no type descriptions |
+| Rolling, 8.0.0 (December 2024) | 3.10 | ROLLING | nothing |
+
+Lyrical's sources could not be had. AsyncNode and AsyncioExecutor are refused by name.
 """
 _WAYS = {"simulation": "here", "process": "process"}
 _LINES = {
