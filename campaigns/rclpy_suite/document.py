@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass
 _TEXT = """# rclpy's own tests on rsltrace
 
 Made by `python campaigns/rclpy_suite --rclpy PATH --baseline LIST --document VERSION`, once with
-`--processes` and once without, which runs rclpy's test suite on rsltrace's middleware, from a
-checkout of rclpy (none of its code is kept here):
+`--processes` and once without, from a checkout of rclpy:
 
-- **here**: each test module is the `main:` of a job with `clocks: {{source: topic, advances:
-  true}}` and [`policy: rclpy`](../policies.md), in rsltrace's process;
-- **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
-  rclpy and its compiled parts, unmodified, on [the library of processes](../processes.md).
+- **here**: each module is the `main:` of a job with `clocks: {{source: topic, advances: true}}`
+  and [`policy: rclpy`](../policies.md);
+- **process**: each is an `isolated: true` script with `clocks: {{source: topic}}`, with rclpy's
+  compiled parts on [the library of processes](../processes.md).
 
 | rclpy {version} | here | process |
 |---|---|---|
@@ -29,15 +28,22 @@ checkout of rclpy (none of its code is kept here):
 
 ## Other releases
 
-Their suites **here**, on their own Python files and messages, without compiled parts, so not natively.
+Their suites **here**, from sources alone; natively they cannot run. None fails.
 
-| rclpy | Python | tests | pass | differs from Jazzy at the boundary |
-|---|---|---|---|---|
-| Humble, 3.3.15 | 3.10 | 413 | 413 | `QoSEvent` for `EventHandle`; `callback` of subscriptions; endpoints without type hash; no type descriptions |
-| Rolling, 8.0.0 (December 2024) | 3.10 | ROLLING | nothing |
+| rclpy | tests | differs at the boundary |
+|---|---|---|
+{releases}
 
-Lyrical's sources could not be had. AsyncNode and AsyncioExecutor are refused by name.
+AsyncNode and AsyncioExecutor are refused by name. Lyrical's sources were not available.
 """
+_RELEASES = {
+    "Humble 3.3.15 (Python 3.10)": (
+        413,
+        "`QoSEvent`; callbacks of subscriptions are attributes; no type hashes",
+    ),
+    "Rolling 8.0.0 (2024)": (485, "nothing"),
+}
+"""Releases that no wheels have: tests in their suites, and what they have otherwise than Jazzy."""
 _WAYS = {"simulation": "here", "process": "process"}
 _LINES = {
     "suite": "in the suite",
@@ -74,7 +80,13 @@ def document(
         for way, where in _WAYS.items()
         for test, reason in excluded[way].items()
     ]
-    return _TEXT.format(version=version, counts="\n".join(lines), rows="\n".join(rows))
+    releases = [f"| {name} | {count} | {text} |" for name, (count, text) in _RELEASES.items()]
+    return _TEXT.format(
+        version=version,
+        counts="\n".join(lines),
+        rows="\n".join(rows),
+        releases="\n".join(releases),
+    )
 
 
 def read(text: str) -> tuple[str, dict[str, Counts]]:
