@@ -9,15 +9,12 @@ from dataclasses import asdict, dataclass
 _TEXT = """# rclpy's own tests on rsltrace
 
 Made by `python campaigns/rclpy_suite --rclpy PATH --baseline LIST --document VERSION`, once with
-`--processes` and once without, which runs rclpy's test suite on rsltrace's middleware, from a
-checkout of rclpy (none of its code is kept here):
+`--processes` and once without, from a checkout of rclpy:
 
-- **here**: each test module is the `main:` of a job with `clocks: {{source: topic, advances:
-  true}}` and [`policy: rclpy`](../policies.md), in rsltrace's process;
-- **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
-  rclpy and its compiled parts, unmodified, on [the library of processes](../processes.md).
-
-`make rclpy-tests RCLPY=PATH` does it without the document.
+- **here**: each module is the `main:` of a job with `clocks: {{source: topic, advances: true}}`
+  and [`policy: rclpy`](../policies.md);
+- **process**: each is an `isolated: true` script with `clocks: {{source: topic}}`, with rclpy's
+  compiled parts on [the library of processes](../processes.md).
 
 | rclpy {version} | here | process |
 |---|---|---|
@@ -28,7 +25,25 @@ checkout of rclpy (none of its code is kept here):
 | test | where | reason |
 |---|---|---|
 {rows}
+
+## Other releases
+
+Their suites **here**, from sources alone; natively they cannot run. None fails.
+
+| rclpy | tests | differs at the boundary |
+|---|---|---|
+{releases}
+
+AsyncNode and AsyncioExecutor are refused by name. Lyrical's sources were not available.
 """
+_RELEASES = {
+    "Humble 3.3.15 (Python 3.10)": (
+        413,
+        "`QoSEvent`; callbacks of subscriptions are attributes; no type hashes",
+    ),
+    "Rolling 8.0.0 (2024)": (485, "nothing"),
+}
+"""Releases that no wheels have: tests in their suites, and what they have otherwise than Jazzy."""
 _WAYS = {"simulation": "here", "process": "process"}
 _LINES = {
     "suite": "in the suite",
@@ -65,7 +80,13 @@ def document(
         for way, where in _WAYS.items()
         for test, reason in excluded[way].items()
     ]
-    return _TEXT.format(version=version, counts="\n".join(lines), rows="\n".join(rows))
+    releases = [f"| {name} | {count} | {text} |" for name, (count, text) in _RELEASES.items()]
+    return _TEXT.format(
+        version=version,
+        counts="\n".join(lines),
+        rows="\n".join(rows),
+        releases="\n".join(releases),
+    )
 
 
 def read(text: str) -> tuple[str, dict[str, Counts]]:
