@@ -461,7 +461,7 @@ class Process:
         source, call, answer = _SOURCES[fields.number()], fields.text(), fields.text()
         running = self._running_node()
         node = running.key if running is not None else ""
-        self.adapter.note_answer(source, call, answer, stack_text(fields.frames()), node)
+        self.adapter.note_answer(source, call, answer, stack_text(fields.rest()), node)
 
     def _alive(self, fields: RecordReader) -> None:
         self.things[fields.number()].assert_liveliness()

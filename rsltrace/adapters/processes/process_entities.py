@@ -28,10 +28,12 @@ from rsltrace.simulation.middleware.participant import Participant, QosEvent, fu
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.event import NO_EVENT, CodeLine, EventKind
+from rsltrace.trace.model.operation import PARAMETER_EVENTS
 
 # What lets a process go on besides messages and timers: the end of a wait, and the graph.
 
 _RESUME = int(EventKind.RESUME)
+_OF_NODES = (TOPIC_ROSOUT, PARAMETER_EVENTS)
 
 
 class GraphWaiter(Protocol):
@@ -320,14 +322,13 @@ class ProcessEntities(dict[int, Any]):
 
     def _sender(self, fields: RecordReader) -> None:
         """Record the line of code that is about to send by an endpoint, once for each callback."""
-        end, stack = self[fields.number()], stack_text(fields.frames())
-        dispatcher = self._process.dispatcher
-        recorder, (place, _, function) = (
-            dispatcher.recorder,
-            stack.partition("\n")[0].partition(" in "),
-        )
-        key = end.entity_id, dispatcher.event.entity, place
-        if recorder is None or isinstance(end, RosoutPublisher) or key in self._sent_from:
+        end, dispatcher = self[fields.number()], self._process.dispatcher
+        if end.topic in _OF_NODES or dispatcher.recorder is None:
+            return  # rcl and rclcpp send there
+        stack = stack_text(fields.rest())
+        place, _, function = stack.partition("\n")[0].partition(" in ")
+        recorder, key = dispatcher.recorder, (end.entity_id, dispatcher.event.entity, place)
+        if key in self._sent_from:
             return
         if function or not stack:  # with debug information, or no more looked up
             self._sent_from.add(key)

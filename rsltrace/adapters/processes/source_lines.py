@@ -10,6 +10,8 @@ from functools import cache, lru_cache
 from itertools import takewhile
 from pathlib import Path
 
+from rsltrace.adapters.processes.wire import RecordReader
+
 Frame = tuple[str, int]
 """The file of a program or library, and an address in it."""
 
@@ -26,12 +28,16 @@ def _has_lines(module: str) -> bool:
         return False
 
 
-def stack_text(frames: Sequence[Frame]) -> str:
+@lru_cache(maxsize=4096)
+def stack_text(packed: bytes) -> str:
     """Return the lines of the program's own code (``node.cpp:24 in Node::tick()``), innermost
     first, one per line of text; where there is no debug information, the innermost address, as
-    addr2line takes it."""
-    _look_up(frames)
-    lines = [line for frame in frames for line in _lines[frame]]
+    addr2line takes it. ``packed`` is a stack as the process sends it.
+
+    :raises WireError: if it is none.
+    """
+    frames = list(RecordReader(memoryview(packed)).frames())
+    lines = _lines_of(frames)
     if lines or not frames:
         return "\n".join(lines)
     module, address = frames[0]
@@ -42,7 +48,7 @@ _lines: dict[Frame, list[str]] = {}
 """The lines at each address: the inlined function first."""
 
 
-def _look_up(frames: Sequence[Frame]) -> None:
+def _lines_of(frames: Sequence[Frame]) -> list[str]:
     unknown = dict.fromkeys(frame for frame in frames if frame not in _lines)
     _lines.update((frame, []) for frame in unknown)
     for module in dict.fromkeys(module for module, _ in unknown):
@@ -51,6 +57,7 @@ def _look_up(frames: Sequence[Frame]) -> None:
             said = _output(["addr2line", "-e", module, "-afiC", *map(hex, found)])
             for address, part in zip(found, re.split(r"^0x", said, flags=re.M)[1:], strict=False):
                 _lines[module, address] = _functions(part.splitlines()[1:])
+    return [line for frame in frames for line in _lines[frame]]
 
 
 def _functions(pairs: Sequence[str]) -> list[str]:
@@ -68,7 +75,8 @@ def callback_place(module: str, name: str) -> str:
     for line in _symbols(module):
         address, _, symbol = line.split(" ", 2)
         if symbol == name or symbol.startswith(name + _LAMBDA_CALL):
-            return stack_text([(module, int(address, 16))]).rpartition("\n")[2].partition(" in ")[0]
+            lines = _lines_of([(module, int(address, 16))])
+            return lines[-1].partition(" in ")[0] if lines else ""
     return ""
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from enum import IntEnum
 from typing import Any
 
@@ -126,9 +126,10 @@ class RecordReader:
         """Read a text; what is no UTF-8 becomes an escape."""
         return self.blob().decode("utf-8", "backslashreplace")
 
-    def frames(self) -> list[tuple[str, int]]:
+    def frames(self) -> Iterator[tuple[str, int]]:
         """Read a stack: files and addresses in them."""
-        return [(self.text(), self.unpack(_ADDRESS)[0]) for _ in range(self.number())]
+        for _ in range(self.number()):
+            yield self.text(), self.unpack(_ADDRESS)[0]
 
     def rest(self) -> bytes:
         """Read what is left."""

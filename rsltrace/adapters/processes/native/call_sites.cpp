@@ -17,6 +17,7 @@ namespace {
 
 constexpr int DEPTH = 16;
 constexpr std::uint32_t NOTES_PER_EVENT = 100;  // as many as the guard keeps
+constexpr std::uint32_t LOOKS_FIRST = 32;       // at clocks, from each place
 constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency/code_lines.py
 
 const char *const LIBRARIES[] = {"librcl.so", "librclcpp.so", "libc.so.6", "libstdc++.so.6"};
@@ -32,38 +33,44 @@ bool is_library(const Dl_info &info) {
   return false;
 }
 
-void write_frame(Writer &body, const void *address) {
+struct Caller {
+  bool own = false;
+  std::string file;
+  std::uint64_t offset = 0;  // of the call, not of where it returns to
+  std::uint32_t looks = 0;
+};
+
+// dladdr goes through all symbols of a library: once for each place.
+Caller &caller_at(const void *address) {
+  static auto *known = new std::unordered_map<const void *, Caller>;
+  const auto [found, is_new] = known->try_emplace(address);
   Dl_info info{};
-  const bool known = dladdr(address, &info) != 0 && info.dli_fname != nullptr;
-  body.text(known ? info.dli_fname : "");
-  const auto base = known ? reinterpret_cast<std::uintptr_t>(info.dli_fbase) : 0;
-  body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(address) - base));
+  if (!is_new || dladdr(address, &info) == 0 || info.dli_fname == nullptr) return found->second;
+  const auto offset = static_cast<const char *>(address) - 1 - static_cast<char *>(info.dli_fbase);
+  found->second = {!is_library(info), info.dli_fname, static_cast<std::uint64_t>(offset)};
+  return found->second;
 }
 
-// The frames of the program's own code, innermost first; addresses of calls, not of returns.
+void write_frame(Writer &body, const Caller &caller) {
+  body.text(caller.file);
+  body.number(caller.offset);
+}
+
+// The frames of the program's own code, innermost first.
 void write_stack(Writer &body) {
   void *frames[DEPTH];
   const int depth = backtrace(frames, DEPTH);
-  const void *own[DEPTH];
+  const Caller *own[DEPTH];
   std::uint32_t count = 0;
   for (int i = 0; i < depth; ++i)
-    if (is_own_code(frames[i])) own[count++] = static_cast<char *>(frames[i]) - 1;
+    if (const Caller &caller = caller_at(frames[i]); caller.own) own[count++] = &caller;
   body.number(count);
-  for (std::uint32_t i = 0; i < count; ++i) write_frame(body, own[i]);
+  for (std::uint32_t i = 0; i < count; ++i) write_frame(body, *own[i]);
 }
 
 }  // namespace
 
-bool is_own_code(const void *caller) {
-  static auto *known = new std::unordered_map<const void *, bool>;
-  Thread *thread = self;
-  if (thread == nullptr || !linked()) return false;
-  const auto found = known->find(caller);
-  if (found != known->end()) return found->second;
-  Dl_info info{};
-  const bool own = dladdr(caller, &info) != 0 && info.dli_fname != nullptr && !is_library(info);
-  return known->emplace(caller, own).first->second;
-}
+bool is_own_code(const void *caller) { return self != nullptr && linked() && caller_at(caller).own; }
 
 void note_answer(Source source, const char *call, const std::string &answer, const void *caller) {
   static std::uint64_t event = 0;
@@ -71,6 +78,8 @@ void note_answer(Source source, const char *call, const std::string &answer, con
   Thread *thread = me();
   if (thread == nullptr) return;
   const Inside inside(*thread);
+  // Clocks are looked at often, and show what the event's time is.
+  if (source == Source::CLOCK && ++caller_at(caller).looks > LOOKS_FIRST) return;
   if (event != times_let_go()) noted = 0;
   event = times_let_go();
   if (++noted > NOTES_PER_EVENT) return;
@@ -78,9 +87,9 @@ void note_answer(Source source, const char *call, const std::string &answer, con
   body.number(static_cast<std::uint32_t>(source));
   body.text(call);
   body.text(answer);
-  if (source == Source::CLOCK) {  // looked at often
+  if (source == Source::CLOCK) {
     body.number(1U);
-    write_frame(body, static_cast<const char *>(caller) - 1);
+    write_frame(body, caller_at(caller));
   } else {
     write_stack(body);
   }
