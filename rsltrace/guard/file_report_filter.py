@@ -25,7 +25,8 @@ _COMPILED = "/__pycache__/"
 _BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
 """Modules through which others access the file system."""
 
-UNREPORTED_MODULES = frozenset(("importlib.metadata", "logging", "threading", *SOURCE_READERS))
+_METADATA_READERS = ("importlib.metadata", "importlib_metadata")
+UNREPORTED_MODULES = frozenset((*_METADATA_READERS, "logging", "threading", *SOURCE_READERS))
 """Modules that access files and the machine for their own records."""
 
 
