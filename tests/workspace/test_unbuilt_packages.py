@@ -171,7 +171,7 @@ def test_the_run_that_makes_the_classes_is_like_the_next(runs: tuple[Path, list[
 
 def test_a_search_for_metadata_is_no_file_that_a_node_reads(runs: tuple[Path, list[Any]]) -> None:
     _, (first, _) = runs
-    assert [Path(count.call.split("'")[1]).name for count in first.guarded] == ["limits.yaml"]
+    assert not [count.call for count in first.guarded if "stat(" in count.call]
 
 
 def test_nothing_of_it_is_left_behind(runs: tuple[Path, list[Any]]) -> None:
