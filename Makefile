@@ -7,7 +7,7 @@
 #   make truth         a thousand planted faults, and what diff says of them
 #   make dist          wheel and sdist, tried in empty environments
 #   make attack        hostile files, jobs, nodes, servers and disks, for an hour
-# Needs Python 3.10 to 3.14 (with venv) on Linux x86_64, and nothing else.
+# Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -22,8 +22,8 @@ SAMPLE := sample_traces/nondeterministic_callback
 setup: $(INSTALLED)
 
 $(INSTALLED): pyproject.toml
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 15))' \
-		|| { echo "rsltrace needs Python 3.10 to 3.14; set PYTHON=python3.12 or the like"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' \
+		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
 	@echo "setting up $(VENV) (once, about a minute)"
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,remote,rerun,dev,docs]'
