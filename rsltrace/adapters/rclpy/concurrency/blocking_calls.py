@@ -13,7 +13,8 @@ import threading
 import time
 import uuid
 from _thread import get_ident
-from asyncio import _get_running_loop, _set_running_loop
+from asyncio import _get_running_loop, _set_running_loop, current_task
+from asyncio.tasks import _enter_task, _leave_task  # type: ignore[attr-defined]
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
@@ -78,16 +79,14 @@ def wait(
     runtime.runners.blocked[blocked] = None
     runtime.event.on_end = None
     runtime.programs.leave()
-    running = _get_running_loop()
-    if running is not None:  # asyncio keeps one per thread, here each stack has its own
-        _set_running_loop(None)
+    enter_asyncio = leave_asyncio()
     given = runtime.runners.next().switch()
     if given and serve is not None and serve(*given):
+        enter_asyncio()
         blocked.stop_waiting()
         blocked.resumed()
         return True
-    if running is not None:
-        _set_running_loop(running)
+    enter_asyncio()
     runtime.runners.blocked.pop(blocked, None)
     blocked.stop_waiting()
     blocked.resumed()
@@ -97,6 +96,30 @@ def wait(
         error, blocked.error = blocked.error, None
         raise error
     return not blocked.timed_out
+
+
+def leave_asyncio() -> Callable[[], None]:
+    """Leave this stack's asyncio loop and task, if it runs in one; return what enters them again.
+
+    Asyncio keeps one of each per thread; here each stack has its own.
+    """
+    loop = _get_running_loop()
+    if loop is None:
+        return _nothing
+    task = current_task(loop)
+    if task is not None:
+        _leave_task(loop, task)
+    _set_running_loop(None)
+
+    def enter() -> None:
+        _set_running_loop(loop)
+        if task is not None:
+            _enter_task(loop, task)
+
+    return enter
+
+
+def _nothing() -> None: ...
 
 
 def _check_may_wait(runtime: Runtime, what: object) -> None:

@@ -200,6 +200,11 @@ class SimRLock:
             self._owner = None
             self._lock.release()
 
+    if hasattr(_real_rlock(), "locked"):  # from Python 3.14 on; Condition asks
+
+        def locked(self) -> bool:
+            return self._lock.locked()
+
     def __enter__(self) -> bool:
         return self.acquire()
 

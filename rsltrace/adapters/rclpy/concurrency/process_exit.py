@@ -13,7 +13,6 @@ import signal
 import sys
 import threading
 from _thread import get_ident
-from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from types import FrameType
@@ -25,6 +24,7 @@ from rsltrace.adapters.rclpy.concurrency.blocking_calls import (
     abandon,
     calling_runtime,
     getpid,
+    leave_asyncio,
     runtimes,
 )
 from rsltrace.adapters.rclpy.concurrency.mains import end_program, interrupt, shut_down
@@ -285,8 +285,7 @@ def _end_process(runtime: Runtime, call: str, status: int) -> NoReturn:
     runtime.event.on_end = None
     runtime.dispatcher.end_event()
     runtime.programs.leave()
-    if _get_running_loop() is not None:
-        _set_running_loop(None)
+    leave_asyncio()
     abandon(getcurrent())
     runtime.runners.next().switch()
     raise AssertionError("an abandoned stack was resumed")

@@ -305,8 +305,9 @@ def _mark_stopped(thread: Any) -> None:
         thread._is_stopped = True
     make_handle = getattr(threading, "_make_thread_handle", None)  # from Python 3.13 on
     if make_handle is not None:
-        thread._handle = make_handle(thread._ident)  # its own was never started
-        thread._handle._set_done()
+        handle = make_handle(thread._ident)  # its own was never started
+        handle._set_done()
+        setattr(thread, "_handle" if hasattr(thread, "_handle") else "_os_thread_handle", handle)
 
 
 def _join(self: Any, timeout: float | None = None) -> None:
