@@ -14,7 +14,7 @@ import time
 import uuid
 from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop, current_task
-from asyncio.tasks import _enter_task, _leave_task  # type: ignore[attr-defined]
+from asyncio.tasks import _enter_task, _leave_task
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
