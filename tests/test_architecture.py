@@ -251,6 +251,7 @@ _NO_METHODS_OF_OURS = {
 """What has the name of a method, and why it is none of the product's objects'."""
 
 
+@pytest.mark.long
 def test_no_method_of_another_object_is_replaced() -> None:
     """Whoever watches or steers a run is an observer (``middleware/events/observer.py``)."""
     modules = parsed()

@@ -55,6 +55,7 @@ def compared(tmp_path: Path) -> Any:
     return compare
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("second", ["new/talk.py", "talk_v2.py"])
 def test_the_difference_is_that_of_the_programs(compared: Any, second: str) -> None:
     old = {"old/talk.py": ("talk", "count"), "other.py": ("other", "0")}

@@ -27,6 +27,7 @@ OVERLAYS: list[dict[str, Any]] = [
 ]
 
 
+@pytest.mark.long
 def test_a_trial_is_the_record_of_its_written_out_job(
     worker: Worker, searched: Path, tmp_path: Path, command: Callable[..., Any]
 ) -> None:

@@ -70,6 +70,7 @@ def test_one_more_node_does_not_disturb_torch_in_the_others(said: Said, torch: s
     assert together[0] != alone[0] != together[2]
 
 
+@pytest.mark.long
 def test_a_seed_of_the_nodes_own_is_its_own_in_torch(said: Said, torch: str) -> None:
     code = node_code(DRAW, imports=torch, init="if self.get_name() == 'n': torch.manual_seed(5)")
     alone = said(code)

@@ -197,6 +197,7 @@ def test_an_exception_and_a_driver_say_when(runs: Path) -> None:
             sim.run_until(0.5)
 
 
+@pytest.mark.long
 def test_debug_goes_to_the_times_it_shows(runs: Path) -> None:
     lines = [f"goto {SECOND}", "info timers", "goto 0.75", "goto 1700000000.5", "quit"]
     done = subprocess.run(

@@ -260,6 +260,7 @@ def test_damage_in_the_middle_of_a_cut_trace_does_not_pass_for_an_earlier_cut(
             assert trace.event_count <= whole
 
 
+@pytest.mark.long
 def test_a_cut_trace_whose_channels_are_damaged_has_all_events_or_is_refused(
     tmp_path: Path, cut: tuple[bytes, list[int]]
 ) -> None:

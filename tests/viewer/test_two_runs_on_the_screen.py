@@ -175,7 +175,7 @@ def faults() -> list[str]:
     return names[:: len(names) // 50]
 
 
-@pytest.mark.few(1)
+@pytest.mark.long
 @pytest.mark.ros
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # files left open
 @pytest.mark.parametrize("number", [0, 13, *(n for n in range(50) if n not in (0, 13))])
