@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
 from itertools import count
+from types import FrameType
 from typing import Any
 
 from rsltrace.adapters.rclpy.handles.lifecycle import transition_event
@@ -84,6 +85,8 @@ class MessageObserver:
         self._entities = entities
         self._taker = taker
         self._local = threading.local()
+        self._main_thread = threading.main_thread().ident
+        self._main_is_sending = self._is_interrupted = False
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
         """Called with the messages on a topic, and of their class."""
         self.unreadable = 0
@@ -166,15 +169,31 @@ class MessageObserver:
 
         return trigger
 
+    def interrupt(self, number: int, frame: FrameType | None) -> None:
+        """Interrupt the main thread as Python does, but not between a message that leaves and the
+        note of it: whoever gets it finds its cause."""
+        if not self._main_is_sending:
+            raise KeyboardInterrupt
+        self._is_interrupted = True
+
     @contextmanager
     def _sending(self) -> Iterator[CallbackSpan]:
         """Have an event under way that sends something within the block, and says so there."""
+        is_main = threading.get_ident() == self._main_thread
+        if is_main:
+            self._main_is_sending = True
         span = self._recorder.sending()
         try:
             yield span
         except BaseException:
             self._recorder.sent(span, None)
             raise
+        finally:
+            if is_main:
+                self._main_is_sending = False
+                if self._is_interrupted:
+                    self._is_interrupted = False
+                    raise KeyboardInterrupt
 
     def _sent(
         self,

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import random
+import signal
 import threading
+from unittest.mock import MagicMock
 
-from rsltrace.native.message_observer import channel_of
-from rsltrace.native.observed_entities import ObservedEntity
+import pytest
+
+from rsltrace.native.message_observer import MessageObserver, channel_of
+from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.span_recorder import (
     CallbackError,
     CallbackSpan,
@@ -67,6 +72,34 @@ def test_a_callback_within_another_one_suspends_it() -> None:
     assert kinds(spans) == [TIMER, TIMER, RESUME]
     assert [span.flags for span in spans] == [EventFlag.SUSPENDED, EventFlag.RAISED, 0]
     assert place == (spans[2], 0)
+
+
+def test_an_interrupt_waits_until_what_was_sent_is_noted() -> None:
+    from std_msgs.msg import String
+
+    class Publisher:
+        def publish(self, message: String) -> None:
+            os.kill(os.getpid(), signal.SIGINT)
+
+        publish_raw = publish
+
+    recorder = SpanRecorder()
+    entities = ObservedEntities(recorder.add)
+    observer = MessageObserver(recorder, entities)
+    recorder.begin(TIMER, THING)
+    before = signal.signal(signal.SIGINT, observer.interrupt)
+    try:
+        with observer.watched(MagicMock(Publisher=Publisher)):
+            handle = Publisher()
+            topic = entities.add((handle,), None, EntityKind.PUBLISHER, "/topic")
+            topic.sends_type = String
+            with pytest.raises(KeyboardInterrupt):
+                handle.publish(String(data="last"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    recorder.end()
+    (span,) = recorder.finished(LONG_NS)
+    assert [one.entity for one in span.outputs if isinstance(one, SentMessage)] == [topic]
 
 
 def test_what_a_thread_of_the_users_sends_is_an_event_of_its_own() -> None:

@@ -30,7 +30,7 @@ from rsltrace.guard.pin import MEMORY_NOISE
 SOURCES = Path(__file__).parent / "native"
 OBSERVER = (
     Path(__file__).parent / "observer" / "observer.cpp",
-    *(SOURCES / name for name in ("typesupport.cpp", "typesupport.h", "wire.h")),
+    *(SOURCES / name for name in ("qos.h", "typesupport.cpp", "typesupport.h", "wire.h")),
 )
 """The sources of the library that observes processes of native runs."""
 _STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"

@@ -70,7 +70,10 @@ class RunningMain:
         self._become_main(entity)
         failure = None
         try:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            # Asyncio compares the handler with this one before it puts its own in place.
+            interrupt = self._observers.message_observer.interrupt
+            signal.default_int_handler = interrupt  # type: ignore[assignment]
+            signal.signal(signal.SIGINT, interrupt)
             status = entry.make()
             if status is not None:  # a console script is sys.exit(main())
                 raise SystemExit(status)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 
 from rsltrace.adapters.processes.build import (
     OBSERVER,
@@ -37,28 +38,11 @@ def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[P
     observed = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
     like = replace(like, job=observed, module_path=tuple(sys.path))
     starts = []
-    observer: PreloadLibrary | None = None
-    why_not = ""
+    observer = cache(lambda: _observer(note))  # built for the first program
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         where = spec.origin or locate(job, ("nodes", index, spec.kind))
         command = _command(observed, index, processes, where)
-        variables = None
-        if command and observer is None and not why_not:
-            try:
-                observer = library(note, sources=OBSERVER)
-            except SetupError as error:
-                why_not = str(error)
-                note(f"programs are not observed: {why_not}")
-        if command and observer is not None:
-            variables = program(
-                command,
-                observer,
-                surroundings=os.environ,
-                environment=spec.environment,
-                folder=None,
-                search_path=processes.search_path,
-                prefixes=processes.prefixes,
-            ).environment
+        variables = _observed_variables(spec, command, observer(), processes) if command else None
         starts.append(
             ProcessStart(
                 spec.target,
@@ -76,6 +60,35 @@ def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[P
         order = replace(like, plays_bags=True)
         starts.append(ProcessStart(THE_BAGS, THE_BAGS, order, dict(os.environ), None, True))
     return starts
+
+
+def _observer(note: Callable[[str], None]) -> PreloadLibrary | None:
+    """Return the library that observes programs, None if it cannot be built, with a note."""
+    try:
+        return library(note, sources=OBSERVER)
+    except SetupError as error:
+        note(f"programs are not observed: {error}")
+        return None
+
+
+def _observed_variables(
+    spec: NodeSpec,
+    command: Sequence[str],
+    observer: PreloadLibrary | None,
+    processes: ProcessPrograms,
+) -> Mapping[str, str] | None:
+    """Return the environment of a program with the observer in it, None without one."""
+    if observer is None:
+        return None
+    return program(
+        command,
+        observer,
+        surroundings=os.environ,
+        environment=spec.environment,
+        folder=None,
+        search_path=processes.search_path,
+        prefixes=processes.prefixes,
+    ).environment
 
 
 def _observed(job: Job, spec: NodeSpec) -> NodeSpec:

@@ -484,7 +484,7 @@ class ProgramSpans:
         """Return a message as canonical CDR, which it is but for what the user has written."""
         data = fields.rest()
         if data and type is not None:
-            with suppress(Exception):
+            with suppress(ValueError):  # the user's bytes may be none of this type
                 data = codec_for(type).canonical(data)
         self.unreadable += not data
         return data

@@ -8,10 +8,6 @@ const char *const IDENTIFIER = "rmw_rsltrace";
 
 namespace {
 
-std::int64_t nanoseconds(const rmw_time_t &time) {
-  return static_cast<std::int64_t>(rmw_time_total_nsec(time));
-}
-
 std::vector<std::uint8_t> ask_about(Say kind, const Endpoint &endpoint) {
   Writer body;
   body.number(endpoint.id);
@@ -19,18 +15,6 @@ std::vector<std::uint8_t> ask_about(Say kind, const Endpoint &endpoint) {
 }
 
 }  // namespace
-
-void write_qos(Writer &body, const rmw_qos_profile_t &qos) {
-  body.number(static_cast<std::uint32_t>(qos.history));
-  body.number(static_cast<std::uint64_t>(qos.depth));
-  body.number(static_cast<std::uint32_t>(qos.reliability));
-  body.number(static_cast<std::uint32_t>(qos.durability));
-  body.number(nanoseconds(qos.deadline));
-  body.number(nanoseconds(qos.lifespan));
-  body.number(static_cast<std::uint32_t>(qos.liveliness));
-  body.number(nanoseconds(qos.liveliness_lease_duration));
-  body.number(static_cast<std::uint32_t>(qos.avoid_ros_namespace_conventions));
-}
 
 rmw_qos_profile_t read_qos(Reader &reader) {
   rmw_qos_profile_t qos{};

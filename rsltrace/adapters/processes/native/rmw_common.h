@@ -10,6 +10,7 @@
 #include <string>
 
 #include "endpoints.h"
+#include "qos.h"
 
 namespace rsltrace {
 
@@ -20,7 +21,6 @@ inline bool ours(const char *identifier) {
          (identifier == IDENTIFIER || std::strcmp(identifier, IDENTIFIER) == 0);
 }
 
-void write_qos(Writer &body, const rmw_qos_profile_t &qos);
 rmw_qos_profile_t read_qos(Reader &reader);
 // The QoS that an endpoint has settled on.
 rmw_ret_t actual_qos(const Endpoint &endpoint, rmw_qos_profile_t *qos);

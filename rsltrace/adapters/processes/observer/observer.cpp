@@ -24,12 +24,14 @@
 #include <shared_mutex>
 #include <unordered_map>
 
+#include "../native/qos.h"
 #include "../native/typesupport.h"
 #include "../native/wire.h"
 
 #define EXPORT extern "C" __attribute__((visibility("default")))
 
 using rsltrace::MessageCodec;
+using rsltrace::write_qos;
 using rsltrace::Writer;
 
 namespace {
@@ -240,22 +242,6 @@ std::uint32_t id_of(const void *handle) {
   return found == nullptr ? 0 : found->id;
 }
 
-std::int64_t nanoseconds(const rmw_time_t &time) {
-  return static_cast<std::int64_t>(rmw_time_total_nsec(time));
-}
-
-void write_qos(Writer &body, const rmw_qos_profile_t &qos) {
-  body.number(static_cast<std::uint32_t>(qos.history));
-  body.number(static_cast<std::uint64_t>(qos.depth));
-  body.number(static_cast<std::uint32_t>(qos.reliability));
-  body.number(static_cast<std::uint32_t>(qos.durability));
-  body.number(nanoseconds(qos.deadline));
-  body.number(nanoseconds(qos.lifespan));
-  body.number(static_cast<std::uint32_t>(qos.liveliness));
-  body.number(nanoseconds(qos.liveliness_lease_duration));
-  body.number(static_cast<std::uint32_t>(qos.avoid_ros_namespace_conventions));
-}
-
 // Note an endpoint. Without a type that can be written as bytes there are no contents.
 void made(Kind kind, const void *node, const char *name, const std::string &type,
           const rmw_qos_profile_t &qos, const Found &entity, const std::uint8_t *gid = nullptr) {
@@ -328,23 +314,23 @@ rmw_ret_t send(Sent kind, const Found &from, const Data &data, bool is_raw, std:
   body.number(kind == Sent::REQUEST ? INT64_C(0) : *number);
   add_data(body, data, is_raw);
   add(Kind::SENDING, body, begun_ns);
-  const rmw_ret_t told = really();
+  const rmw_ret_t status = really();
   const std::int64_t after_ns = now_ns();
   Writer end;
-  end.number(static_cast<std::uint32_t>(told == RMW_RET_OK));
+  end.number(static_cast<std::uint32_t>(status == RMW_RET_OK));
   end.number(now_ns(CLOCK_REALTIME));
   end.number(*number);
   add(Kind::SENT, end, after_ns);
-  return told;
+  return status;
 }
 
 template <typename Send>
 rmw_ret_t publish(const Found &from, const Data &data, bool is_raw, std::int64_t begun_ns,
                   Send really) {
   const auto number = static_cast<std::int64_t>(++from->sent);
-  const rmw_ret_t told = send(Sent::MESSAGE, from, data, is_raw, begun_ns, &number, really);
-  if (told != RMW_RET_OK) --from->sent;  // the middleware has not counted it
-  return told;
+  const rmw_ret_t status = send(Sent::MESSAGE, from, data, is_raw, begun_ns, &number, really);
+  if (status != RMW_RET_OK) --from->sent;  // the middleware has not counted it
+  return status;
 }
 
 void took(const Found &by, std::uint64_t number, std::int64_t source_ns, std::int64_t received_ns,
@@ -417,13 +403,13 @@ rcl_ret_t call_timer(const rcl_timer_t *timer, Call really) {
     bracket(Kind::BEGIN, timer);
   }
   is_within = true;
-  const rcl_ret_t told = really();
+  const rcl_ret_t status = really();
   is_within = false;
   if (has_callback)
     bracket(Kind::END, timer);
-  else if (told == RCL_RET_OK)
+  else if (status == RCL_RET_OK)
     called(found->id, due_ns);
-  return told;
+  return status;
 }
 
 void named(const void *callback, const char *symbol) {
@@ -546,12 +532,12 @@ EXPORT rmw_ret_t rmw_send_response(const rmw_service_t *service, rmw_request_id_
 EXPORT rmw_ret_t rmw_take_with_info(const rmw_subscription_t *subscription, void *message,
                                     bool *taken, rmw_message_info_t *info,
                                     rmw_subscription_allocation_t *allocation) {
-  const rmw_ret_t told = REAL(rmw_take_with_info)(subscription, message, taken, info, allocation);
-  if (told != RMW_RET_OK || !*taken) return told;
+  const rmw_ret_t status = REAL(rmw_take_with_info)(subscription, message, taken, info, allocation);
+  if (status != RMW_RET_OK || !*taken) return status;
   const std::int64_t begun_ns = now_ns();
   if (const Found by = find(subscription))
     took(by, *info, bytes_of(*by, by->type, message), false, begun_ns);
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_take(const rmw_subscription_t *subscription, void *message, bool *taken,
@@ -564,58 +550,58 @@ EXPORT rmw_ret_t rmw_take_loaned_message_with_info(const rmw_subscription_t *sub
                                                    void **message, bool *taken,
                                                    rmw_message_info_t *info,
                                                    rmw_subscription_allocation_t *allocation) {
-  const rmw_ret_t told =
+  const rmw_ret_t status =
       REAL(rmw_take_loaned_message_with_info)(subscription, message, taken, info, allocation);
-  if (told != RMW_RET_OK || !*taken) return told;
+  if (status != RMW_RET_OK || !*taken) return status;
   const std::int64_t begun_ns = now_ns();
   if (const Found by = find(subscription))
     took(by, *info, bytes_of(*by, by->type, *message), false, begun_ns);
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_take_serialized_message_with_info(const rmw_subscription_t *subscription,
                                                        rmw_serialized_message_t *message,
                                                        bool *taken, rmw_message_info_t *info,
                                                        rmw_subscription_allocation_t *allocation) {
-  const rmw_ret_t told =
+  const rmw_ret_t status =
       REAL(rmw_take_serialized_message_with_info)(subscription, message, taken, info, allocation);
-  if (told != RMW_RET_OK || !*taken) return told;
+  if (status != RMW_RET_OK || !*taken) return status;
   const std::int64_t begun_ns = now_ns();
   if (const Found by = find(subscription)) took(by, *info, bytes_of(*message), true, begun_ns);
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_take_sequence(const rmw_subscription_t *subscription, size_t count,
                                    rmw_message_sequence_t *messages,
                                    rmw_message_info_sequence_t *infos, size_t *taken,
                                    rmw_subscription_allocation_t *allocation) {
-  const rmw_ret_t told =
+  const rmw_ret_t status =
       REAL(rmw_take_sequence)(subscription, count, messages, infos, taken, allocation);
-  const Found by = told == RMW_RET_OK ? find(subscription) : nullptr;
+  const Found by = status == RMW_RET_OK ? find(subscription) : nullptr;
   for (std::size_t i = 0; by != nullptr && i < *taken; ++i) {
     const std::int64_t begun_ns = now_ns();
     took(by, infos->data[i], bytes_of(*by, by->type, messages->data[i]), false, begun_ns);
   }
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_take_request(const rmw_service_t *service, rmw_service_info_t *info,
                                   void *request, bool *taken) {
-  const rmw_ret_t told = REAL(rmw_take_request)(service, info, request, taken);
-  if (told != RMW_RET_OK || !*taken) return told;
+  const rmw_ret_t status = REAL(rmw_take_request)(service, info, request, taken);
+  if (status != RMW_RET_OK || !*taken) return status;
   const std::int64_t begun_ns = now_ns();
   if (const Found by = find(service)) took(by, *info, bytes_of(*by, by->type, request), begun_ns);
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_take_response(const rmw_client_t *client, rmw_service_info_t *info,
                                    void *response, bool *taken) {
-  const rmw_ret_t told = REAL(rmw_take_response)(client, info, response, taken);
-  if (told != RMW_RET_OK || !*taken) return told;
+  const rmw_ret_t status = REAL(rmw_take_response)(client, info, response, taken);
+  if (status != RMW_RET_OK || !*taken) return status;
   const std::int64_t begun_ns = now_ns();
   if (const Found by = find(client))
     took(by, *info, bytes_of(*by, by->other_type, response), begun_ns);
-  return told;
+  return status;
 }
 
 EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions, rmw_guard_conditions_t *guards,
@@ -630,16 +616,16 @@ EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions, rmw_guard_conditio
 EXPORT rcl_ret_t rcl_timer_init2(rcl_timer_t *timer, rcl_clock_t *clock, rcl_context_t *context,
                                  int64_t period, const rcl_timer_callback_t callback,
                                  rcl_allocator_t allocator, bool autostart) {
-  const rcl_ret_t told =
+  const rcl_ret_t status =
       REAL(rcl_timer_init2)(timer, clock, context, period, callback, allocator, autostart);
-  if (told != RCL_RET_OK || !ring().is_open()) return told;
+  if (status != RCL_RET_OK || !ring().is_open()) return status;
   const Found entity = new_entity(timer);
   Writer body;
   body.number(entity->id);
   body.number(period);
   add(Kind::TIMER, body, now_ns());
   if (callback != nullptr) belongs(timer, entity);
-  return told;
+  return status;
 }
 
 EXPORT rcl_ret_t rcl_timer_init(rcl_timer_t *timer, rcl_clock_t *clock, rcl_context_t *context,
