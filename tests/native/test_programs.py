@@ -19,6 +19,7 @@ from rsltrace.trace.model.entity import Entity
 from rsltrace.trace.model.event import EventFlag, EventKind
 
 MAIN, OTHER = 7, 8
+WALL = 10**18
 CAPACITY = 256
 CONSTRUCT, TIMER, SUBSCRIPTION = EventKind.CONSTRUCT, EventKind.TIMER, EventKind.SUBSCRIPTION
 
@@ -38,22 +39,23 @@ class Program:
 
     def say(self, kind: RecordKind, body: bytes = b"", thread: int = MAIN) -> None:
         self.now_ns += 1
-        self.spans.add(Record(kind, self.now_ns, thread, 0, RecordReader(memoryview(body))))
+        fields = RecordReader(memoryview(body))
+        self.spans.add(Record(kind, self.now_ns, self.now_ns + WALL, thread, 0, fields))
 
     def take(self, thread: int = MAIN) -> None:
-        self.say(RecordKind.TAKE, struct.pack("<IqQqq16sI", 3, 0, 1, 0, 0, b"", 0), thread)
+        self.say(RecordKind.TAKE, struct.pack("<IQqq16sI", 3, 1, 0, 0, b"", 0), thread)
 
     def call(self, thread: int = MAIN) -> None:
-        self.say(RecordKind.CALL, struct.pack("<Iqq", 4, 0, 0), thread)
+        self.say(RecordKind.CALL, struct.pack("<Iq", 4, 0), thread)
 
     def send(self, thread: int = MAIN) -> None:
-        self.say(RecordKind.SENDING, struct.pack("<IIqqI", 2, 0, 5, 1, 0) + b"data", thread)
+        self.say(RecordKind.SENDING, struct.pack("<IIqI", 2, 0, 1, 0) + b"data", thread)
 
     def sent(self, is_sent: bool = True, thread: int = MAIN) -> None:
-        self.say(RecordKind.SENT, struct.pack("<Iqq", is_sent, 9, 1), thread)
+        self.say(RecordKind.SENT, struct.pack("<Iq", is_sent, 1), thread)
 
     def mark(self, kind: RecordKind, thread: int = MAIN) -> None:
-        self.say(kind, struct.pack("<Qq", 0xCA11, 0), thread)
+        self.say(kind, struct.pack("<Q", 0xCA11), thread)
 
     def finished(self, patience_ns: int | None = None) -> list[CallbackSpan]:
         return self.spans.finished(self.now_ns + 1, patience_ns)[0]
@@ -99,6 +101,9 @@ def test_a_callback_that_says_so_begins_in_another_thread_and_ends_there() -> No
     construct, timer, outside = program.finished()
     assert (timer.kind, timer.end_ns - timer.start_ns, len(messages(timer))) == (TIMER, 3, 1)
     assert (timer.thread, outside.thread, outside.kind) == (2, 2, EventKind.OUTSIDE)
+    (sent,) = messages(timer)
+    assert timer.wall_ns == timer.start_ns + WALL
+    assert (sent.before_ns, sent.after_ns) == (timer.wall_ns + 1, timer.wall_ns + 2)
     assert timer.entity is not None
     assert timer.entity.name == "Node::tick()"
     made = [one.name for one in construct.outputs if isinstance(one, Entity)]
@@ -139,7 +144,8 @@ def test_a_file_is_read_around_its_end_and_without_what_is_being_written(
     with pytest.raises(ValueError, match="nothing"):
         RecordFile(path)
     body = b"twenty-one bytes long"
-    record = struct.pack("=IIqII", 24 + len(body), RecordKind.WAIT, 30, MAIN, 5) + body + bytes(3)
+    head_of_it = struct.pack("=IIqqII", 32 + len(body), RecordKind.WAIT, 30, WALL, MAIN, 5)
+    record = head_of_it + body + bytes(3)
     ring = bytearray(CAPACITY)
     for place, byte in enumerate(record, start=CAPACITY - 20):
         ring[place % CAPACITY] = byte
@@ -149,7 +155,8 @@ def test_a_file_is_read_around_its_end_and_without_what_is_being_written(
     file = RecordFile(path)
     assert not path.exists()
     (found,) = file.read()
-    assert (found.kind, found.steady_ns, found.thread) == (RecordKind.WAIT, 30, MAIN)
+    assert (found.kind, found.steady_ns, found.wall_ns) == (RecordKind.WAIT, 30, WALL)
+    assert found.thread == MAIN
     assert (found.spent_ns, found.fields.rest(), file.lost) == (5, body, 3)
     assert file.until_ns == 30  # another one is being written
     file._head[4] = 0

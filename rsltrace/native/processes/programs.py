@@ -69,15 +69,16 @@ class RecordKind(IntEnum):
 _MAGIC = 0x31656361_72746C73
 _HEAD_SIZE = 4096
 _CAPACITY, _WRITTEN, _READ, _IS_WRITING, _LOST, _CPU_NS = range(1, 7)
-_RECORD = struct.Struct("=IIqII")
+_RECORD = struct.Struct("=IIqqII")
 
 
 @dataclass(slots=True)
 class Record:
-    """One record: when (steady) and in which thread, and how long it took to make."""
+    """One record: when and in which thread, and how long it took to make."""
 
     kind: int
     steady_ns: int
+    wall_ns: int
     thread: int
     spent_ns: int
     fields: RecordReader
@@ -129,11 +130,11 @@ class RecordFile:
 def _records(data: memoryview) -> Iterator[Record]:
     at = 0
     while at < len(data):
-        size, kind, steady_ns, thread, spent_ns = _RECORD.unpack_from(data, at)
+        size, kind, steady_ns, wall_ns, thread, spent_ns = _RECORD.unpack_from(data, at)
         if size < _RECORD.size:
             raise ValueError("the process has written over its records")
         fields = RecordReader(data[at + _RECORD.size : at + size])
-        yield Record(kind, steady_ns, thread, spent_ns, fields)
+        yield Record(kind, steady_ns, wall_ns, thread, spent_ns, fields)
         at += (size + 7) // 8 * 8
 
 
@@ -161,11 +162,10 @@ _ACTION = "/_action/"
 _GID_SIZE = 16
 _TIMER = struct.Struct("<Iq")
 _POINTER = struct.Struct("<Q")
-_STARTED = struct.Struct("<Qq")
-_TAKEN = struct.Struct(f"<IqQqq{_GID_SIZE}sI")
-_CALLED = struct.Struct("<Iqq")
-_SENDING = struct.Struct("<IIqqI")
-_SENT = struct.Struct("<Iqq")
+_TAKEN = struct.Struct(f"<IQqq{_GID_SIZE}sI")
+_CALLED = struct.Struct("<Iq")
+_SENDING = struct.Struct("<IIqI")
+_SENT = struct.Struct("<Iq")
 _GID = struct.Struct(f"{_GID_SIZE}s")
 _NO_NUMBER = 2**64 - 1
 
@@ -227,8 +227,6 @@ class ProgramSpans:
         """The calls of timers whose callbacks say themselves when they begin."""
         self._last_node: ObservedEntity | None = None
         self._timers = 0
-        self._wall_ns = time.time_ns() - now_ns()
-        """The system clock less the steady one, as last seen."""
         self.unreadable = 0
         self._log_type = get_message_class("rcl_interfaces/msg/Log")
 
@@ -257,9 +255,9 @@ class ProgramSpans:
         elif record.kind == RecordKind.CALL:
             self._call(thread, record)
         elif record.kind == RecordKind.BEGIN:
-            self._begun(thread, *fields.unpack(_STARTED))
+            self._begun(thread, *fields.unpack(_POINTER))
         elif record.kind == RecordKind.END:
-            self._ended(thread, record, fields.unpack(_STARTED)[0])
+            self._ended(thread, record, *fields.unpack(_POINTER))
         elif record.kind == RecordKind.WAIT:
             self._close(thread)
             if (running := self.recorder.current()) is not None and running.entity is not None:
@@ -278,7 +276,7 @@ class ProgramSpans:
             for thread in self._threads.values():
                 self.recorder.enter(thread.local)
                 if thread.sending is not None:
-                    self._sent(thread, 1, self.recorder.time_ns(), thread.sending[1].sequence)
+                    self._sent(thread, 1, thread.sending[1].sequence)
                 while thread.frames and thread.frames[-1].ended_ns:
                     self._pop(thread)
         return self.recorder.finished_until(patience_ns)
@@ -286,7 +284,7 @@ class ProgramSpans:
     def _enter(self, record: Record) -> _Thread:
         recorder = self.recorder
         recorder.steady_ns = record.steady_ns
-        recorder.wall_ns = self._wall_ns + record.steady_ns
+        recorder.wall_ns = record.wall_ns
         thread = self._threads.get(record.thread)
         if thread is None:
             local = SimpleNamespace(stack=[], thread=next(self._thread_numbers))
@@ -367,7 +365,7 @@ class ProgramSpans:
     # -- callbacks ------------------------------------------------------------------------------
 
     def _take(self, thread: _Thread, record: Record) -> None:
-        number, wall_ns, sequence, source_ns, ready_ns, gid, is_raw = record.fields.unpack(_TAKEN)
+        number, sequence, source_ns, ready_ns, gid, is_raw = record.fields.unpack(_TAKEN)
         entity = self._entities.get(number)
         if entity is None:
             return
@@ -384,34 +382,31 @@ class ProgramSpans:
             record.spent_ns,
             gid if any(gid) else b"",
         )
-        self._begin(thread, wall_ns, entity, taken)
+        self._begin(thread, entity, taken)
 
     def _call(self, thread: _Thread, record: Record) -> None:
-        number, wall_ns, due_ns = record.fields.unpack(_CALLED)
+        number, due_ns = record.fields.unpack(_CALLED)
         if (entity := self._entities.get(number)) is not None:
             taken = ReceivedInput(entity, ready_ns=due_ns, observer_ns=record.spent_ns)
             if entity.id in self._called:
                 self._called[entity.id] = taken
             else:
-                self._begin(thread, wall_ns, entity, taken)
+                self._begin(thread, entity, taken)
 
-    def _begin(
-        self, thread: _Thread, wall_ns: int, entity: ObservedEntity, taken: ReceivedInput | None
-    ) -> None:
+    def _begin(self, thread: _Thread, entity: ObservedEntity, taken: ReceivedInput | None) -> None:
         self._close(thread)
-        self._at(wall_ns)
         kind = EventKind.ACTION if _ACTION in entity.name else _EVENTS[entity.kind]
         self.recorder.begin(int(kind), entity, taken)
         thread.frames.append(_Frame(entity))
 
-    def _begun(self, thread: _Thread, callback: int, wall_ns: int) -> None:
+    def _begun(self, thread: _Thread, callback: int) -> None:
         entity = self._callbacks.get(callback)
         if entity is None:
             return
         top = thread.frames[-1] if thread.frames else None
         if top is None or top.callback is not None or top.entity is not entity:
             taken = self._called.get(entity.id)  # None: what it gets did not come from rmw
-            self._begin(thread, wall_ns, entity, taken)
+            self._begin(thread, entity, taken)
             top = thread.frames[-1]
         top.callback = callback
 
@@ -440,18 +435,17 @@ class ProgramSpans:
         for thread in self._threads.values():
             self.recorder.enter(thread.local)
             if thread.sending is not None:
-                self._sent(thread, 1, self.recorder.time_ns(), thread.sending[1].sequence)
+                self._sent(thread, 1, thread.sending[1].sequence)
             while thread.frames:
                 self._pop(thread)
 
     # -- what is sent ---------------------------------------------------------------------------
 
     def _sending(self, thread: _Thread, record: Record) -> None:
-        number, kind, before_ns, sequence, is_raw = record.fields.unpack(_SENDING)
+        number, kind, sequence, is_raw = record.fields.unpack(_SENDING)
         entity = self._entities.get(number)
         if entity is None:
             return
-        self._at(before_ns)
         data = self._data(record.fields, entity.sends_type if is_raw else None)
         if entity.name == TOPIC_ROSOUT and entity.sends_type is self._log_type and data:
             log = codec_for(self._log_type).deserialize(data)
@@ -462,23 +456,18 @@ class ProgramSpans:
         span = self.recorder.sending()
         span.observer_ns += record.spent_ns
         digest = hash64(data) if data else 0
-        sent = SentMessage(int(_SENDS[kind]), entity, digest, data, sequence, 0, before_ns)
+        sent = SentMessage(int(_SENDS[kind]), entity, digest, data, sequence, 0, record.wall_ns)
         thread.sending = span, sent, record.steady_ns
 
-    def _sent(self, thread: _Thread, is_sent: int, after_ns: int, sequence: int) -> None:
+    def _sent(self, thread: _Thread, is_sent: int, sequence: int) -> None:
         if thread.sending is None:
             return
         span, sent, _ = thread.sending
         thread.sending = None
-        sent.after_ns, sent.sequence = after_ns, sequence
+        sent.after_ns, sent.sequence = self.recorder.time_ns(), sequence
         self.recorder.sent(span, sent if is_sent else None)
         if thread.frames and thread.frames[-1].ended_ns:  # a response leaves after the callback
             thread.frames[-1].ended_ns = self.recorder.steady_ns
-
-    def _at(self, wall_ns: int) -> None:
-        """Take note of what the system clock showed."""
-        self.recorder.wall_ns = wall_ns
-        self._wall_ns = wall_ns - self.recorder.steady_ns
 
     def _data(self, fields: RecordReader, type: Any) -> bytes:
         """Return a message as canonical CDR, which it is but for what the user has written."""

@@ -107,6 +107,7 @@ struct RecordHead {
   std::uint32_t size;
   Kind kind;
   std::int64_t steady_ns;
+  std::int64_t wall_ns;  // read after it: what begins and ends by the one lasts longer than by the other
   std::uint32_t thread;
   std::uint32_t spent_ns;  // by this library for this record
 };
@@ -150,10 +151,9 @@ class Ring {
     if (lost_ > 0) {  // what follows lacks something
       Writer count;
       count.number(lost_);
-      if (put(Kind::LOST, count, thread, now_ns(), 0)) lost_ = 0;
+      if (put(Kind::LOST, count, thread, 0)) lost_ = 0;
     }
-    const std::int64_t time_ns = now_ns();
-    if (lost_ > 0 || !put(kind, body, thread, time_ns, time_ns - begun_ns)) {
+    if (lost_ > 0 || !put(kind, body, thread, begun_ns)) {
       ++lost_;
       head_->lost.fetch_add(1);
     }
@@ -161,13 +161,14 @@ class Ring {
   }
 
  private:
-  bool put(Kind kind, const Writer &body, std::uint32_t thread, std::int64_t steady_ns,
-           std::int64_t spent_ns) {
+  bool put(Kind kind, const Writer &body, std::uint32_t thread, std::int64_t begun_ns) {
     const std::size_t size = (sizeof(RecordHead) + body.bytes.size() + 7) / 8 * 8;
     const std::uint64_t at = head_->written.load();
     if (at + size - head_->read.load() > CAPACITY) return false;
+    const std::int64_t steady_ns = now_ns(), wall_ns = now_ns(CLOCK_REALTIME);
+    const std::int64_t spent_ns = begun_ns == 0 ? 0 : steady_ns - begun_ns;
     const RecordHead record{static_cast<std::uint32_t>(sizeof(RecordHead) + body.bytes.size()), kind,
-                            steady_ns, thread, static_cast<std::uint32_t>(spent_ns)};
+                            steady_ns, wall_ns, thread, static_cast<std::uint32_t>(spent_ns)};
     copy(at, &record, sizeof record);
     copy(at + sizeof record, body.bytes.data(), body.bytes.size());
     head_->written.store(at + size);
@@ -310,7 +311,6 @@ rmw_ret_t send(Sent kind, const Found &from, const Data &data, bool is_raw, std:
   Writer body;
   body.number(from->id);
   body.number(static_cast<std::uint32_t>(kind));
-  body.number(now_ns(CLOCK_REALTIME));
   body.number(kind == Sent::REQUEST ? INT64_C(0) : *number);
   add_data(body, data, is_raw);
   add(Kind::SENDING, body, begun_ns);
@@ -318,7 +318,6 @@ rmw_ret_t send(Sent kind, const Found &from, const Data &data, bool is_raw, std:
   const std::int64_t after_ns = now_ns();
   Writer end;
   end.number(static_cast<std::uint32_t>(status == RMW_RET_OK));
-  end.number(now_ns(CLOCK_REALTIME));
   end.number(*number);
   add(Kind::SENT, end, after_ns);
   return status;
@@ -338,7 +337,6 @@ void took(const Found &by, std::uint64_t number, std::int64_t source_ns, std::in
   const std::uint8_t none[RMW_GID_STORAGE_SIZE] = {};
   Writer body;
   body.number(by->id);
-  body.number(now_ns(CLOCK_REALTIME));
   body.number(number);
   body.number(source_ns);
   body.number(received_ns);
@@ -362,7 +360,6 @@ void bracket(Kind kind, const void *callback) {
   if (!ring().is_open()) return;
   Writer body;
   body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
-  body.number(now_ns(CLOCK_REALTIME));
   add(kind, body, now_ns());
 }
 
@@ -378,7 +375,6 @@ void belongs(const void *callback, const Found &entity) {
 void called(std::uint32_t timer, std::int64_t due_ns) {
   Writer body;
   body.number(timer);
-  body.number(now_ns(CLOCK_REALTIME));
   body.number(due_ns);
   add(Kind::CALL, body, now_ns());
 }
