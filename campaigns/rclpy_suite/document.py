@@ -25,28 +25,7 @@ Made by `python campaigns/rclpy_suite --rclpy PATH --baseline LIST --document VE
 | test | where | reason |
 |---|---|---|
 {rows}
-
-## Other releases
-
-Their suites **here**, from sources alone; natively they cannot run.
-
-| rclpy | tests | differs at the boundary |
-|---|---|---|
-{releases}
-
-AsyncNode and AsyncioExecutor are refused by name. Lyrical's sources were not available.
 """
-_RELEASES = {
-    "Humble 3.3.15 (Python 3.10)": (
-        413,
-        "`QoSEvent`; callbacks of subscriptions are attributes; no type hashes",
-    ),
-    "Rolling 8.0.0 (2024)": (
-        473,
-        "nothing; 465 pass, one fails as natively, 7 timed out on a busy machine",
-    ),
-}
-"""Releases that no wheels have: tests in their suites, and what they have otherwise than Jazzy."""
 _WAYS = {"simulation": "here", "process": "process"}
 _LINES = {
     "suite": "in the suite",
@@ -83,13 +62,7 @@ def document(
         for way, where in _WAYS.items()
         for test, reason in excluded[way].items()
     ]
-    releases = [f"| {name} | {count} | {text} |" for name, (count, text) in _RELEASES.items()]
-    return _TEXT.format(
-        version=version,
-        counts="\n".join(lines),
-        rows="\n".join(rows),
-        releases="\n".join(releases),
-    )
+    return _TEXT.format(version=version, counts="\n".join(lines), rows="\n".join(rows))
 
 
 def read(text: str) -> tuple[str, dict[str, Counts]]:
