@@ -2,6 +2,7 @@
 // with their length before them. The other side is ../wire.py.
 #pragma once
 
+#include <algorithm>
 #include <cstdint>
 #include <cstring>
 #include <string>
@@ -65,8 +66,10 @@ class Writer {
   }
   void text(const std::string &value) { blob(value.data(), value.size()); }
   void raw(const void *data, std::size_t size) {
-    const auto *first = static_cast<const std::uint8_t *>(data);
-    bytes.insert(bytes.end(), first, first + size);
+    // Not insert(): g++ 12 warns of a move of what an empty vector does not have.
+    const auto before = bytes.size();
+    bytes.resize(before + size);
+    std::copy_n(static_cast<const std::uint8_t *>(data), size, bytes.begin() + before);
   }
   std::vector<std::uint8_t> bytes;
 };
