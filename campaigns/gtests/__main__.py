@@ -120,6 +120,7 @@ def _run(
     """Run a command of gtest; return what it printed, and how it ended."""
     if simulated:
         node = {"program": command[0], "arguments": command[1:], "required": True}
+        node["intra_process"] = True  # some tests are of it
         job = {"nodes": [node], "clocks": {"source": "topic"}, "stop": {"duration": "1h"}}
         (folder / "job.yaml").write_text(json.dumps(job))
         words = ["record", str(folder / "job.yaml"), "-o", str(folder / "run.mcap"), "--force"]

@@ -32,6 +32,7 @@ from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec, LatencySpec
 from rsltrace.job.values.target import Target, target_text
+from rsltrace.trace.model.finding import decode_unseen
 from rsltrace.trace.model.texts import NS_PER_S, format_duration, format_seconds
 from rsltrace.trace.reader import Trace
 
@@ -306,7 +307,12 @@ def evaluating(
     :raises TraceError: the trace is damaged, or lacks the messages that a check reads.
     """
     came_to_its_end = trace.complete and trace.result.get("exit_code") != str(EXIT_RUN)
-    names = names_of(trace.entities.values(), are_all=came_to_its_end, fields=trace.fields_of)
+    names = names_of(
+        trace.entities.values(),
+        are_all=came_to_its_end,
+        fields=trace.fields_of,
+        unseen=decode_unseen(trace.result),
+    )
     held = [_property(trace, job, index, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
     places = [

@@ -12,6 +12,7 @@ import click
 from rsltrace.cli.options import job_folder_option, set_option, trust_option
 from rsltrace.cli.replay import agree, code_lines
 from rsltrace.terminal import tell
+from rsltrace.trace.model.finding import decode_unseen
 from rsltrace.trace.model.texts import printable
 
 
@@ -87,7 +88,8 @@ def debug(
                 tell(line)
             agree(plan, trust=trust)
             shown = {f"{one.name} {one.change}" for one in plan.code}
-            names = names_of(plan.trace.entities.values())
+            unseen = decode_unseen(plan.trace.result)
+            names = names_of(plan.trace.entities.values(), unseen=unseen)
         session = stack.enter_context(
             DebugSession(
                 source,

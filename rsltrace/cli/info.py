@@ -26,7 +26,7 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.finding import decode_drops, decode_waits
+from rsltrace.trace.model.finding import decode_drops, decode_unseen, decode_waits, unseen_notes
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import (
     NS_PER_S,
@@ -234,6 +234,7 @@ def _as_text(trace: Trace, counts: TraceCounts, *, show_all: bool) -> list[str]:
         lines += ["", "edits of this branch", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
     lines += _drop_lines(trace)
+    lines += (f"note: {one}" for one in unseen_notes(decode_unseen(trace.result)))
     lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
     return lines
 

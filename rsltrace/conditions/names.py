@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from rsltrace.errors import did_you_mean, near_or_all
 from rsltrace.trace.model.entity import WITH_TOPIC, Entity, EntityKind
+from rsltrace.trace.model.finding import unseen_text
 from rsltrace.trace.words.entities import is_named
 
 Fields = Callable[[str], Mapping[str, str] | None]
@@ -26,7 +27,8 @@ class RunNames:
     """The names of a run's nodes, topics (and services) and entities.
 
     Unless they ``are_all`` (the run may make more), a name that is none of them is no mistake.
-    ``interfaces`` is by topic; ``fields`` knows those of an interface, or None.
+    ``interfaces`` is by topic; ``fields`` knows those of an interface, or None. ``unseen`` has the
+    process of each topic whose messages are in no trace.
     """
 
     nodes: tuple[str, ...] = ()
@@ -35,18 +37,25 @@ class RunNames:
     are_all: bool = False
     interfaces: Mapping[str, str] = field(default_factory=dict)
     fields: Fields = _no_fields
+    unseen: Mapping[str, str] = field(default_factory=dict)
 
     def unknown(self, pattern: str, names: Iterable[str], what: str) -> str:
         """Return what is wrong with a pattern that has to fit one of ``names``, empty if nothing
         is."""
         names = tuple(names)
+        if what.startswith("topic") and pattern in self.unseen:
+            return unseen_text([pattern], self.unseen[pattern])
         if not self.are_all or any(is_named(pattern, name) for name in names):
             return ""
         return f"no {what} is called {pattern!r}{near_or_all(pattern, names)}"
 
 
 def names_of(
-    entities: Iterable[Entity], *, are_all: bool = True, fields: Fields = _no_fields
+    entities: Iterable[Entity],
+    *,
+    are_all: bool = True,
+    fields: Fields = _no_fields,
+    unseen: Mapping[str, str] | None = None,
 ) -> RunNames:
     """Return the names of entities, as those of a trace."""
     entities = tuple(entities)
@@ -62,6 +71,7 @@ def names_of(
             if one.kind in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
         },
         fields=fields,
+        unseen=unseen or {},
     )
 
 

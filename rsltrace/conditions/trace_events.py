@@ -16,6 +16,7 @@ from rsltrace.conditions.topic_fields import topic_of, with_topic_prefix
 from rsltrace.conditions.view import SentOutput
 from rsltrace.errors import ConditionError, TraceError
 from rsltrace.trace.model.event import NO_EVENT, NO_SEQUENCE, EventRecord, Output, OutputKind
+from rsltrace.trace.model.finding import decode_unseen
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.trace.words.entities import is_named
@@ -128,7 +129,8 @@ class TraceCondition:
     """
 
     def __init__(self, text: str, trace: Trace) -> None:
-        names = names_of(trace.entities.values(), fields=trace.fields_of)
+        unseen = decode_unseen(trace.result)
+        names = names_of(trace.entities.values(), fields=trace.fields_of, unseen=unseen)
         read = parse_condition(text, names)
         self._armed = read.arm(StartOfTrace(trace.start_ns))
         inner = getattr(self._armed, "inner", self._armed)

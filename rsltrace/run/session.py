@@ -86,7 +86,9 @@ from rsltrace.trace.model.finding import (
     GuardCount,
     encode_drops,
     encode_suppressed,
+    encode_unseen,
     encode_waits,
+    unseen_notes,
 )
 from rsltrace.trace.model.texts import format_seconds, shortened
 from rsltrace.trace.recorder import Recorder
@@ -540,6 +542,7 @@ class RunSession:
                     **_waits(error, outcome.waits),
                     **encode_suppressed(outcome.suppressed),
                     **encode_drops(queue_drops(outcome.drops)),
+                    **encode_unseen(outcome.unseen),
                     **self._late_numerics(),
                 },
                 replace=self.has_begun or exit_code == 0,
@@ -556,7 +559,13 @@ class RunSession:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
-            notes=(*self._notes, *outcome.notes, *drop_notes(outcome.drops), *unused),
+            notes=(
+                *self._notes,
+                *outcome.notes,
+                *drop_notes(outcome.drops),
+                *unseen_notes(outcome.unseen),
+                *unused,
+            ),
             guarded=self._guarded.counts,
             kept="" if self._writer is None else self._writer.kept,
         )

@@ -11,6 +11,7 @@ from typing import Any, NoReturn, Protocol
 from rsltrace.errors import TraceError, near_or_all, nearest
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.model.finding import decode_unseen, unseen_text
 from rsltrace.trace.model.operation import is_built_in
 from rsltrace.trace.model.texts import printable
 from rsltrace.trace.reader import Trace
@@ -127,10 +128,16 @@ _DEPTH_MAX = 8
 def why(trace: Trace, node: str, asked: str, at_ns: int | None = None) -> Reason:
     """Return why a callback of a node did not run, or ran late.
 
-    :raises TraceError: there is no such node, topic or callback.
+    :raises TraceError: there is no such node, topic or callback, or its messages are in no trace.
     """
     found = find_target(RunHistory(trace), node, asked, at_ns)
-    return found if isinstance(found, Reason) else _solve(found)
+    if isinstance(found, Reason):
+        return found
+    unseen = decode_unseen(trace.result)
+    if found.entity.kind is EntityKind.SUBSCRIPTION and found.entity.name in unseen:
+        topic = found.entity.name
+        raise TraceError(f"{trace.name} cannot tell: {unseen_text([topic], unseen[topic])}")
+    return _solve(found)
 
 
 def _solve(question: Question) -> Reason:

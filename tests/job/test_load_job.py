@@ -478,7 +478,7 @@ GOLDEN = {
     "a node as text": (
         "nodes: [my_nodes:Talker]\n",
         """
-        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, script, module, program, component, container, extra_arguments, isolated, environment, working_directory, respawn, instant_sleep, required, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard, start_after, stdin; write {node: my_nodes:Talker}
+        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, script, module, program, component, container, extra_arguments, isolated, environment, working_directory, respawn, instant_sleep, intra_process, required, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard, start_after, stdin; write {node: my_nodes:Talker}
             1 | nodes: [my_nodes:Talker]
               |         ^
         """,  # noqa: E501

@@ -9,12 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.errors import JobError
-from rsltrace.job import load_job
+from rsltrace.checks.evaluate import evaluate_checks
+from rsltrace.conditions.trace_events import TraceCondition
+from rsltrace.errors import ConditionError, JobError, TraceError
+from rsltrace.job import job_from_text, load_job
 from rsltrace.run import RunResult, run
 from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from rsltrace.why.answer import why
 
 pytestmark = pytest.mark.ros
 
@@ -105,9 +108,29 @@ def test_a_rule_for_a_topic_whose_messages_do_not_leave_a_process_is_refused(
     node = f"{{program: {compiled('counter.c')}, arguments: ['100', intra]}}"
     (tmp_path / "job.yaml").write_text(f"nodes: [{node}]\nstop: {{topic: /count, duration: 1s}}\n")
     result = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
-    assert "use_intra_process_comms, switch that off; a rule of the job goes by /count" in str(
+    assert "intra-process communication, switch that off; a rule of the job goes by /count" in str(
         result.error
     )
+
+
+def test_what_is_asked_of_a_topic_whose_messages_do_not_leave_a_process_is_refused(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    _run(
+        tmp_path,
+        compiled("counter.c"),
+        "    arguments: ['100', intra]\n    remappings: {echo: count}",
+    )
+    job = tmp_path / "checks.yaml"
+    job.write_text("checks: [{rate: /count, at_least: 1}]\nnodes: [{node: a:B}]\n")
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        asked = job_from_text(job.read_text(), "checks.yaml", str(tmp_path))
+        with pytest.raises(JobError, match=r"/count stay in process .*counter and are"):
+            evaluate_checks(trace, asked)
+        with pytest.raises(ConditionError, match=r"/count stay in process .*counter"):
+            TraceCondition("topic /count", trace)
+        with pytest.raises(TraceError, match="cannot tell: messages on /count stay in process"):
+            why(trace, "/counter", "/count")
 
 
 @pytest.mark.parametrize(

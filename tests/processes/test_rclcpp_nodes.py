@@ -113,6 +113,19 @@ def test_executors_do_what_rclcpp_does_and_each_run_is_the_same(
                       "Listener::Listener()::{lambda()#2}"]  # fmt: skip
 
 
+def test_intra_process_communication_is_off_unless_the_job_leaves_it_on(tmp_path: Path) -> None:
+    program = _compile("inside.cpp", tmp_path / "inside")
+    for more, expected in (("", 10), (", intra_process: true", 0)):
+        job = f"nodes: [{{program: {program}{more}}}]\nstop: {{duration: 1s}}\n"
+        result = _run(tmp_path, job, f"{expected}.mcap")
+        assert "intra" in "".join(result.notes)
+        with Trace.open(tmp_path / f"{expected}.mcap") as trace:
+            of_count = [one for one in trace.entities.values() if one.name == "/count"]
+            (heard,) = [one for one in of_count if one.kind is EntityKind.SUBSCRIPTION]
+            events = [trace.event(index) for index in range(trace.event_count)]
+        assert sum(event.entity == heard.id for event in events) == expected
+
+
 @pytest.mark.native
 @pytest.mark.parametrize("executor", ["single", "multi", "events"])
 def test_native_runs_have_every_callback_with_its_cause(

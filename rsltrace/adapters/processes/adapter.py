@@ -30,7 +30,8 @@ class ProcessProgram:
 
     Its addresses are ``fixed`` (the same in every run, where the system allows that), random, or,
     with None, what those of this process would be. If ``noise``, a seed, is not 0, its heap is
-    fragmented first. Its sleeps take no simulated time with ``instant_sleep``.
+    fragmented first. Its sleeps take no simulated time with ``instant_sleep``; its messages may
+    stay in it with ``intra_process``.
     """
 
     argv: Sequence[str]
@@ -39,6 +40,7 @@ class ProcessProgram:
     fixed: bool | None = True
     noise: int = 0
     instant_sleep: bool = False
+    intra_process: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +98,7 @@ class ProcessAdapter:
             log_failure=log_failure,
             program=program.argv[0],
             instant_sleep=program.instant_sleep,
+            intra_process=program.intra_process,
         )
         process.begun_ns = domain.loop.now_ns
         process.entity_id = domain.entities.new_id()

@@ -334,6 +334,7 @@ def program(
     prefixes: Sequence[str] = (),
     pinned: bool = True,
     instant_sleep: bool = False,
+    intra_process: bool = False,
 ) -> ProcessProgram:
     """Return a command as a process of the run: with variables of ``surroundings`` but for those of
     ``environment``.
@@ -363,7 +364,9 @@ def program(
     fragments = 0
     if needs_symbols:  # Python depends on addresses as the run's own process does
         fixed, fragments = fixed if random == "0" else False, int(noise)
-    return ProcessProgram(list(command), around, folder, fixed, fragments, instant_sleep)
+    return ProcessProgram(
+        list(command), around, folder, fixed, fragments, instant_sleep, intra_process
+    )
 
 
 def _not_in(known: Sequence[str], environment: Mapping[str, str]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
@@ -41,7 +41,7 @@ from rsltrace.simulation.middleware.participant import Participant
 from rsltrace.simulation.middleware.publisher import Publisher
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventFlag, EventKind
-from rsltrace.trace.model.finding import NondeterminismSource
+from rsltrace.trace.model.finding import NondeterminismSource, unseen_text
 from rsltrace.trace.model.texts import format_seconds
 
 _RESUME = int(EventKind.RESUME)
@@ -51,7 +51,7 @@ _GRACE_S = 5.0
 _WAITER = struct.Struct("<IIqI")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
-_HELLO = struct.Struct("<qQII")
+_HELLO = struct.Struct("<qQIII")
 _SHOWN = struct.Struct("<qI")
 _SOURCES = (NondeterminismSource.RANDOM, NondeterminismSource.CLOCK, NondeterminismSource.PID)
 """What is drawn, by the numbers of ``native/call_sites.h``."""
@@ -94,6 +94,7 @@ class Process:
         log_failure: bool,
         program: str = "",
         instant_sleep: bool = False,
+        intra_process: bool = False,
     ) -> None:
         self.adapter = adapter
         self.dispatcher = adapter.domain.dispatcher
@@ -102,6 +103,7 @@ class Process:
         self.program = program
         self.log_failure = log_failure
         self.instant_sleep = instant_sleep
+        self.intra_process = intra_process
         self.entity_id = 0
         self.announced = True
         self.begun_ns = 0
@@ -120,7 +122,6 @@ class Process:
         self._waking_soon = False
         self._last: WaitableEntity | None = None
         self._is_stopping = False
-        self._unseen_topics: list[str] = []
         self._graph = GraphChange(self)
         adapter.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
@@ -372,10 +373,6 @@ class Process:
 
     def vanish(self) -> None:
         """Destroy all that it has made."""
-        if self._unseen_topics:
-            note = self._unseen_note(self._unseen_topics)
-            self.adapter.domain.outcome.notes.append(note)
-            self._unseen_topics.clear()
         for waking in self._waking.values():
             waking.off()
         self.things.give_all_up()
@@ -386,7 +383,7 @@ class Process:
     def _hello(self, fields: RecordReader) -> bytes:
         adapter, now_ns = self.adapter, self.dispatcher.loop.now_ns
         seed, own_clocks = adapter.seed_of(self.key), adapter.clock is not None
-        return _HELLO.pack(now_ns, seed, own_clocks, self.instant_sleep)
+        return _HELLO.pack(now_ns, seed, own_clocks, self.instant_sleep, self.intra_process)
 
     def _clock(self, fields: RecordReader) -> bytes:
         """Answer what a clock shows: that of a node, or of the running one."""
@@ -472,13 +469,7 @@ class Process:
         :raises RunError: if a rule of the job goes by them.
         """
         publisher = self.things[fields.number()]
-        self._unseen_topics.append(publisher.topic)
+        topic = publisher.topic
+        self.adapter.domain.outcome.unseen.setdefault(topic, self.name)
         if publisher.observers is not None and publisher.observers.watchers:
-            topic = publisher.topic
-            raise RunError(f"{self._unseen_note([topic])}; a rule of the job goes by {topic}")
-
-    def _unseen_note(self, topics: Iterable[str]) -> str:
-        return (
-            f"messages on {', '.join(sorted(set(topics)))} stay in process {self.name} and are in "
-            "no trace: it publishes them with use_intra_process_comms, switch that off"
-        )
+            raise RunError(f"{unseen_text([topic], self.name)}; a rule of the job goes by {topic}")

@@ -39,10 +39,11 @@ _ONLY_A_PROCESS = {
     "working_directory": "only a process has a folder of its own: 'program', or 'isolated: true'",
     "respawn": "only a process is started again: 'program', or 'isolated: true'",
     "instant_sleep": "only a process can sleep in no time: 'program', or 'isolated: true'",
+    "intra_process": "only of a process would messages not be seen: 'program', or 'isolated: true'",
 }
 _RARE = (
     *("start_after", "stdin", "isolated", "environment", "working_directory", "respawn"),
-    *("instant_sleep", "required", "container", "extra_arguments"),
+    *("instant_sleep", "intra_process", "required", "container", "extra_arguments"),
 )
 """Keys that are written down only where they say something."""
 
@@ -150,6 +151,12 @@ class NodeSpec(JobPart):
         "no simulated time in a process.",
         examples=[True],
     )
+    intra_process: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether nodes of a process may use intra-process communication (off by "
+        "default), whose messages are in no trace.",
+        examples=[True],
+    )
     required: Annotated[bool, check(flag)] = Field(
         default=False,
         description="Whether the run ends with this entry. Not for a `node`.",
@@ -229,6 +236,7 @@ class NodeSpec(JobPart):
             working_directory: str | os.PathLike[str] | None = None,
             respawn: RespawnSpec | dict[str, Any] | TimeLike | None = None,
             instant_sleep: bool = False,
+            intra_process: bool = False,
             required: bool = False,
             name: str | None = None,
             namespace: str | None = None,

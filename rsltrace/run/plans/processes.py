@@ -78,6 +78,7 @@ class ProcessPrograms:
             prefixes=self.prefixes,
             pinned=self._job.guard.pins,
             instant_sleep=spec.instant_sleep,
+            intra_process=spec.intra_process,
         )
 
     @cached_property

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import astuple, field
 from enum import Enum
 
@@ -42,6 +42,38 @@ def decode_drops(result: Mapping[str, str]) -> list[QueueDrops]:
         ]
     except (ValueError, TypeError):
         return []
+
+
+# Topics whose messages did not leave a process, which no trace has, with the name of the process.
+
+
+def encode_unseen(topics: Mapping[str, str]) -> dict[str, str]:
+    """Return the entry of a run's result for such topics."""
+    return {"unseen": json.dumps(topics, sort_keys=True)} if topics else {}
+
+
+def decode_unseen(result: Mapping[str, str]) -> dict[str, str]:
+    """Return such topics of a result; none if another program wrote them."""
+    try:
+        found = json.loads(result.get("unseen", "{}"))
+        return {str(topic): str(process) for topic, process in found.items()}
+    except (ValueError, AttributeError):
+        return {}
+
+
+def unseen_notes(topics: Mapping[str, str]) -> Iterator[str]:
+    """Yield what is said of such topics, process by process."""
+    for process in sorted(set(topics.values())):
+        yield unseen_text((topic for topic, of in topics.items() if of == process), process)
+
+
+def unseen_text(topics: Iterable[str], process: str) -> str:
+    """Return what is said of such topics, without a full stop."""
+    named = ", ".join(printable(topic) for topic in sorted(topics))
+    return (
+        f"messages on {named} stay in process {printable(process)} and are in no trace: it "
+        "publishes them with intra-process communication, switch that off"
+    )
 
 
 # The guard's call counts, as in the metadata ``rsltrace:guard``.

@@ -49,6 +49,7 @@ std::uint64_t times_let_go() { return idles; }
 std::int64_t shown_ns(std::uint32_t, bool) { return now; }
 std::uint64_t seed() { return 42; }
 bool has_instant_sleep() { return false; }
+bool has_intra_process() { return false; }
 bool is_own_code(const void *) { return false; }  // there is no trace to note anything in
 void note_answer(Source, const char *, const std::string &, const void *) {}
 

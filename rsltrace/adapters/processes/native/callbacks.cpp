@@ -1,4 +1,5 @@
-// Names of callbacks, and whose timers are: rclcpp tells both to tracetools, rcl knows neither.
+// Names of callbacks, and whose timers are: rclcpp tells both to tracetools, rcl knows neither. And
+// messages that stay in the process.
 #include <rcl/node.h>
 #include <rcl/publisher.h>
 #include <rcl/service.h>
@@ -101,6 +102,23 @@ RSLTRACE_EXPORT void ros_trace_rclcpp_intra_publish(const void *publisher, const
   if (!linked()) return;
   const auto *found = rmw_handle(static_cast<const rcl_publisher_t *>(publisher));
   if (found != nullptr) stayed_here(*static_cast<Endpoint *>(found->data));
+}
+
+// rclcpp::NodeOptions::use_intra_process_comms() const: what stays in the process is in no trace.
+RSLTRACE_EXPORT bool node_is_intra_process(const void *options) __asm__(
+    "_ZNK6rclcpp11NodeOptions23use_intra_process_commsEv");
+bool node_is_intra_process(const void *options) {
+  static const auto asked = reinterpret_cast<bool (*)(const void *)>(
+      original("librclcpp.so", "_ZNK6rclcpp11NodeOptions23use_intra_process_commsEv"));
+  if (!asked(options)) return false;
+  if (!linked() || has_intra_process()) return true;
+  static bool is_told = false;
+  if (!is_told)
+    report(
+        "use_intra_process_comms is off, so that all messages are in the trace; the entry's "
+        "'intra_process: true' leaves it on");
+  is_told = true;
+  return false;
 }
 
 // rclcpp makes the text only if it is wanted.

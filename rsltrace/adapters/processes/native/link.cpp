@@ -34,6 +34,7 @@ std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
 bool own_clocks = false;
 bool sleeps_are_instant = false;
+bool keeps_intra_process = false;
 std::uint64_t lets_go = 0;
 std::uint32_t ready_id = 0;
 std::size_t filled = 0;  // bytes of what has been received
@@ -182,6 +183,7 @@ void begin() {
   seed_of_process = reader.number<std::uint64_t>();
   own_clocks = reader.number<std::uint32_t>() != 0;
   sleeps_are_instant = reader.number<std::uint32_t>() != 0;
+  keeps_intra_process = reader.number<std::uint32_t>() != 0;
   if (noise != 0) fragment_heap(noise);
 }
 
@@ -204,6 +206,8 @@ std::uint64_t seed() { return seed_of_process; }
 bool has_own_clocks() { return own_clocks; }
 
 bool has_instant_sleep() { return sleeps_are_instant; }
+
+bool has_intra_process() { return keeps_intra_process; }
 
 std::uint64_t times_let_go() { return lets_go; }
 

@@ -57,6 +57,8 @@ bool has_own_clocks();
 std::uint32_t owner_of_new_clock();
 // Whether sleeps take no simulated time.
 bool has_instant_sleep();
+// Whether nodes may keep messages within the process.
+bool has_intra_process();
 std::uint64_t seed();
 
 // Append a record to the batch that the loop takes with the next wait or question, or if the process

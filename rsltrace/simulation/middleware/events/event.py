@@ -88,7 +88,8 @@ class RunOutcome:
     """How a run has gone. ``ended_after`` is the number of events when it ended; later ones are its
     shutdown. ``waits`` are the calls that still waited then, ``suppressed`` the exceptions that
     rclpy suppressed. ``drops`` counts the drops of full
-    queues by receiver, and by queue size of a publisher in an outage (else 0)."""
+    queues by receiver, and by queue size of a publisher in an outage (else 0). ``unseen`` has the
+    process of each topic whose messages did not leave it."""
 
     error: RunError | None = None
     notes: list[str] = field(default_factory=list)
@@ -96,6 +97,7 @@ class RunOutcome:
     waits: list[EndlessWait] = field(default_factory=list)
     suppressed: list[SuppressedException] = field(default_factory=list)
     drops: dict[tuple[Any, int], int] = field(default_factory=dict)
+    unseen: dict[str, str] = field(default_factory=dict)
 
     def note_end(self, events: int) -> None:
         """Remember the number of events at the end of the run; the first call counts."""
