@@ -114,7 +114,7 @@ def test_executors_do_what_rclcpp_does_and_each_run_is_the_same(
 
 
 def test_intra_process_communication_is_off_unless_the_job_leaves_it_on(tmp_path: Path) -> None:
-    program = _compile("inside.cpp", tmp_path / "inside")
+    program = _compile("inside.cpp", tmp_path / "inside", ["-g"])
     for more, expected in (("", 10), (", intra_process: true", 0)):
         job = f"nodes: [{{program: {program}{more}}}]\nstop: {{duration: 1s}}\n"
         result = _run(tmp_path, job, f"{expected}.mcap")
@@ -124,6 +124,7 @@ def test_intra_process_communication_is_off_unless_the_job_leaves_it_on(tmp_path
             (heard,) = [one for one in of_count if one.kind is EntityKind.SUBSCRIPTION]
             events = [trace.event(index) for index in range(trace.event_count)]
         assert sum(event.entity == heard.id for event in events) == expected
+        assert heard.source.endswith("inside.cpp:21")  # of a std::bind: where it is subscribed
 
 
 @pytest.mark.native

@@ -96,7 +96,6 @@ class ProcessAdapter:
             name,
             key,
             log_failure=log_failure,
-            program=program.argv[0],
             instant_sleep=program.instant_sleep,
             intra_process=program.intra_process,
         )

@@ -49,7 +49,6 @@ class HostProcess(Protocol):
     """The process that endpoints and timers are in, as they see it."""
 
     name: str
-    program: str
     dispatcher: Dispatcher
 
     def wants(self, thing: WaitableEntity) -> bool:

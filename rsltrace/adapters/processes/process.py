@@ -92,7 +92,6 @@ class Process:
         key: str,
         *,
         log_failure: bool,
-        program: str = "",
         instant_sleep: bool = False,
         intra_process: bool = False,
     ) -> None:
@@ -100,7 +99,6 @@ class Process:
         self.dispatcher = adapter.domain.dispatcher
         self.name = name
         self.key = key
-        self.program = program
         self.log_failure = log_failure
         self.instant_sleep = instant_sleep
         self.intra_process = intra_process

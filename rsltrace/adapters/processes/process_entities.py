@@ -318,7 +318,7 @@ class ProcessEntities(dict[int, Any]):
     def _callback(self, fields: RecordReader) -> None:
         """Take note of the name of a callback, which rclcpp says."""
         end, name = self[fields.number()], fields.text()
-        end.named_callback(name, callback_place(self._process.program, name))
+        end.named_callback(name, callback_place(name, list(fields.frames())))
 
     def _sender(self, fields: RecordReader) -> None:
         """Record the line of code that is about to send by an endpoint, once for each callback."""

@@ -66,17 +66,25 @@ def _functions(pairs: Sequence[str]) -> list[str]:
     return [f"{place} in {name}" for place, name in places if place]
 
 
+def callback_place(name: str, maker: Sequence[Frame]) -> str:
+    """Return ``node.cpp:24`` of a function or lambda, by the name that rclcpp gives a callback; of
+    a ``std::bind``, or what was inlined, the line that makes its subscription, timer or service. ""
+    without debug information, and for ROS's own. ``maker`` has the frames of that line."""
+    return _function_place(maker[0][0], name) or _first_place(_lines_of(maker)) if maker else ""
+
+
+def _first_place(lines: Sequence[str]) -> str:
+    return lines[0].partition(" in ")[0] if lines else ""
+
+
 @cache
-def callback_place(module: str, name: str) -> str:
-    """Return ``node.cpp:24`` of a function or lambda, by the name that rclpp gives a callback; ""
-    if the program has no such function of its own (it was inlined, or is a ``std::bind``)."""
+def _function_place(module: str, name: str) -> str:
     if not _has_lines(module):
         return ""
     for line in _symbols(module):
         address, _, symbol = line.split(" ", 2)
         if symbol == name or symbol.startswith(name + _LAMBDA_CALL):
-            lines = _lines_of([(module, int(address, 16))])
-            return lines[-1].partition(" in ")[0] if lines else ""
+            return _first_place(_lines_of([(module, int(address, 16))])[-1:])
     return ""
 
 

@@ -6,8 +6,10 @@
 #include <execinfo.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstdlib>
 #include <unordered_map>
+#include <vector>
 
 #include "real.h"
 #include "scheduler.h"
@@ -16,6 +18,7 @@ namespace rsltrace {
 namespace {
 
 constexpr int DEPTH = 16;
+constexpr int DEPTH_OF_TEMPLATES = 64;  // of rclcpp, unoptimized
 constexpr std::uint32_t NOTES_PER_EVENT = 100;  // as many as the guard keeps
 constexpr std::uint32_t LOOKS_FIRST = 32;       // at clocks, from each place
 constexpr std::uint32_t SENDERS_FIRST = 32;     // as adapters/rclpy/concurrency/code_lines.py
@@ -94,6 +97,17 @@ void note_answer(Source source, const char *call, const std::string &answer, con
     write_stack(body);
   }
   say(Say::DRAW, body);
+}
+
+void write_maker(Writer &body, const void *caller) {
+  void *frames[DEPTH_OF_TEMPLATES];
+  void **end = frames + backtrace(frames, DEPTH_OF_TEMPLATES);
+  void **first = std::find(frames, end, caller);
+  std::vector<const Caller *> own;
+  for (void **frame = first; frame != end && caller_at(caller).own; ++frame)
+    if (const Caller &one = caller_at(*frame); one.own) own.push_back(&one);
+  body.number(static_cast<std::uint32_t>(own.size()));
+  for (const Caller *one : own) write_frame(body, *one);
 }
 
 void note_sender(std::uint32_t id) {

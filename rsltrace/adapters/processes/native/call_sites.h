@@ -4,6 +4,8 @@
 #include <cstdint>
 #include <string>
 
+#include "wire.h"
+
 namespace rsltrace {
 
 // The numbers are those of ../process.py.
@@ -13,6 +15,9 @@ enum class Source : std::uint32_t { RANDOM = 0, CLOCK = 1, PID = 2 };
 bool is_own_code(const void *caller);
 // Put into the trace what the program's own code got from a call. `caller` is where it returns to.
 void note_answer(Source source, const char *call, const std::string &answer, const void *caller);
+// Append the frames of the program's own code that make something, innermost first: none if ROS
+// itself makes it. `caller` is where the function that ROS's templates call returns to.
+void write_maker(Writer &body, const void *caller);
 // Say from where an endpoint is about to send, the first times from each callback.
 void note_sender(std::uint32_t id);
 

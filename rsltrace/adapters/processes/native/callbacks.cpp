@@ -7,6 +7,7 @@
 
 #include <unordered_map>
 
+#include "call_sites.h"
 #include "rmw_common.h"
 #include "timers.h"
 
@@ -46,12 +47,13 @@ Owners &callbacks() {
   return *all;
 }
 
-void name(const void *callback, const char *symbol) {
+void name(const void *callback, const char *symbol, const void *caller) {
   const auto found = callbacks().find(callback);
   if (found == callbacks().end() || symbol == nullptr || !linked()) return;
   Writer body;
   body.number(found->second);
   body.text(symbol);
+  write_maker(body, caller);
   callbacks().erase(found);  // it is told once, and the address may become another's
   say(Say::CALLBACK, body);
 }
@@ -126,9 +128,9 @@ RSLTRACE_EXPORT bool ros_trace_enabled_rclcpp_callback_register() { return linke
 
 RSLTRACE_EXPORT void ros_trace_do_rclcpp_callback_register(const void *callback,
                                                            const char *symbol) {
-  name(callback, symbol);
+  name(callback, symbol, __builtin_return_address(0));
 }
 
 RSLTRACE_EXPORT void ros_trace_rclcpp_callback_register(const void *callback, const char *symbol) {
-  name(callback, symbol);
+  name(callback, symbol, __builtin_return_address(0));
 }
