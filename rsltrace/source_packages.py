@@ -47,6 +47,15 @@ def source_packages(folders: Iterable[Path]) -> dict[str, SourcePackage]:
     return found
 
 
+def sourced_package(name: str) -> SourcePackage | None:
+    """Return the share of a package of the sourced ROS, if it has definitions of interfaces."""
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        share = Path(prefix, "share", name)
+        if any((share / kind).is_dir() for kind in _KINDS):
+            return SourcePackage(name, share)
+    return None
+
+
 def workspaces_of(file: Path) -> list[Path]:
     """Return the folders of the workspace that a file's package lies in; none if it has none.
 

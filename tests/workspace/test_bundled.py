@@ -92,6 +92,19 @@ def test_the_workspace_comes_first_and_may_use_what_is_bundled(
         assert import_module("my_msgs.msg").TFMessage().at.latitude == 0.0
 
 
+def test_what_is_sourced_without_python_comes_before_what_is_bundled(
+    tmp_path: Path, caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    for name, text in (("tf2_msgs", "int32 own\n"), ("cpp_msgs", "tf2_msgs/TFMessage tree\n")):
+        share = tmp_path / "share" / name
+        (share / "msg").mkdir(parents=True)
+        (share / "msg" / "TFMessage.msg").write_text(text)
+    with unbuilt_packages([]):
+        assert import_module("tf2_msgs.msg").TFMessage().own == 0
+        assert import_module("cpp_msgs.msg").TFMessage().tree.own == 0
+
+
 def test_natively_they_are_refused_by_name(caches: Path) -> None:
     from rclpy.type_support import check_for_type_support
 

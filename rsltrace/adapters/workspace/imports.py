@@ -34,7 +34,7 @@ _SUPPORT = "_s__rosidl_typesupport_c"
 
 class UnbuiltWorkspace:
     """The packages in and below some folders, as far as they have not been built, and those whose
-    interfaces are bundled with rsltrace."""
+    interfaces are sourced without their Python modules, or bundled with rsltrace."""
 
     def __init__(self, folders: Sequence[Path], *, native: bool = False) -> None:
         """``native``: their interfaces go to ROS's middleware, which needs them compiled."""
@@ -60,15 +60,24 @@ class UnbuiltWorkspace:
         """Return what makes the classes of a package; None if it has none."""
         package = self.packages.get(name)
         is_own = package is not None and bool(package.interfaces)
-        if name not in BUNDLED and not is_own:
-            return None
         with engage(None):
-            from rsltrace.adapters.workspace.interfaces import has_rosidl, interface_makers
+            from rsltrace.source_packages import sourced_package
+
+            sourced = None if is_own else sourced_package(name)
+            if name not in BUNDLED and not is_own and sourced is None:
+                return None
+            from rsltrace.adapters.workspace.interfaces import (
+                InterfaceMaker,
+                has_rosidl,
+                interface_makers,
+            )
 
             if not is_own and not has_rosidl():
                 return None  # as where nothing has the package: code may do without it
             if self._makers is None:
                 self._makers = interface_makers({**bundled_packages(), **self.packages})
+            if sourced is not None and name not in self.made:
+                self._makers[name] = InterfaceMaker(sourced, self._makers)
             maker = self._makers.get(name)
             if maker is None:
                 return None
@@ -101,7 +110,7 @@ class UnbuiltWorkspace:
                 text = f"{name} in {self.packages[name].folder} has not been built"
                 what = "build"
             else:
-                text = f"{name} is not installed: rsltrace only has its definitions"
+                text = f"{name} is not installed: there are only its definitions"
                 what = "install"
             raise SetupError(
                 f"{text}, and its interfaces cannot go over DDS as they are: {what} the package "
