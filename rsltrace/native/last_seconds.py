@@ -61,8 +61,15 @@ class LastSeconds:
         self._reasons: list[str] = []
         self._due_ns = 0
         self._written_ns = 0
+        self.ended_ns = 0
+        """When the run was told to end, 0 before that: the last seconds are those up to then."""
         self.missing: list[str] = []
         """What the file that was written last lacks."""
+
+    @property
+    def since_ns(self) -> int:
+        """Since when all is kept."""
+        return (self.ended_ns or now_ns()) - self._spec.duration_ns
 
     def trigger(self, reason: str, at_ns: int | None = None, *, at_once: bool = False) -> None:
         """Have a file written, from any thread. Unless ``at_once``, it goes on where the last one
@@ -81,7 +88,7 @@ class LastSeconds:
         """Take what is new, drop what is old, and write a file if it is time."""
         self._take(CUT_AFTER_NS)
         if self._programs is not None:
-            for at_ns, reason in self._programs.look_at_programs(now_ns() - self._spec.duration_ns):
+            for at_ns, reason in self._programs.look_at_programs(self.since_ns):
                 self.trigger(reason, at_ns)
         with self._lock:
             if not self._reasons or now_ns() < self._due_ns:
@@ -93,7 +100,7 @@ class LastSeconds:
     def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Return what is kept now, everything at the end of the run (None)."""
         self._take(patience_ns)
-        since_ns = now_ns() - self._spec.duration_ns
+        since_ns = self.since_ns
         spans = [span for span, _ in self._spans]
         self.missing = []
         if self._dropped_ns > since_ns:
@@ -129,7 +136,7 @@ class LastSeconds:
                 self.trigger(f"a message on {span.taken.entity.name}", span.start_ns)
             self._spans.append((span, size))
             self._size += size
-        since_ns = now_ns() - self._spec.duration_ns
+        since_ns = self.since_ns
         while self._spans:
             span, size = self._spans[0]
             if span.start_ns >= since_ns and self._size <= self._spec.memory:

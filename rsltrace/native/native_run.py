@@ -41,8 +41,8 @@ from rsltrace.trace.writer import TraceWriter
 
 LOOK_EVERY_S = 0.01
 ENDS_WITHIN_S = 5.0
-_MISSING_MAX = 20
-"""Of a run that goes on for days only the latest."""
+_LOOK_FOR_LAST_S = 0.05
+"""Of a run that goes on for days: it is to cost little."""
 _TIMES = {"duration_ns", "time_ns", "timeout_ns"}
 
 
@@ -112,8 +112,8 @@ class NativeRun:
         self.stopped = threading.Event()
         self.levels: dict[str, int] = {}
         self.last: LastSeconds | None = None
-        self.missing: list[str] = []
-        """What the trace lacks, or may lack."""
+        self._missing: list[tuple[int, str]] = []
+        """Since when (steady) the trace lacks something, or may lack it."""
         self.begun_ns = 0
         self.ended_ns = 0
         self._lock = threading.Lock()
@@ -229,7 +229,7 @@ class NativeRun:
             with self._new_trace(path, force=False) as writer:
                 written = self._span_writer(writer, self.last)
                 written.write(None)
-                self._close_trace(writer, written, reason, 0, 0)
+                self._close_trace(writer, written, f"kept: {reason}", 0, 0)
         except RsltraceError as error:
             self.note(f"the last seconds are not kept: {error}")
         else:
@@ -244,10 +244,11 @@ class NativeRun:
         ended_after: int,
         more: Mapping[str, str] | None = None,
     ) -> None:
-        now_ns, start_ns, missing = time.monotonic_ns(), self.clocks.steady_ns, self.missing
-        if self.last is not None and self.job.record.last is not None:
-            start_ns = max(start_ns, now_ns - self.job.record.last.duration_ns)
-            missing = [*missing[-_MISSING_MAX:], *self.last.missing]
+        now_ns, start_ns = time.monotonic_ns(), self.clocks.steady_ns
+        if self.last is not None:
+            start_ns = max(start_ns, self.last.since_ns)
+        missing = [text for at_ns, text in self._missing if at_ns >= start_ns]
+        missing += [] if self.last is None else self.last.missing
         writer.close(
             result={
                 "start_time": str(self.clocks.stamp(start_ns)),
@@ -283,9 +284,16 @@ class NativeRun:
 
     def wait(self) -> Iterator[None]:
         """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
-        while not self.stopped.wait(LOOK_EVERY_S) and self.span_writer.error is None:
+        every_s = LOOK_EVERY_S if self.last is None else _LOOK_FOR_LAST_S
+        while not self.stopped.wait(every_s) and self.span_writer.error is None:
             yield
         self.ended_ns = time.monotonic_ns()
+        if self.last is not None:
+            self.last.ended_ns = self.ended_ns
+
+    def lacks(self, text: str) -> None:
+        """Take note of what the trace lacks, or may lack."""
+        self._missing.append((time.monotonic_ns(), text))
 
     def look(self, events: int, activity_ns: int) -> None:
         """End the run if it is time. ``activity_ns`` is when something was last sent, steady."""

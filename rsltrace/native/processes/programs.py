@@ -86,7 +86,7 @@ class RecordKind(IntEnum):
 _MAGIC = 0x32656361_72746C73
 _HEAD_SIZE = 4096
 _CAPACITY, _WRITTEN, _READ, _IS_WRITING, _LOST, _CPU_NS, _RESERVED = range(1, 8)
-_MADE_WRITTEN, _MADE_READ, _TRIGGERED_NS, _ENDED, _STARTS = range(8, 13)
+_MADE_WRITTEN, _MADE_READ, _TRIGGERED_NS, _TRIGGER, _ENDED, _STARTS = range(8, 14)
 _PARTS = 256
 _MADE_SIZE = 1 << 20
 _RECORD = struct.Struct("=IIqqII")
@@ -161,6 +161,15 @@ class RecordFile:
     def triggered_ns(self) -> int:
         """When a message came last that a file is to be written for, 0 if none did."""
         return self._head[_TRIGGERED_NS]
+
+    @property
+    def trigger(self) -> str:
+        """The topic or service of that message."""
+        for record in _records(memoryview(bytes(self._made))):
+            if record.kind in _ENDS and record.fields.number() == self._head[_TRIGGER]:
+                record.fields.number()
+                return record.fields.text()
+        return ""
 
     @property
     def status(self) -> int | None:
@@ -575,6 +584,8 @@ class ObservedProgram:
         self._name = name
         self._folder = folder
         self._numbers = ids, threads
+        self.own = 0
+        """The number of the process that was started, of whose end the run knows."""
         self._files: dict[Path, tuple[RecordFile, ProgramSpans]] = {}
         self._early: list[CallbackSpan] = []
         self._cpu_ns: dict[Path, int] = {}
@@ -589,14 +600,14 @@ class ObservedProgram:
             file.read_made()
             if file.triggered_ns > self._triggered_ns.get(path, 0):
                 self._triggered_ns[path] = file.triggered_ns
-                yield file.triggered_ns, f"a message that {self._name} sent or got"
+                yield file.triggered_ns, f"a message on {file.trigger}"
             if path in self._ended_ns:
                 if self._ended_ns[path] < since_ns:
                     for known in (self._files, self._ended_ns, self._triggered_ns):
                         known.pop(path, None)
             elif not file.cpu_ns(int(path.stem)):
                 self._ended_ns[path] = now_ns()
-                if file.status != 0:
+                if file.status != 0 and int(path.stem) != self.own:
                     how = "was killed" if file.status is None else f"exit status {file.status}"
                     yield now_ns(), f"the end of process {path.stem} of {self._name}: {how}"
 
@@ -611,25 +622,28 @@ class ObservedProgram:
         found: list[CallbackSpan] = []
         missing = []
         for path, (file, _) in list(self._files.items()):
+            at_ns = now_ns()
             made, left = file.last()
+            if path in self._ended_ns:
+                at_ns = max((one[-1].steady_ns for one in (made, left) if one), default=at_ns)
             spans = ProgramSpans(self._name, int(path.stem), *self._numbers)
-            start_ns = left[0].steady_ns if left else now_ns()
+            start_ns = left[0].steady_ns if left else at_ns
             before = [record for record in made if record.steady_ns < start_ns]
             for record in before:
                 spans.add(record)
             if file.overwritten:
                 spans.begin_late()
                 if start_ns > since_ns:
-                    kept_s = format_seconds(now_ns() - start_ns)
+                    kept_s = format_seconds(at_ns - start_ns)
                     missing.append(
                         f"of {self._name}, all but the last {kept_s} s: its memory is full"
                     )
             for record in heapq.merge(made[len(before) :], left, key=_steady_ns):
                 spans.add(record)
-            found += spans.finished(now_ns(), None)[0]
+            found += spans.finished(at_ns, None)[0]
             if file.lost:
                 missing.append(f"{file.lost} records of {self._name}, for which there was no room")
-            if file.status is None and path in self._ended_ns:
+            if file.status is None and path in self._ended_ns and int(path.stem) != self.own:
                 missing.append(
                     f"of {self._name}, which was killed, what each thread was just doing"
                 )

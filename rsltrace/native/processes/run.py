@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -196,7 +198,19 @@ _KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
 Counts = tuple[int, int, int, int, int]
 """Of a process: its events, when it was last active (steady), messages that could not be read,
 its processor time, and that of telling of it."""
+_SHARED_MEMORY = Path("/dev/shm")
+_ROOM = 1 << 30
+"""As much has to be free there."""
 _QUIET_ENDS = ("KeyboardInterrupt", "ExternalShutdownException")
+
+
+def _memory_folder() -> Path | None:
+    """Return where files are memory only, None if there is no room: a disk would be written to all
+    the time."""
+    with suppress(OSError):
+        if shutil.disk_usage(_SHARED_MEMORY).free >= _ROOM and os.access(_SHARED_MEMORY, os.W_OK):
+            return _SHARED_MEMORY
+    return None
 
 
 class MultiProcessRun(NativeRun):
@@ -210,7 +224,8 @@ class MultiProcessRun(NativeRun):
         self._ids, self._threads = count(1), count(1)
         self._told: dict[ObservedProcess, tuple[SpanDecoder, ProcessSpans]] = {}
         self._programs: dict[ObservedProcess, ObservedProgram] = {}
-        self._folder = Path(stack.enter_context(TemporaryDirectory(prefix="rsltrace-")))
+        folder = TemporaryDirectory(prefix="rsltrace-", dir=_memory_folder())
+        self._folder = Path(stack.enter_context(folder))
         self._counts: dict[ObservedProcess, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
@@ -270,6 +285,7 @@ class MultiProcessRun(NativeRun):
             program = ObservedProgram(start.name, folder, self._ids, self._threads)
         child = ObservedProcess(start, self._hear, self._ended)
         if program is not None:
+            program.own = child.number
             self._programs[child] = program
         self.children.append(child)
         return child
@@ -336,7 +352,7 @@ class MultiProcessRun(NativeRun):
         except Exception as error:
             del self._programs[child]
             self.merge.end(self._told[child][1])
-            self.missing.append(f"what {child.what.name} did from {self._at} s on: {error}")
+            self.lacks(f"what {child.what.name} did from {self._at} s on: {error}")
             return
         self._counts[child] = program.counts
         self._add(self._told[child][1], found, until_ns)
@@ -424,15 +440,15 @@ class MultiProcessRun(NativeRun):
     def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
         """Take note of what the trace lacks, or may lack, of a process that has ended."""
         name, program = child.what.name, self._programs.get(child)
-        if program is not None and program.lost:
-            self.missing.append(f"{program.lost} records of {name}, for which there was no room")
+        if program is not None and program.lost and self.last is None:
+            self.lacks(f"{program.lost} records of {name}, for which there was no room")
         if program is not None and program.unobserved:
-            self.missing.append(
+            self.lacks(
                 f"{program.unobserved} processes of {name}: no room for files in {self._folder}"
             )
         if child.has_begun and status < 0 and status != -signal.SIGINT:
             what = "the last 50 ms" if program is None else "what each thread was just doing"
-            self.missing.append(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
 
     @property
     def _at(self) -> str:

@@ -109,6 +109,7 @@ struct Head {
   std::atomic<std::uint64_t> made_written;
   std::atomic<std::uint64_t> made_read;
   std::atomic<std::int64_t> triggered_ns;  // the last message that the last records are kept for
+  std::atomic<std::uint64_t> trigger;      // the id of whoever sent or got it
   std::atomic<std::uint64_t> ended;        // ENDED and the exit status, unless it was killed
   std::atomic<std::uint64_t> starts[PARTS];
 };
@@ -231,7 +232,10 @@ class Ring {
     head_->is_writing.store(0, std::memory_order_release);
   }
 
-  void trigger() { head_->triggered_ns.store(now_ns()); }
+  void trigger(std::uint32_t id) {
+    head_->trigger.store(id);
+    head_->triggered_ns.store(now_ns());
+  }
 
  private:
   bool put(Kind kind, std::uint32_t thread, std::int64_t begun_ns, const void *fields,
@@ -405,7 +409,7 @@ void add_message(Kind kind, Fields &fields, const Entity &entity, const Data &da
   fields.number(static_cast<std::uint32_t>(is_raw && has_data));
   fields.number(data.empty() ? UINT64_C(0) : rsltrace::hash64(data.data(), data.size()));
   add(kind, fields, begun_ns, has_data ? &data : nullptr);
-  if (entity.is_trigger) ring().trigger();
+  if (entity.is_trigger) ring().trigger(entity.id);
 }
 
 // -- what happens -------------------------------------------------------------------------------
