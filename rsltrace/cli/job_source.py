@@ -241,18 +241,22 @@ def job_words(
 
 
 def all_overrides(
-    overrides: Sequence[Override], seed: int | None, until: str | None
+    overrides: Sequence[Override], seed: int | None, until: str | None, last: str | None = None
 ) -> list[Override]:
-    """Return the overrides of ``--set``, then those of ``--seed`` and ``--until``."""
+    """Return the overrides of ``--set``, then those of ``--seed``, ``--until`` and ``--last``."""
     found: list[Override] = list(overrides)
     if seed is not None:
         found.append(("--seed", f"seed={seed}"))
     if until is not None:
         key = "time" if until.startswith("@") else "duration"
-        time = until.removeprefix("@")
-        time = f"{time}s" if time[-1:].isdigit() else time
-        found.append(("--until", f"stop.{key}={json.dumps(time)}"))
+        found.append(("--until", f"stop.{key}={_time(until.removeprefix('@'))}"))
+    if last is not None:
+        found.append(("--last", f"record.last.duration={_time(last)}"))
     return found
+
+
+def _time(text: str) -> str:
+    return json.dumps(f"{text}s" if text[-1:].isdigit() else text)
 
 
 def _with_paths(words: Sequence[str], folder: Path) -> list[str]:

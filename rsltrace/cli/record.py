@@ -102,6 +102,12 @@ if TYPE_CHECKING:
     "job's policy. Threads get real-time priorities where permitted.",
 )
 @click.option(
+    "--last",
+    metavar="T",
+    help="With --native: keep only the last T seconds, in memory, and write them to a file at the "
+    "end, after a crash, and at SIGUSR1 (record: last: in a job).",
+)
+@click.option(
     "-q", "--quiet", is_flag=True, help="Show no progress and no log records of the nodes."
 )
 @click.option("--sample-states", is_flag=True, hidden=True)  # as the runs of ``verify`` do
@@ -124,6 +130,7 @@ def record(
     processes: bool,
     domain: int | None,
     policy: str | None,
+    last: str | None,
     quiet: bool,
     sample_states: bool,
 ) -> None:
@@ -146,8 +153,8 @@ def record(
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         skip_final_collection()
-    _check_options(native, executor, domain, policy, replay, seed, processes=processes)
-    changes = all_overrides(overrides, seed, until)
+    _check_options(native, executor, domain, policy, replay, seed, last, processes=processes)
+    changes = all_overrides(overrides, seed, until, last)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:
         guard = loaded.guard.model_copy(update={"pin": False})
@@ -200,6 +207,7 @@ def _check_options(
     policy: str | None,
     replay: Path | None,
     seed: int | None,
+    last: str | None,
     *,
     processes: bool,
 ) -> None:
@@ -208,6 +216,8 @@ def _check_options(
         raise click.UsageError("--replay and --seed have no effect on a native run: leave them out")
     if not native and (executor is not None or domain is not None or processes):
         raise click.UsageError("--executor, --processes and --domain need --native")
+    if not native and last is not None:
+        raise click.UsageError("--last needs --native")
     if not native and policy is not None:
         raise click.UsageError(
             "--policy needs --native; for a simulation use --set policy=rate_monotonic"

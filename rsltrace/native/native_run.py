@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from rsltrace.errors import RsltraceError, RunError, SetupError
-from rsltrace.job import Job
+from rsltrace.errors import JobError, RsltraceError, RunError, SetupError
+from rsltrace.job import Job, locate
 from rsltrace.native import support
+from rsltrace.native.last_seconds import LastSeconds, Programs
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
@@ -31,11 +35,15 @@ from rsltrace.simulation.loop.stop import Progress, Stop
 from rsltrace.simulation.middleware.events.failure import exception_text
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_NATIVE
 from rsltrace.trace.mcap.sink import unfinished_path
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 LOOK_EVERY_S = 0.01
 ENDS_WITHIN_S = 5.0
+_LOOK_FOR_LAST_S = 0.05
+"""Of a run that goes on for days: it is to cost little."""
+_TIMES = {"duration_ns", "time_ns", "timeout_ns"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +111,9 @@ class NativeRun:
         self.ending: Stop | None = None
         self.stopped = threading.Event()
         self.levels: dict[str, int] = {}
-        self.missing: list[str] = []
-        """What the trace lacks, or may lack."""
+        self.last: LastSeconds | None = None
+        self._missing: list[tuple[int, str]] = []
+        """Since when (steady) the trace lacks something, or may lack it."""
         self.begun_ns = 0
         self.ended_ns = 0
         self._lock = threading.Lock()
@@ -122,12 +131,23 @@ class NativeRun:
         self._conditions = conditions_of(self._stop_rules)
         if self.options.policy is not None and (refused := real_time_class()):
             self.note(f"{refused}; executors go by priorities all the same")
+        self._check_last()
         if without := support.ignored(self.job, self.options.policy):
             self.note(
                 f"a native run is not steered; without effect in the job: {', '.join(without)}"
             )
         for place in (output, unfinished_path(output)):
             check_output(self.job, place, None)
+
+    def _check_last(self) -> None:
+        """Raise ``JobError`` if the run cannot keep its last seconds only."""
+        seen = self.job.stop.model_fields_set - _TIMES
+        if self.job.record.last is not None and seen:
+            raise JobError(
+                "a run of which only the last seconds are kept is not looked at while it goes on: "
+                "end it by a time (duration, time, timeout) or Ctrl-C",
+                where=locate(self.job, ("stop", seen.pop())),
+            )
 
     def create(
         self,
@@ -136,25 +156,31 @@ class NativeRun:
         spans: SpanSource,
         described: Mapping[str, str],
         sources: Mapping[str, Path] | None = None,
+        programs: Programs | None = None,
         *,
         force: bool,
     ) -> None:
         """Create the trace, which ``spans`` come to. ``sources`` are the files of the user's code,
-        None if they are loaded here."""
-        job = self.job
-        policy = self.options.policy
-        discovery = "this machine" if self.options.domain_id is None else "as the environment says"
-        self.writer = stack.enter_context(
-            TraceWriter(output, force=force, events_per_segment=job.record.segment_events)
-        )
+        None if they are loaded here; ``programs`` keep their last seconds themselves."""
+        self._output = output
+        self._described = described, sources
         if self.observer.interrupt is not None:
             self.observer.interrupt(self.stop)
-        recorder = Recorder(self.writer, keep_payload=payload_filter(job))
         self.clocks = ClockPair.now()
-        write_job(self.writer, job)
-        self.writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
-        write_sources(self.writer, job, sources)
-        self.writer.add_metadata(
+        if self.job.record.last is not None:
+            spans = self._keep_last(stack, spans, programs)
+        self.writer = stack.enter_context(self._new_trace(output, force=force))
+        self.span_writer = self._span_writer(self.writer, spans)
+
+    def _new_trace(self, path: Path, *, force: bool) -> TraceWriter:
+        job, policy = self.job, self.options.policy
+        described, sources = self._described
+        discovery = "this machine" if self.options.domain_id is None else "as the environment says"
+        writer = TraceWriter(path, force=force, events_per_segment=job.record.segment_events)
+        write_job(writer, job)
+        writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
+        write_sources(writer, job, sources)
+        writer.add_metadata(
             METADATA_NATIVE,
             {
                 "mode": "native",
@@ -166,7 +192,77 @@ class NativeRun:
                 **({} if policy is None else {"policy": policy, "priorities": order()}),
             },
         )
-        self.span_writer = SpanWriter(spans, recorder, self.clocks, job.base_dir)
+        return writer
+
+    def _span_writer(self, writer: TraceWriter, spans: SpanSource) -> SpanWriter:
+        recorder = Recorder(writer, keep_payload=payload_filter(self.job))
+        look = None if self.last is None else self.last.look
+        return SpanWriter(spans, recorder, self.clocks, self.job.base_dir, look)
+
+    # -- only the last seconds ------------------------------------------------------------------
+
+    def _keep_last(
+        self, stack: ExitStack, spans: SpanSource, programs: Programs | None
+    ) -> LastSeconds:
+        spec = self.job.record.last
+        assert spec is not None
+        self.last = last = LastSeconds(
+            spec, spans, programs, payload_filter(self.job), self._keep_file
+        )
+        if threading.current_thread() is threading.main_thread():
+            before = signal.signal(signal.SIGUSR1, lambda *_: last.trigger("SIGUSR1", at_once=True))
+            stack.callback(signal.signal, signal.SIGUSR1, before)
+        self.note(
+            f"the last {format_seconds(spec.duration_ns)} s are kept: kill -USR1 {os.getpid()} "
+            "writes them to a file"
+        )
+        return last
+
+    def _keep_file(self, reason: str) -> None:
+        """Write the last seconds to a file of their own; the run goes on."""
+        if self.stopped.is_set():  # the end of the run is a file, too
+            return
+        assert self.last is not None
+        numbers = (self._output.with_stem(f"{self._output.stem}-{n}") for n in count(1))
+        path = next(path for path in numbers if not path.exists())
+        try:
+            with self._new_trace(path, force=False) as writer:
+                written = self._span_writer(writer, self.last)
+                written.write(None)
+                self._close_trace(writer, written, f"kept: {reason}", 0, 0)
+        except RsltraceError as error:
+            self.note(f"the last seconds are not kept: {error}")
+        else:
+            self.note(f"wrote {path}: {reason}")
+
+    def _close_trace(
+        self,
+        writer: TraceWriter,
+        written: SpanWriter,
+        reason: str,
+        exit_code: int,
+        ended_after: int,
+        more: Mapping[str, str] | None = None,
+    ) -> None:
+        now_ns, start_ns = time.monotonic_ns(), self.clocks.steady_ns
+        if self.last is not None:
+            start_ns = max(start_ns, self.last.since_ns)
+        missing = [text for at_ns, text in self._missing if at_ns >= start_ns]
+        missing += [] if self.last is None else self.last.missing
+        writer.close(
+            result={
+                "start_time": str(self.clocks.stamp(start_ns)),
+                "end_time": str(self.clocks.stamp(now_ns)),
+                "stop_reason": reason,
+                "exit_code": str(exit_code),
+                "ended_after": str(ended_after or written.count),
+                "observer_ns": str(written.observer_ns),
+                "unknown_causes": str(written.causes.unknown),
+                **(more or {}),
+                **({"missing": "; ".join(missing)} if missing else {}),
+            },
+            replace=self.begun_ns > 0 or exit_code == 0,
+        )
 
     def watch_stop_topics(self, on_message: dict[str, Any]) -> None:
         """Let messages end the run: ``on_message`` gets a function of bytes and class by topic."""
@@ -188,9 +284,16 @@ class NativeRun:
 
     def wait(self) -> Iterator[None]:
         """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
-        while not self.stopped.wait(LOOK_EVERY_S) and self.span_writer.error is None:
+        every_s = LOOK_EVERY_S if self.last is None else _LOOK_FOR_LAST_S
+        while not self.stopped.wait(every_s) and self.span_writer.error is None:
             yield
         self.ended_ns = time.monotonic_ns()
+        if self.last is not None:
+            self.last.ended_ns = self.ended_ns
+
+    def lacks(self, text: str) -> None:
+        """Take note of what the trace lacks, or may lack."""
+        self._missing.append((time.monotonic_ns(), text))
 
     def look(self, events: int, activity_ns: int) -> None:
         """End the run if it is time. ``activity_ns`` is when something was last sent, steady."""
@@ -233,22 +336,8 @@ class NativeRun:
         observer_ns = self.span_writer.observer_ns
         pen_ns = (self.span_writer.cpu_ns + spent.beside_ns) // max(events, 1)
         callback_ns = spent.callbacks_ns // max(events, 1)
-        self.writer.close(
-            result={
-                "start_time": str(self.clocks.wall_ns),
-                "end_time": str(self.clocks.stamp(time.monotonic_ns())),
-                "stop_reason": stop.reason,
-                "exit_code": str(exit_code),
-                "ended_after": str(ended_after),
-                "observer_ns": str(observer_ns),
-                "pen_ns": str(pen_ns),
-                "callback_ns": str(callback_ns),
-                "unknown_causes": str(self.span_writer.causes.unknown),
-                **self._levels(),
-                **({"missing": "; ".join(self.missing)} if self.missing else {}),
-            },
-            replace=self.begun_ns > 0 or exit_code == 0,
-        )
+        more = {"pen_ns": str(pen_ns), "callback_ns": str(callback_ns), **self._levels()}
+        self._close_trace(self.writer, self.span_writer, stop.reason, exit_code, ended_after, more)
         return NativeResult(
             path=self.writer.place,
             events=events,

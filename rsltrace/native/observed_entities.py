@@ -36,8 +36,6 @@ class ObservedEntity:
     gid: bytes = b""
     """A publisher's in the middleware, empty where nobody has asked."""
     sequence: count[int] = field(default_factory=lambda: count(1))
-    channel: int | None = None
-    """That of the trace, once something has been written to it."""
 
 
 class ObservedEntities:

@@ -7,6 +7,7 @@ import threading
 import time
 from array import array
 from collections import defaultdict, deque
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol
@@ -130,18 +131,27 @@ class SpanWriter(threading.Thread):
     """Takes spans from a source and writes them, until ``finish`` is called."""
 
     def __init__(
-        self, source: SpanSource, recorder: Recorder, clocks: ClockPair, base_dir: Path
+        self,
+        source: SpanSource,
+        recorder: Recorder,
+        clocks: ClockPair,
+        base_dir: Path,
+        look: Callable[[], None] | None = None,
     ) -> None:
+        """``look`` is called again and again if nothing is written before ``finish``."""
         super().__init__(name="rsltrace span writer", daemon=True)
         self._source = source
         self._recorder = recorder
         self._clocks = clocks
         self._base_dir = base_dir
+        self._look = look
         self._over = threading.Event()
         self.causes = CauseIndex()
         self.error: BaseException | None = None
         """Why nothing is written any more."""
         self._observer_ns = array("Q")
+        self._channels: dict[int, int] = {}
+        """Those of the trace, by the ids of entities that something was written of."""
         self.cpu_ns = 0
         """Processor time of this thread."""
 
@@ -159,6 +169,9 @@ class SpanWriter(threading.Thread):
         try:
             kept_ns = time.monotonic_ns()
             while not self._over.wait(_EVERY_S):
+                if self._look is not None:
+                    self._look()
+                    continue
                 self.write(CUT_AFTER_NS)
                 if time.monotonic_ns() - kept_ns >= _KEPT_EVERY_NS:
                     self._recorder.writer.flush()
@@ -242,19 +255,19 @@ class SpanWriter(threading.Thread):
         self._recorder.message(sent.kind, sent.entity.id, channel, stamp_ns, sent.data, sent.digest)
 
     def _channel(self, entity: ObservedEntity, prefix: str) -> int:
-        if entity.channel is None:
-            entity.channel = -1
+        if entity.id not in self._channels:
+            self._channels[entity.id] = -1
             topic, recorder = prefix + entity.name, self._recorder
             if entity.sends is not None and recorder.keep_payload(topic):
                 text, type_hash = entity.sends.describe()
-                entity.channel = recorder.writer.add_channel(
+                self._channels[entity.id] = recorder.writer.add_channel(
                     topic,
                     entity.sends.name,
                     text,
                     qos_yaml=entity.qos_yaml,
                     type_hash="" if prefix else type_hash,
                 )
-        return entity.channel
+        return self._channels[entity.id]
 
     def _logged(self, logged: EmittedLog, stamp_ns: int) -> None:
         record = logged.entity.sends_type(

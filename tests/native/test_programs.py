@@ -43,13 +43,13 @@ class Program:
         self.spans.add(Record(kind, self.now_ns, self.now_ns + WALL, thread, 0, fields))
 
     def take(self, thread: int = MAIN) -> None:
-        self.say(RecordKind.TAKE, struct.pack("<IQqq16sI", 3, 1, 0, 0, b"", 0), thread)
+        self.say(RecordKind.TAKE, struct.pack("<IQqq16sIQ", 3, 1, 0, 0, b"", 0, 9), thread)
 
     def call(self, thread: int = MAIN) -> None:
         self.say(RecordKind.CALL, struct.pack("<Iq", 4, 0), thread)
 
     def send(self, thread: int = MAIN) -> None:
-        self.say(RecordKind.SENDING, struct.pack("<IIqI", 2, 0, 1, 0) + b"data", thread)
+        self.say(RecordKind.SENDING, struct.pack("<IIqIQ", 2, 0, 1, 0, 9) + b"data", thread)
 
     def sent(self, is_sent: bool = True, thread: int = MAIN) -> None:
         self.say(RecordKind.SENT, struct.pack("<Iq", is_sent, 1), thread)

@@ -29,7 +29,7 @@ from rsltrace.guard.pin import MEMORY_NOISE
 
 SOURCES = Path(__file__).parent / "native"
 OBSERVER = (
-    Path(__file__).parent / "observer" / "observer.cpp",
+    *(Path(__file__).parent / "observer" / name for name in ("observer.cpp", "hash64.h")),
     *(SOURCES / name for name in ("qos.h", "typesupport.cpp", "typesupport.h", "wire.h")),
 )
 """The sources of the library that observes processes of native runs."""

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field, field_validator
 
 from rsltrace.job.parts.part import JobPart
-from rsltrace.job.values.checks import Globs, check, flag, whole
+from rsltrace.job.values.checks import Globs, check, flag, part, positive_time, whole
 from rsltrace.job.values.problem import JobProblem
 from rsltrace.job.values.target import Target, check_callable_target
+from rsltrace.job.values.times import TimeLike, parse_size
 from rsltrace.trace.model.event import SEGMENT_EVENTS
 
 # ``hooks:``: functions that are called around the construction of the nodes.
@@ -30,6 +31,51 @@ class HooksSpec(JobPart):
         "return more nodes.",
         examples=["my_robot.setup:wire"],
     )
+
+
+class LastSpec(JobPart):
+    """Native runs: keep only what happened last, in memory, and write it to a file when something
+    goes wrong."""
+
+    MEANT: ClassVar[str] = "duration"
+
+    duration_ns: Annotated[int, check(positive_time)] = Field(
+        alias="duration", description="How much time to keep.", examples=["30s"]
+    )
+    memory: Annotated[int, check(parse_size)] = Field(
+        default=64 << 20,
+        description="Memory for it, per process; what is older is dropped sooner if it is full.",
+        examples=["64MiB"],
+    )
+    largest: Annotated[int, check(parse_size)] = Field(
+        default=1 << 20,
+        description="Of larger messages keep only the hash.",
+        examples=["100kB"],
+    )
+    keep_on: Globs = Field(
+        default=(),
+        description="Topics and services, as globs: a message or request there writes a file.",
+        examples=[["/emergency_stop"]],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            duration: TimeLike | None = None,
+            duration_ns: int | None = None,
+            memory: int | str = ...,
+            largest: int | str = ...,
+            keep_on: Sequence[str] = (),
+        ) -> None: ...
+
+    @field_validator("memory")
+    @classmethod
+    def _enough(cls, value: int) -> int:
+        if not 1 << 20 <= value <= 1 << 36:
+            raise JobProblem("expected a size from 1MiB to 64GiB")
+        return value // 4096 * 4096
 
 
 class RecordSpec(JobPart):
@@ -55,6 +101,12 @@ class RecordSpec(JobPart):
         description="Events per segment, the most that a killed run loses. 1 is slow.",
         examples=[1],
     )
+    last: Annotated[LastSpec | None, part("duration")] = Field(
+        default=None,
+        description="Native runs: keep only the last seconds, in memory, and write them to a file "
+        "at the end, after a crash or exception, at SIGUSR1, and as `keep_on` says.",
+        examples=["30s", {"duration": "30s", "memory": "64MiB", "keep_on": ["/emergency_stop"]}],
+    )
 
     if TYPE_CHECKING:
 
@@ -65,6 +117,7 @@ class RecordSpec(JobPart):
             topics: Sequence[str] = ("*",),
             exclude: Sequence[str] = (),
             segment_events: int = SEGMENT_EVENTS,
+            last: LastSpec | TimeLike | None = None,
         ) -> None: ...
 
     @field_validator("topics")

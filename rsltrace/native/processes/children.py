@@ -72,6 +72,7 @@ class ObservedProcess(threading.Thread):
             )
         except OSError as error:
             raise JobError(f"{start.name} cannot be started: {error.strerror}") from error
+        self.number = self._process.pid
         self._link = Link(here)
         try:
             with suppress(BrokenPipeError, ConnectionResetError):  # has ended: that is noticed

@@ -6,6 +6,7 @@ the order of their times, and there even if the process is killed.
 
 from __future__ import annotations
 
+import heapq
 import mmap
 import struct
 import time
@@ -14,6 +15,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, auto
 from itertools import count
+from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +24,7 @@ from rsltrace.adapters.processes.wire import RecordReader
 from rsltrace.adapters.rclpy.messages.codec import codec_for
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class, message_type
 from rsltrace.errors import SetupError
+from rsltrace.job import Job
 from rsltrace.native.message_observer import channel_of
 from rsltrace.native.observed_entities import ObservedEntities, ObservedEntity
 from rsltrace.native.span_recorder import (
@@ -38,10 +41,24 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
+from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.native import CUT_AFTER_NS
 
 FOLDER = "RSLTRACE_OBSERVER"
 """The variable that tells the library where its file goes."""
+_SETTINGS = "RSLTRACE_OBSERVER_SETTINGS"
+_MEMORY = 32 << 20
+"""How much room a process has for what is read all the time."""
+
+
+def variables_of(job: Job, folder: Path) -> dict[str, str]:
+    """Return what a program's library has to know (``Settings`` in observer.cpp)."""
+    record, last = job.record, job.record.last
+    sizes = (_MEMORY, 0, _MEMORY) if last is None else (last.memory, 1, last.largest)
+    kept = record.topics if record.payloads else ()
+    lists = (("+", kept), ("-", record.exclude), ("!", () if last is None else last.keep_on))
+    names = (f"{mark}{name}" for mark, globs in lists for name in globs)
+    return {FOLDER: str(folder), _SETTINGS: "\n".join((" ".join(map(str, sizes)), *names))}
 
 
 class RecordKind(IntEnum):
@@ -66,10 +83,14 @@ class RecordKind(IntEnum):
     LOST = auto()
 
 
-_MAGIC = 0x31656361_72746C73
+_MAGIC = 0x32656361_72746C73
 _HEAD_SIZE = 4096
-_CAPACITY, _WRITTEN, _READ, _IS_WRITING, _LOST, _CPU_NS = range(1, 7)
+_CAPACITY, _WRITTEN, _READ, _IS_WRITING, _LOST, _CPU_NS, _RESERVED = range(1, 8)
+_MADE_WRITTEN, _MADE_READ, _TRIGGERED_NS, _TRIGGER, _ENDED, _STARTS = range(8, 14)
+_PARTS = 256
+_MADE_SIZE = 1 << 20
 _RECORD = struct.Struct("=IIqqII")
+_steady_ns = attrgetter("steady_ns")
 
 
 @dataclass(slots=True)
@@ -97,6 +118,10 @@ class RecordFile:
         path.unlink()  # it is there for as long as it is mapped
         self.until_ns = 0
         """There are no other records of before."""
+        self.overwritten = False
+        """Whether there were records before those that ``last`` has returned."""
+        self._made = bytearray()
+        """If only the last records are kept: all those that make entities."""
 
     @property
     def lost(self) -> int:
@@ -113,11 +138,8 @@ class RecordFile:
         """Take what there is, and make room for more."""
         head, at_ns = self._head, now_ns()
         is_quiet = not head[_IS_WRITING]
-        end, start = head[_WRITTEN], head[_READ]
-        place, size = start % head[_CAPACITY], end - start
-        first = min(size, head[_CAPACITY] - place)
-        begin = _HEAD_SIZE + place
-        data = self._map[begin : begin + first] + self._map[_HEAD_SIZE : _HEAD_SIZE + size - first]
+        end = head[_WRITTEN]
+        data = self._part(_HEAD_SIZE, head[_CAPACITY], head[_READ], end)
         head[_READ] = end
         records = list(_records(memoryview(data)))
         if is_quiet:
@@ -125,6 +147,61 @@ class RecordFile:
         elif records:
             self.until_ns = max(self.until_ns, records[-1].steady_ns)
         return records
+
+    def _part(self, begin: int, capacity: int, start: int, end: int) -> bytes:
+        """Return what lies between two counts of a ring."""
+        place, size = start % capacity, end - start
+        first = min(size, capacity - place)
+        at = begin + place
+        return self._map[at : at + first] + self._map[begin : begin + size - first]
+
+    # -- if only the last records are kept --------------------------------------------------------
+
+    @property
+    def triggered_ns(self) -> int:
+        """When a message came last that a file is to be written for, 0 if none did."""
+        return self._head[_TRIGGERED_NS]
+
+    @property
+    def trigger(self) -> str:
+        """The topic or service of that message."""
+        for record in _records(memoryview(bytes(self._made))):
+            if record.kind in _ENDS and record.fields.number() == self._head[_TRIGGER]:
+                record.fields.number()
+                return record.fields.text()
+        return ""
+
+    @property
+    def status(self) -> int | None:
+        """The exit status, None if the process has not ended by itself."""
+        ended = self._head[_ENDED]
+        return ended & 0xFF if ended else None
+
+    def read_made(self) -> None:
+        """Take what makes entities, and make room for more."""
+        head = self._head
+        start, end = head[_MADE_READ], head[_MADE_WRITTEN]
+        if start != end:
+            begin = _HEAD_SIZE + head[_CAPACITY]
+            self._made += self._part(begin, _MADE_SIZE, start, end)
+            head[_MADE_READ] = end
+
+    def last(self) -> tuple[list[Record], list[Record]]:
+        """Return the records that make entities, and of the others those that are left."""
+        self.read_made()
+        head = self._head
+        end, capacity = head[_WRITTEN], head[_CAPACITY]
+        starts = sorted({0, *head[_STARTS : _STARTS + _PARTS]})
+        begin = _first(starts, end - capacity, end)
+        data = self._part(_HEAD_SIZE, capacity, begin, end)
+        whole = _first(starts, head[_RESERVED] - capacity, end)  # others were written over
+        self.overwritten = whole > 0
+        left = memoryview(data)[max(whole - begin, 0) :]
+        return list(_records(memoryview(bytes(self._made)))), list(_records(left))
+
+
+def _first(starts: list[int], low: int, end: int) -> int:
+    return next((one for one in starts if low <= one < end), end)
 
 
 def _records(data: memoryview) -> Iterator[Record]:
@@ -162,9 +239,9 @@ _ACTION = "/_action/"
 _GID_SIZE = 16
 _TIMER = struct.Struct("<Iq")
 _POINTER = struct.Struct("<Q")
-_TAKEN = struct.Struct(f"<IQqq{_GID_SIZE}sI")
+_TAKEN = struct.Struct(f"<IQqq{_GID_SIZE}sIQ")
 _CALLED = struct.Struct("<Iq")
-_SENDING = struct.Struct("<IIqI")
+_SENDING = struct.Struct("<IIqIQ")
 _SENT = struct.Struct("<Iq")
 _GID = struct.Struct(f"{_GID_SIZE}s")
 _NO_NUMBER = 2**64 - 1
@@ -365,12 +442,11 @@ class ProgramSpans:
     # -- callbacks ------------------------------------------------------------------------------
 
     def _take(self, thread: _Thread, record: Record) -> None:
-        number, sequence, source_ns, ready_ns, gid, is_raw = record.fields.unpack(_TAKEN)
+        number, sequence, source_ns, ready_ns, gid, is_raw, digest = record.fields.unpack(_TAKEN)
         entity = self._entities.get(number)
         if entity is None:
             return
-        data = self._data(record.fields, entity.takes_type if is_raw else None)
-        digest = hash64(data) if data else 0
+        _, digest = self._content(record.fields, entity.takes_type if is_raw else None, digest)
         taken = ReceivedInput(
             entity,
             digest,
@@ -430,6 +506,14 @@ class ProgramSpans:
         recorder.end()
         recorder.steady_ns = at_ns
 
+    def begin_late(self) -> None:
+        """Take note that what follows is not what came next."""
+        self._missing()
+        for thread in self._threads.values():
+            self.recorder.enter(thread.local)
+            if (running := self.recorder.current()) is not None and running.entity is not None:
+                self.recorder.pause(running.entity)
+
     def _missing(self) -> None:
         """End everything: nobody knows what has come in between."""
         for thread in self._threads.values():
@@ -442,11 +526,12 @@ class ProgramSpans:
     # -- what is sent ---------------------------------------------------------------------------
 
     def _sending(self, thread: _Thread, record: Record) -> None:
-        number, kind, sequence, is_raw = record.fields.unpack(_SENDING)
+        number, kind, sequence, is_raw, digest = record.fields.unpack(_SENDING)
         entity = self._entities.get(number)
         if entity is None:
             return
-        data = self._data(record.fields, entity.sends_type if is_raw else None)
+        raw_type = entity.sends_type if is_raw else None
+        data, digest = self._content(record.fields, raw_type, digest)
         if entity.name == TOPIC_ROSOUT and entity.sends_type is self._log_type and data:
             log = codec_for(self._log_type).deserialize(data)
             self.recorder.add(
@@ -455,7 +540,6 @@ class ProgramSpans:
             return
         span = self.recorder.sending()
         span.observer_ns += record.spent_ns
-        digest = hash64(data) if data else 0
         sent = SentMessage(int(_SENDS[kind]), entity, digest, data, sequence, 0, record.wall_ns)
         thread.sending = span, sent, record.steady_ns
 
@@ -469,14 +553,16 @@ class ProgramSpans:
         if thread.frames and thread.frames[-1].ended_ns:  # a response leaves after the callback
             thread.frames[-1].ended_ns = self.recorder.steady_ns
 
-    def _data(self, fields: RecordReader, type: Any) -> bytes:
-        """Return a message as canonical CDR, which it is but for what the user has written."""
+    def _content(self, fields: RecordReader, type: Any, digest: int) -> tuple[bytes, int]:
+        """Return a message, if it is kept, and its hash: of canonical CDR, which it is but for what
+        the user has written."""
         data = fields.rest()
         if data and type is not None:
             with suppress(ValueError):  # the user's bytes may be none of this type
                 data = codec_for(type).canonical(data)
-        self.unreadable += not data
-        return data
+                digest = hash64(data)
+        self.unreadable += not digest
+        return data, digest
 
 
 def _type(name: str) -> tuple[Any, MessageType]:
@@ -498,18 +584,82 @@ class ObservedProgram:
         self._name = name
         self._folder = folder
         self._numbers = ids, threads
+        self.own = 0
+        """The number of the process that was started, of whose end the run knows."""
         self._files: dict[Path, tuple[RecordFile, ProgramSpans]] = {}
         self._early: list[CallbackSpan] = []
         self._cpu_ns: dict[Path, int] = {}
+        self._ended_ns: dict[Path, int] = {}
+        self._triggered_ns: dict[Path, int] = {}
+
+    def look(self, since_ns: int) -> Iterator[tuple[int, str]]:
+        """If only the last records are kept: yield times and reasons to write a file, and forget
+        what ended before ``since_ns``."""
+        self._open()
+        for path, (file, _) in list(self._files.items()):
+            file.read_made()
+            if file.triggered_ns > self._triggered_ns.get(path, 0):
+                self._triggered_ns[path] = file.triggered_ns
+                yield file.triggered_ns, f"a message on {file.trigger}"
+            if path in self._ended_ns:
+                if self._ended_ns[path] < since_ns:
+                    for known in (self._files, self._ended_ns, self._triggered_ns):
+                        known.pop(path, None)
+            elif not file.cpu_ns(int(path.stem)):
+                self._ended_ns[path] = now_ns()
+                if file.status != 0 and int(path.stem) != self.own:
+                    how = "was killed" if file.status is None else f"exit status {file.status}"
+                    yield now_ns(), f"the end of process {path.stem} of {self._name}: {how}"
+
+    @property
+    def is_forgotten(self) -> bool:
+        """Whether nothing is left of its processes."""
+        return not self._files
+
+    def last(self, since_ns: int) -> tuple[list[CallbackSpan], list[str]]:
+        """Return the spans that are kept, and what is missing of those since then."""
+        self._open()
+        found: list[CallbackSpan] = []
+        missing = []
+        for path, (file, _) in list(self._files.items()):
+            at_ns = now_ns()
+            made, left = file.last()
+            if path in self._ended_ns:
+                at_ns = max((one[-1].steady_ns for one in (made, left) if one), default=at_ns)
+            spans = ProgramSpans(self._name, int(path.stem), *self._numbers)
+            start_ns = left[0].steady_ns if left else at_ns
+            before = [record for record in made if record.steady_ns < start_ns]
+            for record in before:
+                spans.add(record)
+            if file.overwritten:
+                spans.begin_late()
+                if start_ns > since_ns:
+                    kept_s = format_seconds(at_ns - start_ns)
+                    missing.append(
+                        f"of {self._name}, all but the last {kept_s} s: its memory is full"
+                    )
+            for record in heapq.merge(made[len(before) :], left, key=_steady_ns):
+                spans.add(record)
+            found += spans.finished(at_ns, None)[0]
+            if file.lost:
+                missing.append(f"{file.lost} records of {self._name}, for which there was no room")
+            if file.status is None and path in self._ended_ns and int(path.stem) != self.own:
+                missing.append(
+                    f"of {self._name}, which was killed, what each thread was just doing"
+                )
+        return found, missing
+
+    def _open(self) -> None:
+        for path in sorted(set(self._folder.iterdir()) - self._files.keys()):
+            with suppress(OSError, ValueError):
+                spans = ProgramSpans(self._name, int(path.stem), *self._numbers)
+                self._files[path] = RecordFile(path), spans
 
     def read(self, *, is_over: bool) -> tuple[list[CallbackSpan], int]:
         """Return the spans that are new, in order, and up to when these are all. ``is_over``: the
         processes are no more."""
         until_ns = now_ns()
-        for path in sorted(set(self._folder.iterdir()) - self._files.keys()):
-            with suppress(OSError, ValueError):
-                spans = ProgramSpans(self._name, int(path.stem), *self._numbers)
-                self._files[path] = RecordFile(path), spans
+        self._open()
         found = self._early
         for path, (file, spans) in self._files.items():
             for record in file.read():

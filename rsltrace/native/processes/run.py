@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import signal
 import threading
 import time
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
@@ -19,7 +21,7 @@ from rsltrace.adapters.rclpy.boundary.installation import native_extension
 from rsltrace.adapters.rclpy.entry import StartRule
 from rsltrace.adapters.rclpy.messages.interfaces import get_message_class
 from rsltrace.child_processes import how_ended
-from rsltrace.errors import NodeError, RsltraceError, RunError
+from rsltrace.errors import JobError, NodeError, RsltraceError, RunError
 from rsltrace.native.callback_observer import EXECUTORS
 from rsltrace.native.native_run import (
     ENDS_WITHIN_S,
@@ -30,7 +32,7 @@ from rsltrace.native.native_run import (
 )
 from rsltrace.native.processes.children import ObservedProcess, ProcessStart
 from rsltrace.native.processes.plans import start_rules, starts_of
-from rsltrace.native.processes.programs import FOLDER, ObservedProgram
+from rsltrace.native.processes.programs import ObservedProgram, variables_of
 from rsltrace.native.processes.wire import EntryOrder, Frame, SpanDecoder
 from rsltrace.native.span_recorder import CallbackSpan, SentMessage, now_ns
 from rsltrace.native.support import check_loopback, domain
@@ -196,7 +198,19 @@ _KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
 Counts = tuple[int, int, int, int, int]
 """Of a process: its events, when it was last active (steady), messages that could not be read,
 its processor time, and that of telling of it."""
+_SHARED_MEMORY = Path("/dev/shm")
+_ROOM = 1 << 30
+"""As much has to be free there."""
 _QUIET_ENDS = ("KeyboardInterrupt", "ExternalShutdownException")
+
+
+def _memory_folder() -> Path | None:
+    """Return where files are memory only, None if there is no room: a disk would be written to all
+    the time."""
+    with suppress(OSError):
+        if shutil.disk_usage(_SHARED_MEMORY).free >= _ROOM and os.access(_SHARED_MEMORY, os.W_OK):
+            return _SHARED_MEMORY
+    return None
 
 
 class MultiProcessRun(NativeRun):
@@ -210,7 +224,8 @@ class MultiProcessRun(NativeRun):
         self._ids, self._threads = count(1), count(1)
         self._told: dict[ObservedProcess, tuple[SpanDecoder, ProcessSpans]] = {}
         self._programs: dict[ObservedProcess, ObservedProgram] = {}
-        self._folder = Path(stack.enter_context(TemporaryDirectory(prefix="rsltrace-")))
+        folder = TemporaryDirectory(prefix="rsltrace-", dir=_memory_folder())
+        self._folder = Path(stack.enter_context(folder))
         self._counts: dict[ObservedProcess, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
@@ -221,6 +236,13 @@ class MultiProcessRun(NativeRun):
         self._log_type = get_message_class("rcl_interfaces/msg/Log")
         self.prepare(output)
         self._rules = start_rules(self.job)
+        if self.job.record.last is not None and any(
+            rule.topic or rule.service or rule.node for rule in self._rules.values()
+        ):
+            raise JobError(
+                "a run of which only the last seconds are kept is not looked at while it goes on: "
+                "start_after takes only started, ended and delay there"
+            )
         if self.options.domain_id is None:
             check_loopback()
         number = stack.enter_context(domain(self.options.domain_id))
@@ -250,7 +272,7 @@ class MultiProcessRun(NativeRun):
                 f"not observed: {', '.join(unobserved)}; what these send is seen where it arrives, "
                 "and its cause is unknown"
             )
-        self.create(stack, output, self.merge, described, self._sources, force=force)
+        self.create(stack, output, self.merge, described, self._sources, self, force=force)
         self.watch_stop_topics(self._on_message)
 
     def _start(self, start: ProcessStart) -> ObservedProcess:
@@ -258,11 +280,12 @@ class MultiProcessRun(NativeRun):
         if order.environment is not None:
             folder = self._folder / str(len(self.children))
             folder.mkdir()
-            variables = {**order.environment, FOLDER: str(folder)}
+            variables = {**order.environment, **variables_of(self.job, folder)}
             start = replace(start, order=replace(order, environment=variables))
             program = ObservedProgram(start.name, folder, self._ids, self._threads)
         child = ObservedProcess(start, self._hear, self._ended)
         if program is not None:
+            program.own = child.number
             self._programs[child] = program
         self.children.append(child)
         return child
@@ -322,14 +345,14 @@ class MultiProcessRun(NativeRun):
     def _look_at(self, child: ObservedProcess, *, is_over: bool = False) -> None:
         """Take what a program has done."""
         program = self._programs.get(child)
-        if program is None or child not in self._told:
+        if program is None or child not in self._told or self.last is not None:
             return
         try:
             found, until_ns = program.read(is_over=is_over)
         except Exception as error:
             del self._programs[child]
             self.merge.end(self._told[child][1])
-            self.missing.append(f"what {child.what.name} did from {self._at} s on: {error}")
+            self.lacks(f"what {child.what.name} did from {self._at} s on: {error}")
             return
         self._counts[child] = program.counts
         self._add(self._told[child][1], found, until_ns)
@@ -399,6 +422,8 @@ class MultiProcessRun(NativeRun):
             if self._refusal is None:
                 self._refusal = RunError(f"the process of {what.name} {how} before it began")
             return
+        if self.last is not None and status:
+            self.last.trigger(f"{what.name} {how}")
         if what.respawn is not None and self._restart(what):
             self.notes.append(f"{what.name} {how} at {self._at} s, and was started again")
         elif (status < 0 or (status > 0 and what.order.command)) and not what.may_fail:
@@ -415,15 +440,15 @@ class MultiProcessRun(NativeRun):
     def _look_for_missing(self, child: ObservedProcess, status: int) -> None:
         """Take note of what the trace lacks, or may lack, of a process that has ended."""
         name, program = child.what.name, self._programs.get(child)
-        if program is not None and program.lost:
-            self.missing.append(f"{program.lost} records of {name}, for which there was no room")
+        if program is not None and program.lost and self.last is None:
+            self.lacks(f"{program.lost} records of {name}, for which there was no room")
         if program is not None and program.unobserved:
-            self.missing.append(
+            self.lacks(
                 f"{program.unobserved} processes of {name}: no room for files in {self._folder}"
             )
         if child.has_begun and status < 0 and status != -signal.SIGINT:
             what = "the last 50 ms" if program is None else "what each thread was just doing"
-            self.missing.append(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+            self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
 
     @property
     def _at(self) -> str:
@@ -438,6 +463,29 @@ class MultiProcessRun(NativeRun):
             self._restarted[what.key] += 1
             self._restarts.append((time.monotonic_ns() + delay_ns, what))
         return True
+
+    # -- if only the last seconds are kept --------------------------------------------------------
+
+    def look_at_programs(self, since_ns: int) -> Iterator[tuple[int, str]]:
+        """Look at the programs (``last_seconds.Programs``)."""
+        for child, program in list(self._programs.items()):
+            yield from program.look(since_ns)
+            if child.is_over and program.is_forgotten:
+                del self._programs[child]
+
+    def last_of_programs(self, since_ns: int) -> tuple[list[CallbackSpan], list[str]]:
+        """Return what programs keep, and what is missing of it."""
+        spans: list[CallbackSpan] = []
+        missing: list[str] = []
+        for child, program in list(self._programs.items()):
+            try:
+                found, lost = program.last(since_ns)
+            except Exception as error:
+                missing.append(f"what {child.what.name} did: {error}")
+            else:
+                spans += found
+                missing += lost
+        return spans, missing
 
     # -- the run --------------------------------------------------------------------------------
 
@@ -462,6 +510,8 @@ class MultiProcessRun(NativeRun):
     def _go(self, child: ObservedProcess) -> None:
         reader = SpanDecoder(self._ids, self._threads, self._log_type)
         self._told[child] = reader, self.merge.source()
+        if self.last is not None and child in self._programs:  # nothing comes before its end
+            self.merge.end(self._told[child][1])
         child.go()
 
     def _start_again(self) -> None:

@@ -3,6 +3,7 @@
 // the process, however that ends. The other side is rsltrace/native/processes/programs.py.
 #include <dlfcn.h>
 #include <fcntl.h>
+#include <fnmatch.h>
 #include <pthread.h>
 #include <rcl/node.h>
 #include <rcl/service.h>
@@ -22,11 +23,13 @@
 #include <memory>
 #include <mutex>
 #include <shared_mutex>
+#include <sstream>
 #include <unordered_map>
 
 #include "../native/qos.h"
 #include "../native/typesupport.h"
 #include "../native/wire.h"
+#include "hash64.h"
 
 #define EXPORT extern "C" __attribute__((visibility("default")))
 
@@ -88,6 +91,12 @@ void *real(const char *name) {
 // What is written goes around in a ring behind the head; all counts only grow. `is_writing` is set
 // before the time of a record is read and cleared once it is there: who finds it clear sees all
 // records of before.
+//
+// If only the last records are kept, what makes entities is in a ring of its own behind the other
+// one, which is read all the time; in the other one new records take the place of the oldest.
+// `reserved` says before they do; `starts` is where the first record of each part of it begins.
+constexpr std::size_t PARTS = 256;
+
 struct Head {
   std::uint64_t magic;
   std::uint64_t capacity;
@@ -96,12 +105,51 @@ struct Head {
   std::atomic<std::uint64_t> is_writing;
   std::atomic<std::uint64_t> lost;
   std::int64_t cpu_ns;  // processor time before all records: of what has become this program
+  std::atomic<std::uint64_t> reserved;
+  std::atomic<std::uint64_t> made_written;
+  std::atomic<std::uint64_t> made_read;
+  std::atomic<std::int64_t> triggered_ns;  // the last message that the last records are kept for
+  std::atomic<std::uint64_t> trigger;      // the id of whoever sent or got it
+  std::atomic<std::uint64_t> ended;        // ENDED and the exit status, unless it was killed
+  std::atomic<std::uint64_t> starts[PARTS];
 };
 
-constexpr std::uint64_t MAGIC = 0x31656361'72746c73;
+constexpr std::uint64_t MAGIC = 0x32656361'72746c73;
 constexpr std::size_t HEAD = 4096;
-constexpr std::uint64_t CAPACITY = 32 << 20;
-constexpr std::size_t LARGEST = CAPACITY / 4;
+constexpr std::size_t MADE = 1 << 20;
+constexpr std::uint64_t ENDED = 0x100;
+static_assert(sizeof(Head) <= HEAD);
+
+// What the run wants: "capacity, whether only the last records are kept, the largest message whose
+// bytes are kept", then names of topics and services, a line each: +those whose messages are kept,
+// -those whose are not, !those for which the last records are kept.
+struct Settings {
+  std::size_t capacity = 32 << 20;
+  bool keeps_last = false;
+  std::size_t largest = 8 << 20;
+  std::vector<std::string> names;
+
+  Settings() {
+    const char *given = std::getenv("RSLTRACE_OBSERVER_SETTINGS");
+    if (given == nullptr) return;
+    std::istringstream text(given);
+    text >> capacity >> keeps_last >> largest;
+    largest = std::min(largest, capacity / 4);
+    for (std::string name; std::getline(text, name);)
+      if (!name.empty()) names.push_back(name);
+  }
+
+  bool has(char mark, const char *name) const {
+    return std::any_of(names.begin(), names.end(), [=](const std::string &one) {
+      return one[0] == mark && fnmatch(one.c_str() + 1, name, 0) == 0;
+    });
+  }
+};
+
+const Settings &settings() {
+  static const auto *made = new Settings;
+  return *made;
+}
 
 struct RecordHead {
   std::uint32_t size;
@@ -110,6 +158,25 @@ struct RecordHead {
   std::int64_t wall_ns;  // read after it: what begins and ends by the one lasts longer than by the other
   std::uint32_t thread;
   std::uint32_t spent_ns;  // by this library for this record
+};
+
+// The fields of a record of known size, without memory from the heap.
+class Fields {
+ public:
+  template <typename Number>
+  void number(Number value) {
+    raw(&value, sizeof value);
+  }
+  void raw(const void *data, std::size_t size) {
+    std::memcpy(bytes_ + size_, data, size);
+    size_ += size;
+  }
+  const std::uint8_t *data() const { return bytes_; }
+  std::size_t size() const { return size_; }
+
+ private:
+  std::uint8_t bytes_[80];
+  std::size_t size_ = 0;
 };
 
 bool is_forked = false;
@@ -125,17 +192,22 @@ class Ring {
         std::string(folder) + "/" + std::to_string(getpid()) + "." + std::to_string(now_ns());
     const int file = open(path.c_str(), O_RDWR | O_CREAT | O_EXCL | O_CLOEXEC, 0600);
     if (file < 0) return;
+    const std::size_t capacity = settings().capacity;
+    const std::size_t size = HEAD + capacity + (settings().keeps_last ? MADE : 0);
     // Not sparse: on a full disk a process would be killed as it writes.
-    if (posix_fallocate(file, 0, HEAD + CAPACITY) == 0) {
-      void *found = mmap(nullptr, HEAD + CAPACITY, PROT_READ | PROT_WRITE,
-                         MAP_SHARED | MAP_POPULATE, file, 0);
+    if (posix_fallocate(file, 0, static_cast<off_t>(size)) == 0) {
+      void *found =
+          mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_POPULATE, file, 0);
       if (found != MAP_FAILED) {
         head_ = static_cast<Head *>(found);
-        head_->capacity = CAPACITY;
+        head_->capacity = capacity;
         head_->cpu_ns = now_ns(CLOCK_PROCESS_CPUTIME_ID);
         std::atomic_thread_fence(std::memory_order_seq_cst);
         head_->magic = MAGIC;
         pthread_atfork(nullptr, nullptr, [] { is_forked = true; });  // the file is its parent's
+        on_exit([](int status, void *head) {
+          if (!is_forked) static_cast<Head *>(head)->ended.store(ENDED | (status & 0xff));
+        }, head_);
       }
     }
     close(file);
@@ -143,48 +215,69 @@ class Ring {
 
   bool is_open() const { return head_ != nullptr && !is_forked; }
 
-  void add(Kind kind, const Writer &body, std::int64_t begun_ns) {
+  void add(Kind kind, const void *fields, std::size_t fields_size, std::int64_t begun_ns,
+           const void *data = nullptr, std::size_t data_size = 0) {
     is_active = kind != Kind::WAIT;
     static thread_local const auto thread = static_cast<std::uint32_t>(syscall(SYS_gettid));
     const std::lock_guard<std::mutex> lock(lock_);
     head_->is_writing.store(1);
-    if (lost_ > 0) {  // what follows lacks something
-      Writer count;
-      count.number(lost_);
-      if (put(Kind::LOST, count, thread, 0)) lost_ = 0;
+    const bool is_made = settings().keeps_last && kind <= Kind::NAME;
+    if (lost_ > 0 && !is_made) {  // what follows lacks something
+      if (put(Kind::LOST, thread, 0, &lost_, sizeof lost_, nullptr, 0)) lost_ = 0;
     }
-    if (lost_ > 0 || !put(kind, body, thread, begun_ns)) {
+    if ((lost_ > 0 && !is_made) || !put(kind, thread, begun_ns, fields, fields_size, data, data_size)) {
       ++lost_;
       head_->lost.fetch_add(1);
     }
-    head_->is_writing.store(0);
+    head_->is_writing.store(0, std::memory_order_release);
+  }
+
+  void trigger(std::uint32_t id) {
+    head_->trigger.store(id);
+    head_->triggered_ns.store(now_ns());
   }
 
  private:
-  bool put(Kind kind, const Writer &body, std::uint32_t thread, std::int64_t begun_ns) {
-    const std::size_t size = (sizeof(RecordHead) + body.bytes.size() + 7) / 8 * 8;
-    const std::uint64_t at = head_->written.load();
-    if (at + size - head_->read.load() > CAPACITY) return false;
+  bool put(Kind kind, std::uint32_t thread, std::int64_t begun_ns, const void *fields,
+           std::size_t fields_size, const void *data, std::size_t data_size) {
+    const std::size_t whole = sizeof(RecordHead) + fields_size + data_size;
+    const std::size_t size = (whole + 7) / 8 * 8;
+    const bool keeps_last = settings().keeps_last, is_made = keeps_last && kind <= Kind::NAME;
+    auto *ring = reinterpret_cast<std::uint8_t *>(head_) + HEAD + (is_made ? head_->capacity : 0);
+    const std::size_t capacity = is_made ? MADE : head_->capacity;
+    auto &written = is_made ? head_->made_written : head_->written;
+    const auto &read = is_made ? head_->made_read : head_->read;
+    const std::uint64_t at = written.load(std::memory_order_relaxed);
+    if (!keeps_last || is_made) {
+      if (at + size - read.load() > capacity) return false;
+    } else {
+      head_->reserved.store(at + size);
+      const std::size_t part = at / (capacity / PARTS) % PARTS;
+      if (part != part_) head_->starts[part].store(at);
+      part_ = part;
+    }
     const std::int64_t steady_ns = now_ns(), wall_ns = now_ns(CLOCK_REALTIME);
     const std::int64_t spent_ns = begun_ns == 0 ? 0 : steady_ns - begun_ns;
-    const RecordHead record{static_cast<std::uint32_t>(sizeof(RecordHead) + body.bytes.size()), kind,
-                            steady_ns, wall_ns, thread, static_cast<std::uint32_t>(spent_ns)};
-    copy(at, &record, sizeof record);
-    copy(at + sizeof record, body.bytes.data(), body.bytes.size());
-    head_->written.store(at + size);
+    const RecordHead record{static_cast<std::uint32_t>(whole), kind, steady_ns, wall_ns, thread,
+                            static_cast<std::uint32_t>(spent_ns)};
+    std::uint64_t next = at;
+    const auto copy = [&](const void *from, std::size_t count) {
+      const std::size_t place = next % capacity, first = std::min(count, capacity - place);
+      std::memcpy(ring + place, from, first);
+      std::memcpy(ring, static_cast<const std::uint8_t *>(from) + first, count - first);
+      next += count;
+    };
+    copy(&record, sizeof record);
+    copy(fields, fields_size);
+    if (data_size > 0) copy(data, data_size);
+    written.store(at + size, std::memory_order_release);
     return true;
-  }
-
-  void copy(std::uint64_t at, const void *data, std::size_t size) {
-    auto *ring = reinterpret_cast<std::uint8_t *>(head_) + HEAD;
-    const std::size_t place = at % CAPACITY, first = std::min<std::size_t>(size, CAPACITY - place);
-    std::memcpy(ring + place, data, first);
-    std::memcpy(ring, static_cast<const std::uint8_t *>(data) + first, size - first);
   }
 
   Head *head_ = nullptr;
   std::mutex lock_;
   std::uint64_t lost_ = 0;  // since the last record that had room
+  std::size_t part_ = PARTS;
 };
 
 // Made with the first node, and never destroyed: what runs at the process's end may still send.
@@ -193,13 +286,22 @@ Ring &ring() {
   return *made;
 }
 
-void add(Kind kind, const Writer &body, std::int64_t begun_ns) { ring().add(kind, body, begun_ns); }
+void add(Kind kind, const Fields &fields, std::int64_t begun_ns = 0, const Data *data = nullptr) {
+  if (data == nullptr) return ring().add(kind, fields.data(), fields.size(), begun_ns);
+  ring().add(kind, fields.data(), fields.size(), begun_ns, data->data(), data->size());
+}
+
+void add(Kind kind, const Writer &body) {
+  ring().add(kind, body.bytes.data(), body.bytes.size(), 0);
+}
 
 // -- what there is ------------------------------------------------------------------------------
 
 struct Entity {
   std::uint32_t id = 0;
   bool has_type = false;
+  bool keeps_data = true;
+  bool is_trigger = false;
   MessageCodec type;        // of a topic, or of requests
   MessageCodec other_type;  // of responses
   std::atomic<std::uint64_t> sent{0};
@@ -230,10 +332,14 @@ void remember(const void *handle, const Found &entity) {
   entities()[handle] = entity;
 }
 
-Found new_entity(const void *handle) {
+Found new_entity(const void *handle, const char *name = nullptr) {
   static std::atomic<std::uint32_t> last{0};
   auto made = std::make_shared<Entity>();
   made->id = ++last;
+  if (name != nullptr) {
+    made->keeps_data = settings().has('+', name) && !settings().has('-', name);
+    made->is_trigger = settings().has('!', name);
+  }
   remember(handle, made);
   return made;
 }
@@ -254,11 +360,11 @@ void made(Kind kind, const void *node, const char *name, const std::string &type
   body.text(type);
   write_qos(body, qos);
   body.raw(gid == nullptr ? none : gid, RMW_GID_STORAGE_SIZE);
-  add(kind, body, now_ns());
+  add(kind, body);
 }
 
-Found topic_end(const void *handle, const rosidl_message_type_support_t *type) {
-  const Found entity = new_entity(handle);
+Found topic_end(const void *handle, const rosidl_message_type_support_t *type, const char *name) {
+  const Found entity = new_entity(handle, name);
   entity->has_type = entity->type.find(type);
   if (!entity->has_type) rmw_reset_error();
   return entity;
@@ -269,7 +375,7 @@ Handle *service_end(Kind kind, Handle *handle, const rmw_node_t *node,
                     const rosidl_service_type_support_t *type, const char *name,
                     const rmw_qos_profile_t *qos) {
   if (handle == nullptr || !ring().is_open()) return handle;
-  const Found entity = new_entity(handle);
+  const Found entity = new_entity(handle, name);
   rsltrace::ServiceCodec codec;
   entity->has_type = codec.find(type);
   if (!entity->has_type) rmw_reset_error();
@@ -279,10 +385,11 @@ Handle *service_end(Kind kind, Handle *handle, const rmw_node_t *node,
   return handle;
 }
 
-Data bytes_of(const Entity &entity, const MessageCodec &type, const void *message) {
-  Data data;
-  if (!entity.has_type) return data;
-  if (!type.serialize(message, data)) {
+// The buffer is this thread's, for one message at a time.
+const Data &bytes_of(const Entity &entity, const MessageCodec &type, const void *message) {
+  static thread_local Data data;
+  data.clear();
+  if (entity.has_type && !type.serialize(message, data)) {
     rmw_reset_error();
     data.clear();
   }
@@ -294,9 +401,15 @@ Data bytes_of(const rmw_serialized_message_t &message) {
   return {message.buffer, message.buffer + message.buffer_length};
 }
 
-void add_data(Writer &body, const Data &data, bool is_raw) {
-  body.number(static_cast<std::uint32_t>(is_raw));
-  if (data.size() <= LARGEST) body.raw(data.data(), data.size());
+void add_message(Kind kind, Fields &fields, const Entity &entity, const Data &data, bool is_raw,
+                 std::int64_t begun_ns) {
+  // What is taken has been sent, with its bytes; the user's may have others.
+  const bool has_data = (is_raw || (kind == Kind::SENDING && entity.keeps_data)) &&
+                        data.size() <= settings().largest;
+  fields.number(static_cast<std::uint32_t>(is_raw && has_data));
+  fields.number(data.empty() ? UINT64_C(0) : rsltrace::hash64(data.data(), data.size()));
+  add(kind, fields, begun_ns, has_data ? &data : nullptr);
+  if (entity.is_trigger) ring().trigger(entity.id);
 }
 
 // -- what happens -------------------------------------------------------------------------------
@@ -308,18 +421,16 @@ enum class Sent : std::uint32_t { MESSAGE, REQUEST, RESPONSE };
 template <typename Send>
 rmw_ret_t send(Sent kind, const Found &from, const Data &data, bool is_raw, std::int64_t begun_ns,
                const std::int64_t *number, Send really) {
-  Writer body;
-  body.number(from->id);
-  body.number(static_cast<std::uint32_t>(kind));
-  body.number(kind == Sent::REQUEST ? INT64_C(0) : *number);
-  add_data(body, data, is_raw);
-  add(Kind::SENDING, body, begun_ns);
+  Fields fields;
+  fields.number(from->id);
+  fields.number(static_cast<std::uint32_t>(kind));
+  fields.number(kind == Sent::REQUEST ? INT64_C(0) : *number);
+  add_message(Kind::SENDING, fields, *from, data, is_raw, begun_ns);
   const rmw_ret_t status = really();
-  const std::int64_t after_ns = now_ns();
-  Writer end;
+  Fields end;
   end.number(static_cast<std::uint32_t>(status == RMW_RET_OK));
   end.number(*number);
-  add(Kind::SENT, end, after_ns);
+  add(Kind::SENT, end);
   return status;
 }
 
@@ -335,14 +446,13 @@ rmw_ret_t publish(const Found &from, const Data &data, bool is_raw, std::int64_t
 void took(const Found &by, std::uint64_t number, std::int64_t source_ns, std::int64_t received_ns,
           const std::uint8_t *gid, const Data &data, bool is_raw, std::int64_t begun_ns) {
   const std::uint8_t none[RMW_GID_STORAGE_SIZE] = {};
-  Writer body;
-  body.number(by->id);
-  body.number(number);
-  body.number(source_ns);
-  body.number(received_ns);
-  body.raw(gid == nullptr ? none : gid, RMW_GID_STORAGE_SIZE);
-  add_data(body, data, is_raw);
-  add(Kind::TAKE, body, begun_ns);
+  Fields fields;
+  fields.number(by->id);
+  fields.number(number);
+  fields.number(source_ns);
+  fields.number(received_ns);
+  fields.raw(gid == nullptr ? none : gid, RMW_GID_STORAGE_SIZE);
+  add_message(Kind::TAKE, fields, *by, data, is_raw, begun_ns);
 }
 
 void took(const Found &by, const rmw_message_info_t &info, const Data &data, bool is_raw,
@@ -358,25 +468,25 @@ void took(const Found &by, const rmw_service_info_t &info, const Data &data, std
 
 void bracket(Kind kind, const void *callback) {
   if (!ring().is_open()) return;
-  Writer body;
-  body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
-  add(kind, body, now_ns());
+  Fields fields;
+  fields.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
+  add(kind, fields);
 }
 
 // The callback at an address is an entity's.
 void belongs(const void *callback, const Found &entity) {
   if (entity == nullptr) return;
-  Writer body;
-  body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
-  body.number(entity->id);
-  add(Kind::CALLBACK, body, now_ns());
+  Fields fields;
+  fields.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
+  fields.number(entity->id);
+  add(Kind::CALLBACK, fields);
 }
 
 void called(std::uint32_t timer, std::int64_t due_ns) {
-  Writer body;
-  body.number(timer);
-  body.number(due_ns);
-  add(Kind::CALL, body, now_ns());
+  Fields fields;
+  fields.number(timer);
+  fields.number(due_ns);
+  add(Kind::CALL, fields);
 }
 
 thread_local bool is_within = false;  // one function of rcl's calls the other
@@ -413,7 +523,7 @@ void named(const void *callback, const char *symbol) {
   Writer body;
   body.number(static_cast<std::uint64_t>(reinterpret_cast<std::uintptr_t>(callback)));
   body.text(symbol);
-  add(Kind::NAME, body, now_ns());
+  add(Kind::NAME, body);
 }
 
 }  // namespace
@@ -427,7 +537,7 @@ EXPORT rmw_node_t *rmw_create_node(rmw_context_t *context, const char *name, con
   body.number(new_entity(node)->id);
   body.text(name);
   body.text(space);
-  add(Kind::NODE, body, now_ns());
+  add(Kind::NODE, body);
   return node;
 }
 
@@ -439,7 +549,7 @@ EXPORT rmw_publisher_t *rmw_create_publisher(const rmw_node_t *node,
   if (publisher == nullptr || !ring().is_open()) return publisher;
   rmw_gid_t gid{};
   if (REAL(rmw_get_gid_for_publisher)(publisher, &gid) != RMW_RET_OK) rmw_reset_error();
-  const Found entity = topic_end(publisher, type);
+  const Found entity = topic_end(publisher, type, topic);
   made(Kind::PUBLISHER, node, topic, entity->has_type ? entity->type.name() : "", *qos,
        entity, gid.data);
   return publisher;
@@ -451,7 +561,7 @@ EXPORT rmw_subscription_t *rmw_create_subscription(const rmw_node_t *node,
                                                    const rmw_subscription_options_t *options) {
   rmw_subscription_t *subscription = REAL(rmw_create_subscription)(node, type, topic, qos, options);
   if (subscription == nullptr || !ring().is_open()) return subscription;
-  const Found entity = topic_end(subscription, type);
+  const Found entity = topic_end(subscription, type, topic);
   made(Kind::SUBSCRIPTION, node, topic, entity->has_type ? entity->type.name() : "",
        *qos, entity);
   return subscription;
@@ -603,7 +713,7 @@ EXPORT rmw_ret_t rmw_take_response(const rmw_client_t *client, rmw_service_info_
 EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions, rmw_guard_conditions_t *guards,
                           rmw_services_t *services, rmw_clients_t *clients, rmw_events_t *events,
                           rmw_wait_set_t *set, const rmw_time_t *timeout) {
-  if (is_active && ring().is_open()) add(Kind::WAIT, Writer(), now_ns());
+  if (is_active && ring().is_open()) add(Kind::WAIT, Fields());
   return REAL(rmw_wait)(subscriptions, guards, services, clients, events, set, timeout);
 }
 
@@ -619,7 +729,7 @@ EXPORT rcl_ret_t rcl_timer_init2(rcl_timer_t *timer, rcl_clock_t *clock, rcl_con
   Writer body;
   body.number(entity->id);
   body.number(period);
-  add(Kind::TIMER, body, now_ns());
+  add(Kind::TIMER, body);
   if (callback != nullptr) belongs(timer, entity);
   return status;
 }
@@ -663,7 +773,7 @@ EXPORT void ros_trace_rclcpp_timer_link_node(const void *timer, const void *node
     Writer body;
     body.number(entity->id);
     body.number(id_of(found));
-    add(Kind::TIMER_OF, body, now_ns());
+    add(Kind::TIMER_OF, body);
   }
 }
 
