@@ -249,7 +249,7 @@ class NativeOrderObserver(EventObserver):
         self._not_kept: dict[str, int] = {}
         self._loop = loop = domain.loop
         assert isinstance(loop, NativeOrderLoop), "a job that follows a recording has one"
-        self.policy = loop.order = NativeOrder(file, self._here(trace.end_ns), self._names)
+        self.policy = loop.order = NativeOrder(file, self._here(last_ns(trace)) + 1, self._names)
         domain.dispatcher.add_observer(self)
 
     def _here(self, native_ns: int) -> int:
@@ -295,7 +295,6 @@ class NativeOrderObserver(EventObserver):
     def _steps(self, played: Container[int]) -> Iterator[NativeStep]:
         """Yield the callbacks of nodes that run here, and what others sent."""
         trace, names = self._trace, self._native
-        left = trace.event_count if trace.ended_after is None else trace.ended_after
         sent: dict[tuple[int, int], Message] = {}
         counts: dict[int, int] = {}
         for rows, outputs in zip(trace.events(), trace.outputs(), strict=True):
@@ -310,8 +309,6 @@ class NativeOrderObserver(EventObserver):
                 if entity in played:
                     to_play.setdefault(event, []).append((place, message))
             for index, stamp_ns, kind, entity, *cause, digest in _columns(rows, *_OF_EVENT):
-                if index >= left or kind == EventKind.SHUTDOWN:
-                    return
                 at_ns, got = self._here(stamp_ns), sent.get((cause[0], cause[1]))
                 if index in to_play:
                     perform = partial(self._play, index, to_play[index], got)
@@ -350,8 +347,9 @@ class NativeOrderObserver(EventObserver):
 
     def notes(self) -> Iterator[str]:
         yield from self.policy.notes()
-        for name, count in self._not_kept.items():
-            yield f"{self.policy.file} does not hold {count} messages of {name}, so none came"
+        if self._not_kept:
+            count, names = sum(self._not_kept.values()), ", ".join(self._not_kept)
+            yield f"{self.policy.file} does not hold {count} messages, which were not sent: {names}"
 
 
 _OF_EVENT = ("index", "stamp", "kind", "entity", "cause_event", "cause_output", "input_hash")
@@ -359,6 +357,13 @@ _OF_EVENT = ("index", "stamp", "kind", "entity", "cause_event", "cause_output", 
 
 def _columns(rows: npt.NDArray[np.void], *names: str) -> Iterator[tuple[int, ...]]:
     return zip(*(rows[name].tolist() for name in names), strict=True)
+
+
+def last_ns(trace: Trace) -> int:
+    """Return when the last callback of a native run began, or its end if that is later: processes
+    do not end at once."""
+    stamps = [rows["stamp"][np.isin(rows["kind"], list(CALLBACKS))] for rows in trace.events()]
+    return max(trace.end_ns, *(int(one.max()) for one in stamps if len(one)))
 
 
 def definition_of(trace: Trace, type_name: str) -> tuple[str, str]:

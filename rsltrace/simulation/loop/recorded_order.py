@@ -146,9 +146,9 @@ def has_event(item: Any) -> bool:
     return is_there and not is_handed_over and not getattr(item, "quiet", False)
 
 
-# A native run says when each callback began, and with which message. Callbacks run in that order and
-# at those times: timers when they ran, not when they are due. Callbacks that overlapped run one after
-# the other, in the order of their starts.
+# A native run says when each callback began, and with which message. Callbacks run in that order
+# and at those times: timers when they ran, not when they are due. Callbacks that overlapped run one
+# after the other, in the order of their starts.
 
 CALLBACKS = frozenset(
     map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))
@@ -186,7 +186,7 @@ class NativeStep:
 
 
 class NativeOrder:
-    """The order of a native run, which ended at ``end_ns``.
+    """The order of a native run, which ended before ``end_ns``.
 
     What it has of this run is known by ``names``: a unique one for each entity, by its id.
     """
