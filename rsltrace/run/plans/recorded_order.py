@@ -243,9 +243,9 @@ class NativeOrderObserver(EventObserver):
         self._names, self._native = _Names(), _Names()
         for entity in trace.entities.values():
             self._native.add(entity)
-        self._sent: dict[str, int] = {}
+        self._sent: dict[int, int] = {}
         self._event, self._place = -1, 0
-        self._playing: Message | None = None
+        self._playing: int | None = None
         self._not_kept: dict[str, int] = {}
         self._loop = loop = domain.loop
         assert isinstance(loop, NativeOrderLoop), "a job that follows a recording has one"
@@ -262,12 +262,9 @@ class NativeOrderObserver(EventObserver):
         if self._event != self._loop.events:
             self._event, self._place = self._loop.events, 0
         if kind in _SENT:
-            message = self._playing
-            if message is None:
-                name = self._names.get(entity, "")
-                self._sent[name] = self._sent.get(name, 0) + 1
-                message = name, self._sent[name]
-            self.policy.arrivals[self._event, self._place] = message
+            count = self._sent.get(entity, 0) + 1 if self._playing is None else self._playing
+            self.policy.sent[self._event, self._place] = entity, count
+            self._sent[entity] = count
         self._place += 1
 
     def begin(self, *, plays: bool) -> None:
@@ -333,7 +330,7 @@ class NativeOrderObserver(EventObserver):
             if one.kind is OutputKind.RESPONSE and request is not None:
                 ids = (entity for entity, name in self._names.items() if name == request[0])
                 answers = next(ids, 0), request[1]
-            self._playing = message
+            self._playing = message[1]
             sent = Sent(one.kind, one.entity, lambda data=data: data, one.hash, answers)  # type: ignore[misc]
             self._stand_ins.perform((), (sent,), 0, self._client)
             self._playing = None

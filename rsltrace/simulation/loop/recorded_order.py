@@ -199,8 +199,8 @@ class NativeOrder:
         self._known: Mapping[str, int] = {}
         self.next: NativeStep | None = None
         """The first callback that has not run."""
-        self.arrivals: dict[tuple[int, int], Message] = {}
-        """By event and output of this run: what was sent."""
+        self.sent: dict[tuple[int, int], tuple[int, int]] = {}
+        """By event and output of this run: the entity that sent, and the number of its message."""
         self._late: set[Message] = set()
         self._count = self._followed = 0
         self._first: tuple[NativeStep, str] | None = None
@@ -240,7 +240,7 @@ class NativeOrder:
             return "it was cancelled or destroyed here"
         if step.message is None:
             return "nothing with that content was sent here"
-        sent = step.message in self.arrivals.values()
+        sent = step.message in map(self._message, self.sent)
         return "it did not get that message here" if sent else "that message was not sent here"
 
     def holds(self, candidate: Candidate) -> bool:
@@ -252,7 +252,7 @@ class NativeOrder:
             return False
         item = candidate.item
         for place, arrival in enumerate(getattr(item, "queue", ())):
-            sent = self.arrivals.get(arrival[item.origin][:2])
+            sent = self._message(arrival[item.origin][:2])
             if sent is not None and (sent in self._late or sent[1] > self._known.get(sent[0], 0)):
                 _to_front(item.queue, place)
                 return False
@@ -269,11 +269,15 @@ class NativeOrder:
             return True
         for place, arrival in enumerate(item.queue):
             *cause, digest = arrival[item.origin]
-            sent = self.arrivals.get(tuple(cause))
+            sent = self._message(tuple(cause))
             if sent == step.message or (step.message is None and digest == step.input_hash):
                 _to_front(item.queue, place)
                 return True
         return False
+
+    def _message(self, cause: tuple[int, int]) -> Message | None:
+        sent = self.sent.get(cause)
+        return None if sent is None else (self._names.get(sent[0], ""), sent[1])
 
     def notes(self) -> Iterator[str]:
         """Yield how far the order was followed, and where it first was not."""
@@ -369,7 +373,7 @@ class NativeOrderLoop(OrderedLoop):
         """Return the next callback of the native run if it can run."""
         if step.kind != EventKind.TIMER:
             for place in self._ready.runnable():
-                if has_event(place.candidate.item) and order.is_next(place.candidate):
+                if order.is_next(place.candidate):
                     self._take_out(place)
                     return place
             return None
