@@ -67,7 +67,13 @@ _SHOWN_MAX = 12
 @click.option("--force", is_flag=True, help="Replace an existing output file (never TRACE itself).")
 @job_folder_option
 @trust_option
-@click.option("--node", metavar="NAME", help="Run this node alone, with its recorded input.")
+@click.option(
+    "--node",
+    "nodes",
+    metavar="NAME",
+    multiple=True,
+    help="Run this node alone, with its recorded input. Repeatable for a native TRACE.",
+)
 @click.option(
     "--bag",
     "bags",
@@ -108,7 +114,7 @@ def replay(
     force: bool,
     job_folder: Path | None,
     trust: bool,
-    node: str | None,
+    nodes: tuple[str, ...],
     bags: tuple[Path, ...],
     until_diverged: bool,
     everything: bool,
@@ -136,6 +142,9 @@ def replay(
     With --edit, verify the events before the first edit, then branch: the run continues with the
     edits and is compared with TRACE. -o keeps the trace of the branch.
 
+    If TRACE is of a native run, simulate its nodes: each callback runs at its recorded time and
+    with its recorded message. With --node, the other nodes are played from TRACE.
+
     Exit status: 0 if every event was as recorded (including a recorded failure); 1 if the replay
     diverged or the edits changed something; 2 for an error; 130, 143 or 129 if interrupted.
     """
@@ -143,8 +152,9 @@ def replay(
     from rsltrace.replay.one_node.ways import is_job
     from rsltrace.replay.preparation import event_count_to, prepare_replay
 
+    node = ", ".join(nodes)
     ways = NodeReplayOptions(
-        node=node or "",
+        node=node,
         bags=bags,
         until_diverged=until_diverged,
         everything=everything,
@@ -158,20 +168,21 @@ def replay(
     changes = [parse_edit(text) for text in edits]
     if bags and is_job(trace):
         return replay_from_job(trace, ways, no_pin=no_pin)
-    with prepare_replay(trace, job_folder, bags=node is None) as plan:
+    with prepare_replay(trace, job_folder, bags=not nodes) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
         count = None if until is None else event_count_to(plan.trace, until)
         check_edits(changes, plan.trace)
         begin = 0 if first is None else event_count_to(plan.trace, first) - 1
         if not as_json:
-            for line in code_lines(plan, "replaying", node):
+            for line in code_lines(plan, "replaying", node or None):
                 tell(line)
+        is_native = _is_native(plan, until or first or edits or ways.options or bags)
         agree(plan, trust=trust)
-        if node is not None:
+        if nodes and not is_native:
             return replay_one(plan, ways)
         result = _replayed(
-            plan, count, max(begin, 0), changes, output, force=force, quiet=quiet or as_json
+            plan, count, max(begin, 0), changes, nodes, output, force=force, quiet=quiet or as_json
         )
         reopen_standard_streams()
         status = result.exit_code
@@ -183,6 +194,22 @@ def replay(
         except OSError as error:
             status = status_without_output(error, status)
     return status
+
+
+def _is_native(plan: ReplayPlan, options: object) -> bool:
+    """Whether a trace is of a native run, which is replayed without most ``options``.
+
+    :raises ReplayError: there are some.
+    """
+    from rsltrace.trace.native import is_native
+
+    found = is_native(plan.trace)
+    if found and options:
+        raise ReplayError(
+            f"{plan.trace.name} is of a native run: replay it with -o again.mcap first, and "
+            "again.mcap with these options"
+        )
+    return found
 
 
 def agree(plan: ReplayPlan, *, trust: bool) -> None:
@@ -209,15 +236,26 @@ def _replayed(
     until: int | None,
     first: int,
     edits: Sequence[Edit],
+    nodes: Sequence[str],
     output: Path | None,
     *,
     force: bool,
     quiet: bool,
 ) -> ReplayResult:
-    from rsltrace.replay.replaying import replay_prepared
+    from rsltrace.replay.replaying import replay_native, replay_prepared
     from rsltrace.run import RunCallbacks
+    from rsltrace.trace.native import is_native
 
     with interruptible() as on_interrupt, progress(quiet=quiet, what="replaying") as show:
+        if is_native(plan.trace):
+            return replay_native(
+                plan,
+                nodes,
+                output=output,
+                force=force,
+                echo=not quiet,
+                observer=RunCallbacks(progress=show, interrupt=on_interrupt),
+            )
         return replay_prepared(
             plan,
             until=until,
@@ -283,9 +321,11 @@ def _print(result: ReplayResult) -> None:
     if result.edits:
         _print_branch(result)
         return
-    if result.diff is not None:
-        print_diffs([result.diff], "text", DiffOptions(), None)
-        say(f"\nnext: {_next(result)}")
+    compared = result.native or result.diff
+    if compared is not None:
+        print_diffs([compared], "text", DiffOptions(), None)
+        if result.native is None:
+            say(f"\nnext: {_next(result)}")
         return
     say(result.sentence)
     say(f"digest {result.digest}  events {result.verified}  sim {result.sim_seconds}")

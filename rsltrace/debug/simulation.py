@@ -58,13 +58,15 @@ def _opened(
 
         return load_job(Path(source), overrides=spec["overrides"]), RunHistory(), (), []
     from rsltrace.replay.preparation import prepare_replay
+    from rsltrace.trace.native import is_native
 
     folder = spec["job_folder"]
     plan = stack.enter_context(prepare_replay(source, None if folder is None else Path(folder)))
     if plan.distrust and not spec["trust"]:
         raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
     changed = [f"{one.name} {one.change}" for one in plan.code if one.change]
-    return plan.job, TraceHistory(plan.trace), plan.edits, [*plan.notes, *changed]
+    history = RunHistory() if is_native(plan.trace) else TraceHistory(plan.trace)
+    return plan.job, history, plan.edits, [*plan.notes, *changed]
 
 
 def _serve(

@@ -93,6 +93,8 @@ def replay_trace(
     the first of them and goes on as a branch, which is compared with the trace and whose own trace
     (``output``) holds the edits: replaying it makes them again. ``until`` ends the branch, too.
 
+    A native run is simulated in its order and at its times, and compared with the replay.
+
     Returns a ``rsltrace.ReplayResult``, with ``node`` a ``NodeReplayResult``. A run that fails as
     the recorded one did is verified.
 
@@ -104,7 +106,8 @@ def replay_trace(
     from rsltrace.errors import ReplayError
     from rsltrace.replay.edits import parse_edit
     from rsltrace.replay.preparation import event_count_to, prepare_replay
-    from rsltrace.replay.replaying import replay_prepared
+    from rsltrace.replay.replaying import replay_native, replay_prepared
+    from rsltrace.trace.native import is_native
 
     place = None if output is None else Path(output)
     if node is not None:
@@ -132,6 +135,8 @@ def replay_trace(
     with prepare_replay(trace, folder, job) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
+        if is_native(plan.trace):
+            return replay_native(plan, output=place, force=force, echo=echo)
         return replay_prepared(
             plan,
             until=None if until is None else event_count_to(plan.trace, until),

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from rsltrace.adapters.launch import ros_launch
-from rsltrace.errors import JobError, ReplayError
-from rsltrace.job import Job, job_from_text, load_job
+from rsltrace.errors import JobError, ReplayError, TraceError
+from rsltrace.job import Job, StopSpec, job_from_text, load_job
 from rsltrace.job.fields import COMMAND_LINE
+from rsltrace.job.parts.scheduling import PolicySpec
 from rsltrace.job.reading.resolved import job_from_resolved
 from rsltrace.replay.code import JobCodeFile, job_code_files, module_file
 from rsltrace.replay.edits import Edit, edits_of, parse_edit
 from rsltrace.run.inputs import expand_launch_files
+from rsltrace.run.plans.recorded_order import last_ns
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.model.finding import GuardMode
-from rsltrace.trace.native import refuse_native
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 
 # The folder of a trace's job. A trace holds no absolute paths, so the folder is looked for.
@@ -189,6 +192,8 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
         own = _own_job(folder / name, bags=bags)
     except (JobError, OSError, RecursionError):
         own = None
+    if own is not None:
+        own = _following_native(own, job)
     if own is None:
         return f"there is no {name} in {folder} to compare its job with without running code"
     differing = _differing(own, job)
@@ -199,6 +204,17 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: 
     if any(found.mode is GuardMode.RECORD for one in trace.findings.values() for found in one):
         return "it holds recorded answers (of files, sockets, …) that the nodes would get"
     return ""
+
+
+def _following_native(own: Job, job: Job) -> Job:
+    """Return a job as it would follow the native run that another one follows, if it does."""
+    recorded = None if job.policy is None else job.policy.recorded
+    if recorded is None or own.policy == job.policy:
+        return own
+    with suppress(TraceError), Trace.open(job.resolve(recorded)) as trace:
+        if is_native(trace):
+            return job_of_native(trace, own)
+    return own
 
 
 def _own_job(file: Path, *, bags: bool) -> Job | None:
@@ -283,7 +299,6 @@ def prepare_replay(
     if "://" in str(path):
         raise ReplayError(f"{path}: download a trace to replay it")
     with Trace.open(path) as trace:
-        refuse_native(trace, "there is nothing that a replay could do again")
         if trace.event_count == 0:
             raise ReplayError(f"{path} has no events to replay")
         if job is None:
@@ -293,6 +308,8 @@ def prepare_replay(
             distrust = why_not_trusted(trace, job, folder, named=named, bags=bags)
         else:
             folder, distrust = job.base_dir, ""
+        if is_native(trace):
+            job = job_of_native(trace, job)
         yield ReplayPlan(
             trace,
             job,
@@ -303,6 +320,29 @@ def prepare_replay(
             tuple(_notes(trace)),
             tuple(map(parse_edit, edits_of(trace))),
         )
+
+
+_OF_SIMULATIONS = (
+    *("delay", "execution", "executors", "min_time_step_ns", "construct_time_ns", "clocks"),
+    *("faults", "threads", "vary", "timer_ties", "bags", "progress"),
+)
+"""Parts of a job without effect in a native run, and what a replay of one has from its trace."""
+
+
+def job_of_native(trace: Trace, job: Job) -> Job:
+    """Return the job that does again what a native run did."""
+    defaults = {
+        key: Job.model_fields[key].get_default(call_default_factory=True) for key in _OF_SIMULATIONS
+    }
+    lasted_ns = last_ns(trace) - trace.start_ns
+    return job.model_copy(
+        update={
+            **defaults,
+            "start_ns": trace.start_ns,
+            "policy": PolicySpec(recorded=os.path.relpath(trace.name, job.base_dir)),
+            "stop": StopSpec(duration_ns=lasted_ns),
+        }
+    )
 
 
 def _changes(trace: Trace) -> Iterator[EnvironmentChange]:

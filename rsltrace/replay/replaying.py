@@ -17,12 +17,13 @@ from rsltrace.errors import ReplayError, RunError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
 from rsltrace.replay.preparation import ReplayPlan
-from rsltrace.replay.verification import EventVerification
+from rsltrace.replay.verification import EventVerification, interruption
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
+from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
 
@@ -48,6 +49,9 @@ class ReplayResult:
     With ``edits``, the run was verified up to the first of them and went on as a branch: ``digest``
     and ``end_ns`` are the branch's, and ``diff`` compares all of it with the trace, None if the
     edits have changed nothing.
+
+    Of a native run, ``verified`` is how many callbacks ran in its order, ``native`` compares
+    it with the replay (also times), and ``diff`` is that if messages or the order differ.
     """
 
     trace: str
@@ -65,6 +69,7 @@ class ReplayResult:
     interrupted: int = 0
     """The exit status of a replay that was itself interrupted (130: Ctrl-C), else 0."""
     edits: tuple[str, ...] = ()
+    native: Diff | None = field(default=None, compare=False)
 
     @property
     def sim_seconds(self) -> str:
@@ -84,6 +89,8 @@ class ReplayResult:
     @property
     def sentence(self) -> str:
         """The result in one sentence."""
+        if self.native is not None:
+            return self.native.sentence
         if self.edits:
             if self.diff is None:
                 return f"the edits change nothing: the branch has the digest {self.digest}, too"
@@ -96,6 +103,67 @@ class ReplayResult:
         if self.verified != self.events:
             count += f" of {self.events}"
         return f"verified {count}, to {self.sim_seconds} s ({self.ended})"
+
+
+def replay_native(
+    plan: ReplayPlan,
+    nodes: Sequence[str] = (),
+    *,
+    output: Path | None = None,
+    force: bool = False,
+    echo: bool = False,
+    observer: RunCallbacks | None = None,
+) -> ReplayResult:
+    """Simulate what a native run did, in its order; with ``nodes``, only the entries of the job
+    that make these, and the others are played from the trace.
+
+    :raises ReplayError: the job makes no such node.
+    :raises JobError, SetupError, OutputError: the run cannot start or be written.
+    """
+    from rsltrace.replay.one_node.from_bag import node_topics
+
+    job, topics = plan.job, set[str]()
+    if nodes:
+        found = [node_topics(job.model_copy(update={"policy": None}), node) for node in nodes]
+        entries = sorted({one.entry for one in found})
+        job = job.model_copy(update={"nodes": tuple(job.nodes[entry] for entry in entries)})
+        topics = {name for one in found for name in one.published if name not in NODE_TOPICS}
+    with place_for(output) as path, preserved_process():
+        with RunSession(job, path, force=force, echo=echo, observer=observer) as session:
+            session.begin()
+            if not session.ended:
+                session.go_on()
+            run = session.finish()
+        place = run.path or path
+        with Trace.open(place) as again:
+            compared = diff_traces(plan.trace, again, DiffOptions(topics=tuple(sorted(topics))))
+    kept = None if output is None else place
+    native = compared.native
+    assert native is not None, "one of them is native"
+    if kept is None:  # there is nothing to compare again
+        content = replace(native.content, next_step="")
+        compared = replace(
+            compared,
+            b=replace(compared.b, path=THE_REPLAY),
+            native=replace(native, content=content),
+        )
+    differs = compared.diverged or native.moved > 0
+    return ReplayResult(
+        trace=plan.trace.name,
+        verified=native.compared - native.moved,
+        events=plan.trace.event_count,
+        digest=run.digest,
+        start_ns=run.start_ns,
+        end_ns=run.end_ns,
+        ended=run.stop_reason,
+        is_whole=not differs,
+        path=kept,
+        diff=compared if differs else None,
+        error=run.error,
+        notes=tuple(dict.fromkeys([*plan.notes, *run.notes])),
+        interrupted=interruption(run),
+        native=compared,
+    )
 
 
 THE_REPLAY = "the replay"

@@ -31,7 +31,12 @@ from rsltrace.run.plans.faults import BagFaults, arm_node_faults, arm_topic_faul
 from rsltrace.run.plans.guard import RunGuard, install_guard, node_packages
 from rsltrace.run.plans.network import clock_notes, clock_rules, network_plan
 from rsltrace.run.plans.processes import make_process_adapter
-from rsltrace.run.plans.recorded_order import follow_recording, remember_choices, write_choices
+from rsltrace.run.plans.recorded_order import (
+    NativeOrderObserver,
+    follow_recording,
+    remember_choices,
+    write_choices,
+)
 from rsltrace.run.plans.scheduling import (
     continued_policy,
     is_ordered,
@@ -75,6 +80,7 @@ from rsltrace.run.unused_rules import (
 from rsltrace.run.watchdog import Watchdog
 from rsltrace.simulation.loop.loop import EventLoop
 from rsltrace.simulation.loop.ordered import OrderedLoop
+from rsltrace.simulation.loop.recorded_order import NativeOrderLoop
 from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.loop.timer_queue import timer_queue
 from rsltrace.simulation.middleware.events.event import NameRegistry
@@ -101,7 +107,6 @@ if TYPE_CHECKING:
     from rsltrace.run.state_samples import StateSamples
     from rsltrace.simulation.chance.channel import NetworkPlan
     from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        NativeOrderObserver,
         RecordedOrderObserver,
     )
 
@@ -301,6 +306,8 @@ class RunSession:
         world.use_clocks(clock_rules(job), self.start_ns)
 
     def _loop_class(self) -> type[EventLoop]:
+        if self.job.policy is not None and self.job.policy.recorded is not None:
+            return NativeOrderLoop
         return OrderedLoop if is_ordered(self.job) else EventLoop
 
     def _order_events(self, stack: ExitStack) -> None:
@@ -424,6 +431,8 @@ class RunSession:
                     self.world, self.job, self._bags, is_open=self.may_become
                 )
             if not self.ended:
+                if isinstance(self._recorded, NativeOrderObserver):
+                    self._recorded.begin(plays=not later)
                 self.world.jump(self.start_ns)
                 self.has_begun = not self.ended
                 self.world.starts.begin(self.start_ns)

@@ -37,8 +37,9 @@ from rsltrace.trace.native import DurationStatistics, duration_statistics, event
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityKey
 
-TIMES = ("stamp", "*.stamp")
-"""Fields that are not compared: what they hold is real time, or was simulated."""
+TIMES = ("stamp", "*.stamp", "/rosout:file")
+"""Fields that are not compared: what they hold is real time, or was simulated; or where the code of
+a log record is, which is no content of it."""
 
 """Nodes that are created at once mix there, in any order."""
 

@@ -26,6 +26,7 @@ from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries
+from rsltrace.run.plans.recorded_order import definition_of
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, switches_at_lines
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
@@ -279,10 +280,7 @@ class NodeReplaySession(RunSession):
         return next((one for one in clients if one.entity_id == present), None)
 
     def _definition(self, type_name: str) -> tuple[str, str]:
-        for channel in self._trace.channels.values():
-            if channel.type == type_name:
-                return channel.schema_text, str(channel.metadata.get("topic_type_hash", ""))
-        return "", ""
+        return definition_of(self._trace, type_name)
 
 
 class _Progress(EventObserver):

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
 
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
@@ -31,14 +35,18 @@ from rsltrace.simulation.loop.policy import (
 from rsltrace.simulation.loop.recorded_order import (
     CALLBACKS,
     THE_RUN,
-    NativeCallback,
+    Message,
     NativeOrder,
+    NativeOrderLoop,
+    NativeStep,
     RecordedEvent,
     RecordedOrder,
     entity_text,
 )
 from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
-from rsltrace.trace.model.event import EventKind
+from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
+from rsltrace.trace.model.entity import Entity, EntityKind
+from rsltrace.trace.model.event import EventKind, OutputKind
 from rsltrace.trace.model.texts import Stamp
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
@@ -47,9 +55,9 @@ from rsltrace.trace.writer import TraceWriter
 if TYPE_CHECKING:
     from rsltrace.simulation.middleware.domain import Domain
     from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        NativeOrderObserver,
         RecordedOrderObserver,
     )
+    from rsltrace.simulation.middleware.services import Client
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.simulation.loop.policy``."""
@@ -61,12 +69,11 @@ def follow_recording(
     job: Job, domain: Domain, stack: ExitStack
 ) -> RecordedOrderObserver | NativeOrderObserver | None:
     """Let a run follow the order of a recording, if the job says so; the recording stays open as
-    long as ``stack``. The order of a native run is followed where possible.
+    long as ``stack``.
 
     :raises JobError: the recording cannot be read, or has no events.
     """
     from rsltrace.simulation.middleware.events.recorded_order_observer import (
-        NativeOrderObserver,
         RecordedOrderObserver,
     )
 
@@ -77,11 +84,7 @@ def follow_recording(
     assert census is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
     if is_native(trace):
-        events = enumerate(_events(trace))
-        observed = [NativeCallback(index, one) for index, one in events if one.kind in CALLBACKS]
-        return NativeOrderObserver(
-            domain.dispatcher, NativeOrder(file, observed, census.describe_all())
-        )
+        return NativeOrderObserver(domain, trace, file)
     order = RecordedOrder(file, _EventCursor(trace).event, _chosen(trace), census.describe_all())
     from_ns = _polls_from_ns(trace)
     if from_ns is not None:
@@ -199,3 +202,170 @@ def _events(trace: Trace) -> Iterator[RecordedEvent]:
             yield RecordedEvent(
                 Stamp(stamp, start_ns), kind, entity_id, names.get(entity_id, THE_RUN)
             )
+
+
+# Following a native run. Entities of both runs correspond by name, those of one name in the order
+# of their creation; messages by their sender and number.
+
+_SENT = frozenset(map(int, (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)))
+_ENDPOINTS = (
+    EntityKind.NODE,
+    EntityKind.PUBLISHER,
+    EntityKind.SUBSCRIPTION,
+    EntityKind.SERVICE,
+    EntityKind.CLIENT,
+)
+
+
+class _Names(dict[int, str]):
+    """Unique names of entities, by their ids."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._nodes: dict[int, str] = {}
+        self._counts: dict[str, int] = {}
+
+    def add(self, entity: Entity) -> None:
+        if entity.kind is EntityKind.NODE:
+            self._nodes[entity.id] = entity.name
+        name = entity_text(entity, self._nodes.get(entity.node, ""))
+        count = self._counts[name] = self._counts.get(name, 0) + 1
+        self[entity.id] = name if count == 1 else f"{name} ({count})"
+
+
+class NativeOrderObserver(EventObserver):
+    """Lets a run follow a native one; nodes that are not in the run are played from the trace."""
+
+    order = ObserverOrder.RECORDED_ORDER
+
+    def __init__(self, domain: Domain, trace: Trace, file: str) -> None:
+        self._domain, self._trace = domain, trace
+        self._names, self._native = _Names(), _Names()
+        for entity in trace.entities.values():
+            self._native.add(entity)
+        self._sent: dict[int, int] = {}
+        self._event, self._place = -1, 0
+        self._playing: int | None = None
+        self._not_kept: dict[str, int] = {}
+        self._loop = loop = domain.loop
+        assert isinstance(loop, NativeOrderLoop), "a job that follows a recording has one"
+        self.policy = loop.order = NativeOrder(file, self._here(last_ns(trace)) + 1, self._names)
+        domain.dispatcher.add_observer(self)
+
+    def _here(self, native_ns: int) -> int:
+        return native_ns - self._trace.start_ns + self._loop.origin_ns
+
+    def entity_created(self, entity: Entity) -> None:
+        self._names.add(entity)
+
+    def output(self, kind: int, entity: int, content_hash: int) -> None:
+        if self._event != self._loop.events:
+            self._event, self._place = self._loop.events, 0
+        if kind in _SENT:
+            count = self._sent.get(entity, 0) + 1 if self._playing is None else self._playing
+            self.policy.sent[self._event, self._place] = entity, count
+            self._sent[entity] = count
+        self._place += 1
+
+    def begin(self, *, plays: bool) -> None:
+        """Begin with the nodes that there are now; ``plays``: no others will come, and those that
+        the native run has besides are played."""
+        from rsltrace.adapters.stand_ins import StandIns
+
+        self._stand_ins = StandIns(self._domain, self._definition)
+        entities = self._trace.entities
+        here = {node.fully_qualified_name for node in self._domain.graph.nodes}
+        absent = {
+            one.id
+            for one in entities.values()
+            if plays and one.kind is EntityKind.NODE and one.name not in here
+        }
+        played = {one.id: one for one in entities.values() if {one.node, one.id} & absent}
+        ends = [one for one in played.values() if one.kind in _ENDPOINTS]
+        self._stand_ins.perform(ends, (), 0, self._client)
+        known = dict.fromkeys(self._native.values(), 0)
+        for outputs in self._trace.outputs():
+            for entity in outputs["entity"][np.isin(outputs["kind"], list(_SENT))].tolist():
+                known[self._native[entity]] += 1
+        self.policy.begin(self._steps(played), known)
+
+    def _steps(self, played: Container[int]) -> Iterator[NativeStep]:
+        """Yield the callbacks of nodes that run here, and what others sent."""
+        trace, names = self._trace, self._native
+        sent: dict[tuple[int, int], Message] = {}
+        counts: dict[int, int] = {}
+        for rows, outputs in zip(trace.events(), trace.outputs(), strict=True):
+            to_play: dict[int, list[tuple[int, Message]]] = {}
+            begun, place = -1, 0
+            for event, entity, kind in _columns(outputs, "event", "entity", "kind"):
+                begun, place = event, place + 1 if event == begun else 0
+                if kind not in _SENT:
+                    continue
+                counts[entity] = counts.get(entity, 0) + 1
+                sent[event, place] = message = names[entity], counts[entity]
+                if entity in played:
+                    to_play.setdefault(event, []).append((place, message))
+            for index, stamp_ns, kind, entity, *cause, digest in _columns(rows, *_OF_EVENT):
+                at_ns, got = self._here(stamp_ns), sent.get((cause[0], cause[1]))
+                if index in to_play:
+                    perform = partial(self._play, index, to_play[index], got)
+                    yield NativeStep(index, at_ns, kind, "", perform=perform)
+                if kind in CALLBACKS and entity not in played:
+                    yield NativeStep(index, at_ns, kind, names[entity], got, digest)
+
+    def _play(
+        self, event: int, places: Sequence[tuple[int, Message]], request: Message | None
+    ) -> None:
+        """Send what a node that does not run here sent in an event, which ``request`` caused."""
+        from rsltrace.adapters.stand_ins import Sent
+
+        outputs = self._trace.outputs_of(event)
+        for place, message in places:
+            one = outputs[place]
+            payload = self._trace.payload(one)
+            if payload is None:
+                self._not_kept[message[0]] = self._not_kept.get(message[0], 0) + 1
+                continue
+            data, answers = payload[2], None
+            if one.kind is OutputKind.RESPONSE and request is not None:
+                ids = (entity for entity, name in self._names.items() if name == request[0])
+                answers = next(ids, 0), request[1]
+            self._playing = message[1]
+            sent = Sent(one.kind, one.entity, lambda data=data: data, one.hash, answers)  # type: ignore[misc]
+            self._stand_ins.perform((), (sent,), 0, self._client)
+            self._playing = None
+
+    def _client(self, entity: int) -> Client | None:
+        clients = self._domain.graph.all_clients()
+        return next((one for one in clients if one.entity_id == entity), None)
+
+    def _definition(self, type_name: str) -> tuple[str, str]:
+        return definition_of(self._trace, type_name)
+
+    def notes(self) -> Iterator[str]:
+        yield from self.policy.notes()
+        if self._not_kept:
+            count, names = sum(self._not_kept.values()), ", ".join(self._not_kept)
+            yield f"{self.policy.file} does not hold {count} messages, which were not sent: {names}"
+
+
+_OF_EVENT = ("index", "stamp", "kind", "entity", "cause_event", "cause_output", "input_hash")
+
+
+def _columns(rows: npt.NDArray[np.void], *names: str) -> Iterator[tuple[int, ...]]:
+    return zip(*(rows[name].tolist() for name in names), strict=True)
+
+
+def last_ns(trace: Trace) -> int:
+    """Return when the last callback of a native run began, or its end if that is later: processes
+    do not end at once."""
+    stamps = [rows["stamp"][np.isin(rows["kind"], list(CALLBACKS))] for rows in trace.events()]
+    return max(trace.end_ns, *(int(one.max()) for one in stamps if len(one)))
+
+
+def definition_of(trace: Trace, type_name: str) -> tuple[str, str]:
+    """Return the definition and the type hash of an interface, empty where a trace has none."""
+    for channel in trace.channels.values():
+        if channel.type == type_name:
+            return channel.schema_text, str(channel.metadata.get("topic_type_hash", ""))
+    return "", ""

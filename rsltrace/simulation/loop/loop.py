@@ -69,6 +69,8 @@ class EventLoop:
 
     polls = False
     """Whether executors find out what is ready only at polling points: see ``wait_set.py``."""
+    keeps_all = False
+    """Whether queues keep all that arrives, however long they may be."""
 
     def __init__(
         self,

@@ -116,13 +116,10 @@ class OrderedLoop(EventLoop):
         """The policy's choices so far, if they are recorded."""
         self.on_choice: Callable[[Sequence[Candidate], int, ChoicePoint], None] | None = None
         """Called at every choice, even of one candidate."""
-        self.hold_until: Callable[[Sequence[Candidate], ChoicePoint], int | None] | None = None
-        """Returns until when all that is ready has to wait, or None."""
         self.on_lull: Callable[[], None] | None = None
         """Called each time that nothing is left to run."""
         self.has_begun = False
         self._forced: ReadyItem | None = None
-        self._held_until_ns = -1
         self._held: dict[object, None] = {}
         self._ready = _ReadyQueue(lambda item: self.place(item), self._runs)
         self._tasks = _ReadyQueue(lambda item: self.place(item), self._runs)
@@ -132,8 +129,7 @@ class OrderedLoop(EventLoop):
     def next_timer(self) -> TimerState | None:
         """Return the next timer; overdue ones wait for a worker."""
         due, after = self.timers.due(self.now_ns)
-        held = self._held_until_ns > self.now_ns
-        if not held and any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
+        if any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
             return due[0]
         return after
 
@@ -182,22 +178,9 @@ class OrderedLoop(EventLoop):
         places = tasks + self._waiting()
         if not places:
             return None
-        candidates = [place.candidate for place in places]
-        if self.hold_until is not None and self._must_wait(candidates):
-            return None
-        place = places[self.choose(candidates)]
+        place = places[self.choose([place.candidate for place in places])]
         self._take_out(place)
         return place
-
-    def _must_wait(self, ready: list[Candidate]) -> bool:
-        """Whether what is ready has to wait; if so, look again when that is over."""
-        assert self.hold_until is not None
-        until_ns = self.hold_until(ready, ChoicePoint(self.now_ns, self.events, self.origin_ns))
-        self._held_until_ns = -1 if until_ns is None else until_ns
-        if until_ns is None:
-            return False
-        self.schedule(until_ns, lambda: None)
-        return True
 
     def runnable(self) -> list[ReadyItem]:
         """Return all that could run now: tasks, what is ready, and due timers."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
+from rsltrace.simulation.loop.ordered import OrderedLoop, ReadyItem
 from rsltrace.simulation.loop.policy import Candidate, ChoicePoint, FifoUntil
+from rsltrace.simulation.loop.timer_queue import NEVER_NS, TimerState
 from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind
@@ -142,126 +146,240 @@ def has_event(item: Any) -> bool:
     return is_there and not is_handed_over and not getattr(item, "quiet", False)
 
 
-# The order of a native run can only be followed approximately: its timers drift, its messages take
-# time. Callbacks correspond by name and number: a timer's third call there is its third call here.
+# A native run says when each callback began, and with which message. Callbacks run in that order
+# and at those times: timers when they ran, not when they are due. Callbacks that overlapped run one
+# after the other, in the order of their starts.
 
 CALLBACKS = frozenset(
     map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))
 )
 """Events with a place in the order; all others run as soon as they can."""
 
+Message = tuple[str, int]
+"""A message, request or response: the name of its sender, and its number, counted from 1."""
 
-class NativeCallback(NamedTuple):
-    """A callback of the native run and the number of its event."""
+_CALLBACK_KINDS = frozenset(("timer", "subscription", "service", "client"))
+_PATIENCE_NS = 100_000_000
+"""How long a callback is waited for that cannot run in its turn, in simulated time."""
+
+
+@dataclass(slots=True)
+class NativeStep:
+    """A callback of the native run, or (``perform``) what a node sent that does not run here.
+
+    ``name`` is that of its entity, ``message`` what it got, None if that is unknown.
+    """
 
     number: int
-    event: RecordedEvent
+    stamp_ns: int
+    kind: int
+    name: str
+    message: Message | None = None
+    input_hash: int = 0
+    perform: Callable[[], None] | None = None
+
+    def __str__(self) -> str:
+        got = (
+            "" if self.message is None else f" with message {self.message[1]} of {self.message[0]}"
+        )
+        return f"event {self.number}, {self.name}{got}"
 
 
 class NativeOrder:
-    """The order of a native run, followed as far as possible.
+    """The order of a native run, which ended before ``end_ns``.
 
-    A callback that is ready early waits for those before it, but no longer than until its own time
-    in the native run, counted from the first callback of both runs. ``name_of`` returns the name of
-    an entity of this run.
+    What it has of this run is known by ``names``: a unique one for each entity, by its id.
     """
 
-    def __init__(
-        self, file: str, observed: Sequence[NativeCallback], name_of: Callable[[int], str | None]
-    ) -> None:
+    def __init__(self, file: str, end_ns: int, names: Mapping[int, str]) -> None:
         self.file = file
-        self.name_of = name_of
-        self._observed = observed
-        self._places: dict[str, list[int]] = {}
-        for place, one in enumerate(observed):
-            self._places.setdefault(one.event.name, []).append(place)
-        self._counts: dict[str, int] = {}
-        self._next = 0
-        self._ahead_ns: int | None = None
-        self._ran = bytearray(len(observed))
-        self._in_turn = self._late = self._others = 0
-        self._first: tuple[NativeCallback, str] | None = None
+        self.end_ns = end_ns
+        self._names = names
+        self._steps: Iterator[NativeStep] = iter(())
+        self._known: Mapping[str, int] = {}
+        self.next: NativeStep | None = None
+        """The first callback that has not run."""
+        self.sent: dict[tuple[int, int], tuple[int, int]] = {}
+        """By event and output of this run: the entity that sent, and the number of its message."""
+        self._late: set[Message] = set()
+        self._count = self._followed = 0
+        self._first: tuple[NativeStep, str] | None = None
 
-    def hold_until(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int | None:
-        """Return until when all that is ready waits for earlier callbacks; None: run one now."""
-        places = [self._place(one) for one in ready]
-        first = (
-            min(place for place in places if place is not None) if all_have_places(places) else None
-        )
-        if first is None or first <= self._next or self._ahead_ns is None:
-            return None
-        until_ns = self._observed[first].event.stamp_ns - self._ahead_ns
-        return until_ns if until_ns > moment.now_ns else None
+    def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> None:
+        """Follow ``steps``. ``known`` are the entities of the native run and how much each sent."""
+        self._steps, self._known = iter(steps), known
+        self.next = next(self._steps, None)
 
     def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
-        places = [self._place(one) for one in ready]
-        if self._next in places:
-            return places.index(self._next)
-        if None in places:
-            return places.index(None)
-        return min(range(len(ready)), key=lambda index: places[index] or 0)
+        """After the end of the native run, it is first come, first served."""
+        return 0
 
-    def happened(self, kind: int, entity: int, now_ns: int) -> None:
-        """Note an event of this run."""
-        name = self.name_of(entity)
-        if kind not in CALLBACKS or name is None:
-            return
-        place = self._place_of(name)
-        self._counts[name] = self._counts.get(name, 0) + 1
-        if place is None:
-            self._others += 1
-            return
-        if self._ahead_ns is None:
-            self._ahead_ns = self._observed[place].event.stamp_ns - now_ns
-        self._ran[place] = True
-        if place < self._next:
-            self._late += 1
-            return
-        self._in_turn += 1
-        if place > self._next and self._first is None:
-            missed = self._observed[self._next]
-            self._first = missed, self._why(missed, name, now_ns)
-        self._next = place + 1
+    def done(self) -> None:
+        """Go on to the next callback."""
+        assert self.next is not None
+        if self.next.perform is None:
+            self._count += 1
+            self._followed += 1
+        self.next = next(self._steps, None)
 
-    def _why(self, missed: NativeCallback, name: str, now_ns: int) -> str:
-        """Say why the missed callback did not run before an event of that name."""
-        there = sum(place < self._next for place in self._places[missed.event.name])
-        return (
-            f"its run number {there + 1} was not ready here, and {name}, which came after it, did "
-            f"not wait any longer than until {format_seconds(now_ns)} s"
-        )
+    def skip(self) -> None:
+        """Go on to the next callback: this one cannot run."""
+        step = self.next
+        assert step is not None
+        if self._first is None:
+            self._first = step, self._why_not(step)
+        if step.message is not None:
+            self._late.add(step.message)
+        self._count += 1
+        self.next = next(self._steps, None)
 
-    def _place(self, candidate: Candidate) -> int | None:
-        if candidate.kind == "resume" or not has_event(candidate.item):
-            return None
-        name = self.name_of(candidate.entity_id)
-        return None if name is None else self._place_of(name)
+    def _why_not(self, step: NativeStep) -> str:
+        if step.name not in self._names.values():
+            return "there is none here"
+        if step.kind == EventKind.TIMER:
+            return "it was cancelled or destroyed here"
+        if step.message is None:
+            return "nothing with that content was sent here"
+        sent = step.message in map(self._message, self.sent)
+        return "it did not get that message here" if sent else "that message was not sent here"
 
-    def _place_of(self, name: str) -> int | None:
-        places, count = self._places.get(name, ()), self._counts.get(name, 0)
-        return places[count] if count < len(places) else None
+    def holds(self, candidate: Candidate) -> bool:
+        """Whether something runs in its turn only: a callback that the native run has, too, and
+        what it got there."""
+        if candidate.kind not in _CALLBACK_KINDS or self._names.get(candidate.entity_id) is None:
+            return False
+        if self._names[candidate.entity_id] not in self._known:
+            return False
+        item = candidate.item
+        for place, arrival in enumerate(getattr(item, "queue", ())):
+            sent = self._message(arrival[item.origin][:2])
+            if sent is not None and (sent in self._late or sent[1] > self._known.get(sent[0], 0)):
+                _to_front(item.queue, place)
+                return False
+        return True
+
+    def is_next(self, candidate: Candidate) -> bool:
+        """Whether the next callback is this one; its message is then the first in its queue."""
+        step = self.next
+        assert step is not None
+        item = candidate.item
+        if self._names.get(candidate.entity_id) != step.name:
+            return False
+        if step.kind == EventKind.TIMER:
+            return True
+        for place, arrival in enumerate(item.queue):
+            *cause, digest = arrival[item.origin]
+            sent = self._message(tuple(cause))
+            if sent == step.message or (step.message is None and digest == step.input_hash):
+                _to_front(item.queue, place)
+                return True
+        return False
+
+    def _message(self, cause: tuple[int, int]) -> Message | None:
+        sent = self.sent.get(cause)
+        return None if sent is None else (self._names.get(sent[0], ""), sent[1])
 
     def notes(self) -> Iterator[str]:
         """Yield how far the order was followed, and where it first was not."""
-        count, end = self._next, len(self._observed)
-        missing = count - sum(self._ran)
-        if self._in_turn == count and not self._others:
-            what = "all" if count == end else f"the first {count} of {end}"
-            yield f"{what} callbacks of {self.file} ran in its order"
+        count = self._count + sum(one.perform is None for one in self._left())
+        if self._followed == count:
+            yield f"all {count} callbacks of {self.file} ran in its order"
             return
-        rest = "" if count == end else f" before this run ended (it has {end})"
-        yield (
-            f"of {count} callbacks of {self.file}{rest} {self._in_turn} ran in its order, "
-            f"{self._late} after others that they came before, {missing} not at all; "
-            f"{self._others} ran that it does not have"
-        )
+        yield f"of {count} callbacks of {self.file} {self._followed} ran in its order"
         if self._first is not None:
-            missed, why = self._first
-            yield (
-                f"the first that could not run in its turn is event {missed.number}, "
-                f"{missed.event}: {why}"
-            )
+            step, why = self._first
+            yield f"the first that did not is {step}: {why}"
+
+    def _left(self) -> Iterator[NativeStep]:
+        if self.next is not None:
+            yield self.next
+            yield from self._steps
 
 
-def all_have_places(places: Sequence[int | None]) -> bool:
-    return None not in places
+def _to_front(queue: deque[Any], place: int) -> None:
+    arrival = queue[place]
+    del queue[place]
+    queue.appendleft(arrival)
+
+
+class NativeOrderLoop(OrderedLoop):
+    """The loop of a run that follows a recording; ``order`` is that of a native run, or None."""
+
+    order: NativeOrder | None = None
+    _missed = (-1, -1)
+
+    @property
+    def keeps_all(self) -> bool:  # type: ignore[override]
+        """Whether queues drop nothing: the native run says what was lost."""
+        return self.order is not None
+
+    @property
+    def following(self) -> NativeOrder | None:
+        """The order as long as it says what runs."""
+        order = self.order
+        if order is None or (order.next is None and self.now_ns >= order.end_ns):
+            return None
+        return order
+
+    def next_timer(self) -> TimerState | None:
+        """Return the next timer that does not wait for its turn."""
+        order = self.following
+        if order is None:
+            return super().next_timer()
+        places = ((one, self.place(one.owner)) for one in self._all_timers())  # type: ignore[arg-type]
+        return next((one for one, place in places if not order.holds(place.candidate)), None)
+
+    def next_ns(self) -> int | None:
+        own_ns, order = super().next_ns(), self.following
+        if order is None:
+            return own_ns
+        at_ns = order.end_ns if order.next is None else order.next.stamp_ns
+        if at_ns <= self.now_ns:
+            at_ns = self.now_ns if self._is_overdue(order) else at_ns + _PATIENCE_NS
+        return at_ns if own_ns is None else min(own_ns, at_ns)
+
+    def _all_timers(self) -> list[TimerState]:
+        return self.timers.due(NEVER_NS)[0]
+
+    def _is_overdue(self, order: NativeOrder) -> bool:
+        """Whether nothing can happen that the next callback could still wait for."""
+        own_ns = super().next_ns()
+        return order.next is None or own_ns is None or own_ns > order.next.stamp_ns + _PATIENCE_NS
+
+    def _next(self) -> ReadyItem | None:
+        order = self.following
+        if order is None or self._forced is not None:
+            return super()._next()
+        for place in self.runnable():
+            if not order.holds(place.candidate):
+                self._take_out(place)
+                return place
+        while (step := order.next) is not None and step.stamp_ns <= self.now_ns:
+            if step.perform is not None:
+                order.done()
+                step.perform()
+                return self._next()
+            place_or_none = self._awaited(order, step)
+            if place_or_none is not None:
+                order.done()
+                return place_or_none
+            if self._missed != (step.number, self.events) or not self._is_overdue(order):
+                self._missed = step.number, self.events
+                return None
+            order.skip()
+        return None
+
+    def _awaited(self, order: NativeOrder, step: NativeStep) -> ReadyItem | None:
+        """Return the next callback of the native run if it can run."""
+        if step.kind != EventKind.TIMER:
+            for place in self._ready.runnable():
+                if order.is_next(place.candidate):
+                    self._take_out(place)
+                    return place
+            return None
+        for timer in self._all_timers():
+            place = self.place(timer.owner)  # type: ignore[arg-type]
+            if order.is_next(place.candidate) and self._runs(place):
+                timer.deadline_ns = self.now_ns  # as natively, it is due when it runs
+                return place
+        return None

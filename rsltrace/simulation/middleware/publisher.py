@@ -96,7 +96,7 @@ class Publisher(DomainEntity):
         self._channel: int | None = None
         self.observers = transport.observers.get(topic)
         self._history: deque[Delivery] | None = None
-        if self.qos.durability is Durability.TRANSIENT_LOCAL:
+        if self.qos.durability is Durability.TRANSIENT_LOCAL or self.dispatcher.loop.keeps_all:
             self._history = deque(maxlen=self.qos.keep)
 
     @property
@@ -199,11 +199,11 @@ class Publisher(DomainEntity):
 
     def send_history(self, subscription: Subscription) -> None:
         """Send a late joiner the kept messages; never by best effort."""
-        if (
-            not self._history
-            or subscription.qos.durability is not Durability.TRANSIENT_LOCAL
-            or subscription.qos.reliability is not Reliability.RELIABLE
-        ):
+        wants = (
+            subscription.qos.durability is Durability.TRANSIENT_LOCAL
+            and subscription.qos.reliability is Reliability.RELIABLE
+        )
+        if not self._history or not (wants or self.dispatcher.loop.keeps_all):
             return
         kept = list(self._history)
         wanted = kept[-subscription.qos.keep :] if subscription.qos.keep else kept

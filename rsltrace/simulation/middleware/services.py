@@ -54,7 +54,7 @@ class ServiceEndpoint(Receiver):
         self.service = service
         self.type = type
         self.profile = qos.resolved(publisher=True, peers=[])
-        self.keep = self.profile.keep
+        self.keep = None if self.dispatcher.loop.keeps_all else self.profile.keep
         self.queue: deque[Exchange] = deque(maxlen=self.keep)
         self._channel: int | None = None
 

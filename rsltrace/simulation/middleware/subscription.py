@@ -52,8 +52,8 @@ class Subscription(Receiver):
         self.type = type
         self.qos = qos
         self.callback = callback
-        self.keep = qos.keep
-        self.queue: deque[Delivery] = deque(maxlen=qos.keep)
+        self.keep = None if dispatcher.loop.keeps_all else qos.keep
+        self.queue: deque[Delivery] = deque(maxlen=self.keep)
         self.timed = any(map(finite, (qos.deadline_ns, qos.lifespan_ns, qos.lease_ns)))
         self.publishers: list[DomainEntity] = []
         self.events = EndpointEvents()

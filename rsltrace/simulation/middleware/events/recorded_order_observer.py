@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rsltrace.simulation.loop.loop import NOTHING_LEFT
-from rsltrace.simulation.loop.ordered import OrderedLoop
 from rsltrace.simulation.loop.recorded_order import (
-    NativeOrder,
     RecordedEvent,
     RecordedOrder,
     event_text,
@@ -20,28 +18,6 @@ from rsltrace.simulation.loop.stop import Stop
 from rsltrace.simulation.middleware.events.dispatcher import Dispatcher
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.texts import format_seconds
-
-
-class NativeOrderObserver(EventObserver):
-    """Tells the order of a native run what has run, and lets the loop wait."""
-
-    order = ObserverOrder.RECORDED_ORDER
-
-    def __init__(self, dispatcher: Dispatcher, order: NativeOrder) -> None:
-        self.policy = order
-        self._dispatcher = dispatcher
-        dispatcher.add_observer(self)
-        assert isinstance(dispatcher.loop, OrderedLoop), "a job with a policy has one"
-        dispatcher.loop.hold_until = order.hold_until
-
-    def after_event(self) -> None:
-        dispatcher = self._dispatcher
-        if dispatcher.outcome.ended_after is None:
-            event = dispatcher.event
-            self.policy.happened(event.kind, event.entity, dispatcher.loop.stamp)
-
-    def notes(self) -> Iterator[str]:
-        yield from self.policy.notes()
 
 
 class RecordedOrderObserver(EventObserver):
