@@ -30,7 +30,7 @@ from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 
-CASES = cases(3, 40)
+CASES = cases(3, 20)
 pytestmark = pytest.mark.repeated
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -199,7 +199,7 @@ KINDS = {
     "silent": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/filter", "/reading"),
     "service": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/checker", "/check"),
 }
-CASES = cases(4, 40)
+CASES = cases(4, 20)
 
 
 @pytest.mark.long

@@ -279,7 +279,7 @@ def test_an_object_may_say_itself_what_its_state_is() -> None:
 
 # -- in runs --------------------------------------------------------------------------------------
 
-PLANTINGS = cases(20, 200)
+PLANTINGS = cases(20, 100)
 
 PLANTED: dict[str, Any] = {"at": -1, "change": lambda node: None}
 

@@ -28,7 +28,7 @@ pytestmark = [
     ),
 ]
 
-RUNS = cases(3, 20)
+RUNS = cases(3, 10)
 
 
 @pytest.fixture(scope="module")

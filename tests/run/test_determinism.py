@@ -1,7 +1,7 @@
 """One job, many machines' worth of differences, one digest.
 
 Each run is a process of its own with another hash seed, working directory, locale, time zone,
-address-space layout, heap and CPU load. A hundred of them in ``make test-all``.
+address-space layout, heap and CPU load. Thirty-six of them in ``make test-all``.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from tests.tiers import cases
 pytestmark = [pytest.mark.ros, pytest.mark.repeated]
 
 ROOT = Path(__file__).parents[2]
-RUNS = cases(3, 100)
-RUNS_OF_A_POLICY = 2 if RUNS < 100 else 10
+RUNS = cases(3, 36)
+RUNS_OF_A_POLICY = cases(2, 5)
 JOB = """
 # All that a run may contain: topics, services, coroutines, parameters, logs, padding.
 nodes:
