@@ -262,7 +262,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "timer_ties": "creation",
         "livelock_limit": 100_000,
         "bags": [],
-        "record": {"payloads": True, "topics": ["*"], "exclude": [], "segment_events": 4096},
+        "record": {"payloads": True, "topics": ["*"], "exclude": [], "segment_events": 4096, "last": None},
         "delay": None,
         "policy": None,
         "threads": None,
