@@ -16,6 +16,7 @@ import pytest
 from rsltrace.adapters.processes import child
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 from tests.tiers import cases
 
@@ -82,3 +83,26 @@ def test_nodes_of_c_have_one_digest_on_any_core_under_load_with_random_addresses
             result = run(job, path, force=True)
             assert result.error is None
             assert result.digest == digest, f"rsltrace diff {quiet} {path}"
+
+
+ADDRESSED = """import rclpy
+rclpy.init()
+rclpy.spin(rclpy.create_node("listener_%x" % id(object())))
+"""
+
+
+def test_a_node_with_an_address_in_its_name_has_one_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the node of a tf2_ros::TransformListener."""
+    monkeypatch.setattr(child, "fix_addresses", lambda fixed: False)
+    (tmp_path / "node.py").write_text(ADDRESSED)
+    entry = "{script: node.py, isolated: true}"
+    (tmp_path / "job.yaml").write_text(f"nodes: [{entry}, {entry}]\nstop: {{duration: 1s}}\n")
+    job = load_job(tmp_path / "job.yaml")
+    path = tmp_path / "run.mcap"
+    digests = {run(job, path, force=True).digest for _ in range(3)}
+    assert len(digests) == 1
+    with Trace.open(path) as trace:
+        nodes = [one.name for one in trace.entities.values() if one.kind is EntityKind.NODE]
+    assert len({name for name in nodes if name.startswith("/listener_")}) == 2
