@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +14,8 @@ from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError, RunError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
-from rsltrace.replay.preparation import ReplayPlan
+from rsltrace.replay.one_node.from_bag import node_topics
+from rsltrace.replay.preparation import ReplayPlan, place_for
 from rsltrace.replay.verification import EventVerification, interruption
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.process import preserved_process
@@ -120,8 +119,6 @@ def replay_native(
     :raises ReplayError: the job makes no such node.
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
-    from rsltrace.replay.one_node.from_bag import node_topics
-
     job, topics = plan.job, set[str]()
     if nodes:
         found = [node_topics(job.model_copy(update={"policy": None}), node) for node in nodes]
@@ -216,16 +213,6 @@ def replay_prepared(
         compared = _diverged(plan.trace, verification)
         difference = _difference(plan.trace, place, kept=output is not None) if compared else None
     return _result(plan, verification, run, difference, kept)
-
-
-@contextmanager
-def place_for(output: Path | None) -> Iterator[Path]:
-    """Yield the path for the replay's trace: ``output``, or a temporary file."""
-    if output is not None:
-        yield output
-        return
-    with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
-        yield Path(folder, "replay.mcap")
 
 
 def _run(
