@@ -22,6 +22,7 @@ from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
@@ -124,7 +125,10 @@ def replay_native(
         found = [node_topics(job.model_copy(update={"policy": None}), node) for node in nodes]
         entries = sorted({one.entry for one in found})
         job = job.model_copy(update={"nodes": tuple(job.nodes[entry] for entry in entries)})
-        topics = {name for one in found for name in one.published if name not in NODE_TOPICS}
+        own = {one.node for one in found}
+        publishers = [e for e in plan.trace.entities.values() if e.kind is EntityKind.PUBLISHER]
+        others = {e.name for e in publishers if plan.trace.node_of(e).name not in own}
+        topics = {name for one in found for name in one.published} - others - {*NODE_TOPICS} or {""}
     with place_for(output) as path, preserved_process():
         with RunSession(job, path, force=force, echo=echo, observer=observer) as session:
             session.begin()

@@ -29,8 +29,6 @@ from rclpy.node import Node
 from std_msgs.msg import Header, UInt64
 from std_srvs.srv import Trigger
 
-GAIN = 1
-
 
 class Talker(Node):
     def __init__(self, name, first):
@@ -40,7 +38,7 @@ class Talker(Node):
         self.create_timer(0.005, self.on_timer)
 
     def on_timer(self):
-        self.number += GAIN
+        self.number += 1
         self.out.publish(UInt64(data=self.number))
 
 
@@ -48,7 +46,7 @@ class Mixer(Node):
     # What it publishes depends on the order of all that it has heard and done.
     def __init__(self):
         super().__init__("mixer")
-        self.mixed = 0
+        self.mixed = self.ticks = self.answers = 0
         self.out = self.create_publisher(UInt64, "/mixed", 10)
         self.stamped = self.create_publisher(Header, "/stamped", 10)
         self.create_subscription(UInt64, "/numbers", self.on_number, 1)
@@ -65,11 +63,12 @@ class Mixer(Node):
     def on_timer(self):
         self.mix(1)
         self.stamped.publish(Header(stamp=self.get_clock().now().to_msg()))
-        if self.client.service_is_ready():
+        self.ticks += 1
+        if self.ticks > 90 and self.client.service_is_ready():  # it has been discovered
             self.client.call_async(Trigger.Request()).add_done_callback(self.on_answer)
 
     def on_answer(self, future):
-        self.mix(len(future.result().message))
+        self.answers += len(future.result().message)  # a task, which has no turn
 
 
 class Server(Node):
@@ -184,10 +183,10 @@ def test_one_node_alone_and_changed_code(tmp_path: Path, command: Any) -> None:
         assert {alone.node_of(alone.entity(one.entity)).name for one in timers} == {"/mixer"}
         assert {"/mixer", "/a", "/b"} <= nodes
     file = tmp_path / "mixing.py"
-    file.write_text(NODES.replace("GAIN = 1", "GAIN = 2"))
-    other = command("replay", "native.mcap", "-q", "--node", "/a")
+    file.write_text(NODES.replace("* 31", "* 33"))
+    other = command("replay", "native.mcap", "-q", "--node", "/mixer")
     assert other.returncode == 1, other.stderr
-    assert "first on /numbers: message 0 has a different data" in other.stdout
+    assert "first on /mixed: message 1 has a different data" in other.stdout
     file.write_text(NODES.replace("        self.out.publish(UInt64(data=self.number))\n", ""))
     silent = command("replay", "native.mcap", "-q")
     assert silent.returncode == 1

@@ -141,7 +141,7 @@ def test_native_runs_have_every_callback_with_its_cause(
         assert trace.result["unknown_causes"] == "0"
     again = replay(tmp_path / "run.mcap", trust=True, job_folder=tmp_path)
     assert any(note.startswith("all ") and "in its order" in note for note in again.notes)
-    assert again.diff is None, again.sentence
+    assert "callbacks started in the same order" in again.sentence
 
 
 @pytest.mark.parametrize("call", ["some", "all", "once"])
