@@ -190,7 +190,7 @@ def test_one_node_alone_and_changed_code(tmp_path: Path, command: Any) -> None:
     file.write_text(NODES.replace("        self.out.publish(UInt64(data=self.number))\n", ""))
     silent = command("replay", "native.mcap", "-q")
     assert silent.returncode == 1
-    assert "/mixer: subscription /numbers with message 1 of " in silent.stderr
+    assert "/mixer: subscription /numbers with message " in silent.stderr
     assert "that message was not sent here" in silent.stderr
 
 
