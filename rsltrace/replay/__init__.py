@@ -136,6 +136,8 @@ def replay_trace(
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
         if is_native(plan.trace):
+            if edits or until is not None:
+                raise ReplayError(f"{trace} is of a native run: edit a replay of it (output=…)")
             return replay_native(plan, output=place, force=force, echo=echo)
         return replay_prepared(
             plan,

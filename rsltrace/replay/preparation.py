@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -358,6 +359,16 @@ def _notes(trace: Trace) -> Iterator[str]:
         yield (
             f"the trace was cut off: it is replayed as far as it goes, {trace.event_count} events"
         )
+
+
+@contextmanager
+def place_for(output: Path | None) -> Iterator[Path]:
+    """Yield the path for the replay's trace: ``output``, or a temporary file."""
+    if output is not None:
+        yield output
+        return
+    with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
+        yield Path(folder, "replay.mcap")
 
 
 def event_count_to(trace: Trace, position: Position) -> int:

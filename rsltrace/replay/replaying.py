@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import os
-import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,13 +14,15 @@ from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError, RunError
 from rsltrace.replay.editing import EditObserver
 from rsltrace.replay.edits import Edit, check_edits, edits_metadata
-from rsltrace.replay.preparation import ReplayPlan
+from rsltrace.replay.one_node.from_bag import node_topics
+from rsltrace.replay.preparation import ReplayPlan, place_for
 from rsltrace.replay.verification import EventVerification, interruption
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.process import preserved_process
 from rsltrace.run.session import RunSession
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import METADATA_EDITS, METADATA_RECORDED_INPUTS
+from rsltrace.trace.model.entity import EntityKind
 from rsltrace.trace.model.operation import NODE_TOPICS
 from rsltrace.trace.model.texts import format_seconds
 from rsltrace.trace.reader import Trace
@@ -120,14 +120,15 @@ def replay_native(
     :raises ReplayError: the job makes no such node.
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
-    from rsltrace.replay.one_node.from_bag import node_topics
-
     job, topics = plan.job, set[str]()
     if nodes:
         found = [node_topics(job.model_copy(update={"policy": None}), node) for node in nodes]
         entries = sorted({one.entry for one in found})
         job = job.model_copy(update={"nodes": tuple(job.nodes[entry] for entry in entries)})
-        topics = {name for one in found for name in one.published if name not in NODE_TOPICS}
+        own = {one.node for one in found}
+        publishers = [e for e in plan.trace.entities.values() if e.kind is EntityKind.PUBLISHER]
+        others = {e.name for e in publishers if plan.trace.node_of(e).name not in own}
+        topics = {name for one in found for name in one.published} - others - {*NODE_TOPICS} or {""}
     with place_for(output) as path, preserved_process():
         with RunSession(job, path, force=force, echo=echo, observer=observer) as session:
             session.begin()
@@ -216,16 +217,6 @@ def replay_prepared(
         compared = _diverged(plan.trace, verification)
         difference = _difference(plan.trace, place, kept=output is not None) if compared else None
     return _result(plan, verification, run, difference, kept)
-
-
-@contextmanager
-def place_for(output: Path | None) -> Iterator[Path]:
-    """Yield the path for the replay's trace: ``output``, or a temporary file."""
-    if output is not None:
-        yield output
-        return
-    with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
-        yield Path(folder, "replay.mcap")
 
 
 def _run(

@@ -168,7 +168,6 @@ def test_info_and_cat_show_it(graph: tuple[Trace, str], command: Any) -> None:
 def test_nothing_claims_that_it_repeats(graph: tuple[Trace, str], command: Any) -> None:
     trace, _ = graph
     for words in (
-        ("replay", trace.name),
         ("diff", trace.name, trace.name, "--again", trace.name),
         ("view", trace.name, trace.name, "--export", "x.txt"),
     ):

@@ -9,6 +9,7 @@ import pytest
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.words.logs import missing_servers
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
 
@@ -53,5 +54,6 @@ def test_goals_feedback_results_and_cancelling_pass_between_processes(
             (stamp // 10**6, trace.decode("/said", data).data)  # type: ignore[attr-defined]
             for stamp, _, data in trace.messages("/said")
         ]
+        assert missing_servers(trace.entities.values()) == ""
     assert set(said) == EXPECTED
     assert len(said) == len(EXPECTED)

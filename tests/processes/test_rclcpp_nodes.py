@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from rsltrace import DebugSession
+from rsltrace import DebugSession, replay
 from rsltrace.adapters.processes.build import find_compiler, find_ros
 from rsltrace.diff import diff_files
 from rsltrace.diff.report import render
@@ -153,6 +153,9 @@ def test_native_runs_have_every_callback_with_its_cause(
         ]
         assert responses == [["/enable"]] * runs["/enable", EventKind.CLIENT]
         assert trace.result["unknown_causes"] == "0"
+    again = replay(tmp_path / "run.mcap", trust=True, job_folder=tmp_path)
+    assert any(note.startswith("all ") and "in its order" in note for note in again.notes)
+    assert "callbacks started in the same order" in again.sentence
 
 
 @pytest.mark.parametrize("call", ["some", "all", "once"])

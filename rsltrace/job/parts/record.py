@@ -34,17 +34,16 @@ class HooksSpec(JobPart):
 
 
 class LastSpec(JobPart):
-    """Native runs: keep only what happened last, in memory, and write it to a file when something
-    goes wrong."""
+    """What a native run keeps in memory of the last seconds."""
 
     MEANT: ClassVar[str] = "duration"
 
     duration_ns: Annotated[int, check(positive_time)] = Field(
-        alias="duration", description="How much time to keep.", examples=["30s"]
+        alias="duration", description="Time to keep.", examples=["30s"]
     )
     memory: Annotated[int, check(parse_size)] = Field(
         default=64 << 20,
-        description="Memory for it, per process; what is older is dropped sooner if it is full.",
+        description="Most memory per process.",
         examples=["64MiB"],
     )
     largest: Annotated[int, check(parse_size)] = Field(
@@ -54,7 +53,7 @@ class LastSpec(JobPart):
     )
     keep_on: Globs = Field(
         default=(),
-        description="Topics and services, as globs: a message or request there writes a file.",
+        description="Topics and services whose messages write a file, as globs.",
         examples=[["/emergency_stop"]],
     )
 
@@ -103,8 +102,7 @@ class RecordSpec(JobPart):
     )
     last: Annotated[LastSpec | None, part("duration")] = Field(
         default=None,
-        description="Native runs: keep only the last seconds, in memory, and write them to a file "
-        "at the end, after a crash or exception, at SIGUSR1, and as `keep_on` says.",
+        description="Keep only the last seconds, in a native run.",
         examples=["30s", {"duration": "30s", "memory": "64MiB", "keep_on": ["/emergency_stop"]}],
     )
 

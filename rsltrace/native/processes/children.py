@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import threading
@@ -134,7 +135,12 @@ class ObservedProcess(threading.Thread):
         self.is_stopping = True
         with suppress(OSError):
             self._link.send("stop")
-        if self.what.is_main and self.has_begun:
+        if not (self.what.is_main and self.has_begun):
+            return
+        if self.what.order.command:  # with all that it has started, as Ctrl-C in a terminal
+            with suppress(ProcessLookupError):
+                os.killpg(self.number, signal.SIGINT)
+        else:
             self._process.send_signal(signal.SIGINT)
 
     def kill(self) -> None:

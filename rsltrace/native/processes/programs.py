@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import IntEnum, auto
-from itertools import count
+from itertools import chain, count
 from operator import attrgetter
 from pathlib import Path
 from types import SimpleNamespace
@@ -186,7 +186,7 @@ class RecordFile:
             self._made += self._part(begin, _MADE_SIZE, start, end)
             head[_MADE_READ] = end
 
-    def last(self) -> tuple[list[Record], list[Record]]:
+    def last(self) -> tuple[list[Record], Iterator[Record]]:
         """Return the records that make entities, and of the others those that are left."""
         self.read_made()
         head = self._head
@@ -197,7 +197,7 @@ class RecordFile:
         whole = _first(starts, head[_RESERVED] - capacity, end)  # others were written over
         self.overwritten = whole > 0
         left = memoryview(data)[max(whole - begin, 0) :]
-        return list(_records(memoryview(bytes(self._made)))), list(_records(left))
+        return list(_records(memoryview(bytes(self._made)))), _records(left)
 
 
 def _first(starts: list[int], low: int, end: int) -> int:
@@ -624,10 +624,9 @@ class ObservedProgram:
         for path, (file, _) in list(self._files.items()):
             at_ns = now_ns()
             made, left = file.last()
-            if path in self._ended_ns:
-                at_ns = max((one[-1].steady_ns for one in (made, left) if one), default=at_ns)
+            first = next(left, None)
             spans = ProgramSpans(self._name, int(path.stem), *self._numbers)
-            start_ns = left[0].steady_ns if left else at_ns
+            start_ns = at_ns if first is None else first.steady_ns
             before = [record for record in made if record.steady_ns < start_ns]
             for record in before:
                 spans.add(record)
@@ -638,8 +637,11 @@ class ObservedProgram:
                     missing.append(
                         f"of {self._name}, all but the last {kept_s} s: its memory is full"
                     )
+            left = chain([] if first is None else [first], left)
             for record in heapq.merge(made[len(before) :], left, key=_steady_ns):
                 spans.add(record)
+            if path in self._ended_ns:
+                at_ns = spans.recorder.steady_ns
             found += spans.finished(at_ns, None)[0]
             if file.lost:
                 missing.append(f"{file.lost} records of {self._name}, for which there was no room")

@@ -444,7 +444,8 @@ class MultiProcessRun(NativeRun):
             self.lacks(f"{program.lost} records of {name}, for which there was no room")
         if program is not None and program.unobserved:
             self.lacks(
-                f"{program.unobserved} processes of {name}: no room for files in {self._folder}"
+                f"{program.unobserved} processes of {name}, which made no file: killed before, or "
+                f"no room in {self._folder}"
             )
         if child.has_begun and status < 0 and status != -signal.SIGINT:
             what = "the last 50 ms" if program is None else "what each thread was just doing"

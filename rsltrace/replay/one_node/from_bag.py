@@ -22,7 +22,7 @@ from rsltrace.replay.one_node.output_comparison import (
     outputs_of_node,
 )
 from rsltrace.replay.one_node.result import NodeReplayResult
-from rsltrace.replay.replaying import place_for
+from rsltrace.replay.preparation import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import RunCallbacks, run
 from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays

@@ -21,8 +21,7 @@ from rsltrace.replay.one_node.output_comparison import (
 )
 from rsltrace.replay.one_node.result import Column, NodeReplayResult, RecordingColumns
 from rsltrace.replay.one_node.script import RecordedScript, ReplayedEntry, check_payloads
-from rsltrace.replay.preparation import ReplayPlan
-from rsltrace.replay.replaying import place_for
+from rsltrace.replay.preparation import ReplayPlan, place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import RunCallbacks, RunResult
 from rsltrace.run.plans.entries import add_job_location, hook_entries, node_entries

@@ -201,13 +201,16 @@ class NativeOrder:
         """The first callback that has not run."""
         self.sent: dict[tuple[int, int], tuple[int, int]] = {}
         """By event and output of this run: the entity that sent, and the number of its message."""
+        self._taken: set[tuple[str, Message | None]] = set()
         self._late: set[Message] = set()
         self._count = self._followed = 0
         self._first: tuple[NativeStep, str] | None = None
 
     def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> None:
         """Follow ``steps``. ``known`` are the entities of the native run and how much each sent."""
-        self._steps, self._known = iter(steps), known
+        following = tuple(steps)
+        self._taken = {(one.name, one.message) for one in following}
+        self._steps, self._known = iter(following), known
         self.next = next(self._steps, None)
 
     def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
@@ -243,20 +246,41 @@ class NativeOrder:
         sent = step.message in map(self._message, self.sent)
         return "it did not get that message here" if sent else "that message was not sent here"
 
+    def loses(self, candidate: Candidate) -> bool:
+        """Drop a message from its queue that its callback did not get in the native run; return
+        whether there was one."""
+        name, item = self._names.get(candidate.entity_id, ""), candidate.item
+        if name not in self._known or (name, None) in self._taken:
+            return False
+        for place, sent in self._arrivals(item):
+            if not ((name, sent) in self._taken or self._is_new(sent)):
+                del item.queue[place]
+                return True
+        return False
+
     def holds(self, candidate: Candidate) -> bool:
         """Whether something runs in its turn only: a callback that the native run has, too, and
         what it got there."""
-        if candidate.kind not in _CALLBACK_KINDS or self._names.get(candidate.entity_id) is None:
+        if candidate.kind not in _CALLBACK_KINDS:
             return False
-        if self._names[candidate.entity_id] not in self._known:
+        if self._names.get(candidate.entity_id) not in self._known:
             return False
-        item = candidate.item
-        for place, arrival in enumerate(getattr(item, "queue", ())):
-            sent = self._message(arrival[item.origin][:2])
-            if sent is not None and (sent in self._late or sent[1] > self._known.get(sent[0], 0)):
-                _to_front(item.queue, place)
+        for place, sent in self._arrivals(candidate.item):
+            if self._is_new(sent):
+                _to_front(candidate.item.queue, place)
                 return False
         return True
+
+    def _arrivals(self, item: Any) -> Iterator[tuple[int, Message]]:
+        """Yield what waits in the queue of a callback, and where."""
+        for place, arrival in enumerate(getattr(item, "queue", ())):
+            sent = self._message(arrival[item.origin][:2])
+            if sent is not None:
+                yield place, sent
+
+    def _is_new(self, sent: Message) -> bool:
+        """Whether a message has no turn (any more)."""
+        return sent in self._late or sent[1] > self._known.get(sent[0], 0)
 
     def is_next(self, candidate: Candidate) -> bool:
         """Whether the next callback is this one; its message is then the first in its queue."""
@@ -351,7 +375,9 @@ class NativeOrderLoop(OrderedLoop):
         if order is None or self._forced is not None:
             return super()._next()
         for place in self.runnable():
-            if not order.holds(place.candidate):
+            if order.loses(place.candidate):
+                self._take_out(place)
+            elif not order.holds(place.candidate):
                 self._take_out(place)
                 return place
         while (step := order.next) is not None and step.stamp_ns <= self.now_ns:

@@ -68,8 +68,7 @@ def missing_servers(entities: Iterable[Entity]) -> str:
     served: set[str] = set()
     called: dict[str, dict[str, None]] = {}
     for entity in entities:
-        action = entity.detail.get("action")  # of which a client or server is a part
-        name = action if isinstance(action, str) else entity.name
+        name = entity.name.partition("/_action/")[0]
         if entity.kind is EntityKind.NODE:
             nodes[entity.id] = name
         elif entity.kind is EntityKind.SERVICE:

@@ -170,7 +170,7 @@ def test_where_memory_lies_does_not_depend_on_real_time(programs: Programs) -> N
 def test_chance_comes_from_the_seed_and_every_source_goes_on(corner: Corner) -> None:
     ran = corner("entropy")
     assert ran.out == corner("entropy").out != corner("entropy", native=True).out
-    assert len(set(ran.out.split())) == 7
+    assert len(set(ran.out.split())) == 8
 
 
 @pytest.mark.parametrize("name", ["outside_pipe", "outside_unseen"])

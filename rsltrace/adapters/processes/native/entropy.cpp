@@ -164,6 +164,19 @@ RSLTRACE_EXPORT unsigned rsltrace_random_device(std::random_device *device) {
   return drawn;
 }
 
+// libuuid mixes process numbers into what it draws.
+RSLTRACE_EXPORT void uuid_generate_random(unsigned char *out) {
+  using Function = void(unsigned char *);
+  static auto *original = reinterpret_cast<Function *>(real("uuid_generate_random"));
+  if (me() == nullptr && original != nullptr) return original(out);
+  fill(out, 16);
+  out[6] = static_cast<unsigned char>((out[6] & 0x0f) | 0x40);  // version 4, of RFC 4122
+  out[8] = static_cast<unsigned char>((out[8] & 0x3f) | 0x80);
+  RSLTRACE_NOTE(Source::RANDOM, "uuid_generate_random()", shown(out, 16));
+}
+
+RSLTRACE_EXPORT void uuid_generate(unsigned char *out) { uuid_generate_random(out); }
+
 #define RSLTRACE_OPEN(name, ...)                                            \
   if (const int file = open_device(path, __builtin_return_address(0)); file >= 0) return file; \
   va_list rest;                                                             \

@@ -1,0 +1,204 @@
+"""A native run is run again: in its order, with its messages, and at its times."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace import replay
+from rsltrace.errors import ReplayError
+from rsltrace.trace.model.entity import EntityKind
+from rsltrace.trace.model.event import EventKind
+from rsltrace.trace.reader import Trace
+from tests.native.running import COMMAND, environment
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.native,
+    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy"),
+]
+
+NODES = """\
+import rclpy
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.node import Node
+from std_msgs.msg import Header, UInt64
+from std_srvs.srv import Trigger
+
+
+class Talker(Node):
+    def __init__(self, name, first):
+        super().__init__(name)
+        self.out = self.create_publisher(UInt64, "/numbers", 1)
+        self.number = first
+        self.create_timer(0.005, self.on_timer)
+
+    def on_timer(self):
+        self.number += 1
+        self.out.publish(UInt64(data=self.number))
+
+
+class Mixer(Node):
+    # What it publishes depends on the order of all that it has heard and done.
+    def __init__(self):
+        super().__init__("mixer")
+        self.mixed = self.ticks = self.answers = 0
+        self.out = self.create_publisher(UInt64, "/mixed", 10)
+        self.stamped = self.create_publisher(Header, "/stamped", 10)
+        self.create_subscription(UInt64, "/numbers", self.on_number, 1)
+        self.client = self.create_client(Trigger, "/ask")
+        self.create_timer(0.011, self.on_timer)
+
+    def mix(self, number):
+        self.mixed = (self.mixed * 31 + number) % (1 << 60)
+
+    def on_number(self, message):
+        self.mix(message.data)
+        self.out.publish(UInt64(data=self.mixed))
+
+    def on_timer(self):
+        self.mix(1)
+        self.stamped.publish(Header(stamp=self.get_clock().now().to_msg()))
+        self.ticks += 1
+        if self.ticks > 90 and self.client.service_is_ready():  # it has been discovered
+            self.client.call_async(Trigger.Request()).add_done_callback(self.on_answer)
+
+    def on_answer(self, future):
+        self.answers += len(future.result().message)  # a task, which has no turn
+
+
+class Server(Node):
+    def __init__(self):
+        super().__init__("server")
+        self.last = ""
+        self.create_subscription(UInt64, "/mixed", self.on_mixed, 10)
+        self.create_service(Trigger, "/ask", self.on_ask)
+
+    def on_mixed(self, message):
+        self.last = str(message.data)
+
+    def on_ask(self, request, response):
+        response.message = self.last
+        return response
+
+
+def serve():
+    rclpy.init()
+    executor = MultiThreadedExecutor(2)
+    executor.add_node(Server())
+    try:
+        executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+"""
+JOB = """\
+nodes:
+  - {node: mixing:Talker, arguments: {name: a, first: 1000}}
+  - {node: mixing:Talker, arguments: {name: b, first: 2000}}
+  - node: mixing:Mixer
+  - SERVER
+stop: {duration: 2s}
+"""
+
+
+def recorded(folder: Path, server: str, *words: str) -> None:
+    """Record ``native.mcap`` in a folder, which is the working directory."""
+    (folder / "mixing.py").write_text(NODES)
+    (folder / "job.yaml").write_text(JOB.replace("SERVER", server))
+    started = [*COMMAND, "record", "--native", "job.yaml", "-o", "native.mcap", "-q", *words]
+    subprocess.run(started, cwd=folder, env=environment(folder), check=True, timeout=300)
+
+
+def starts(trace: Trace) -> dict[tuple[int, int], int]:
+    """Return when each call of each timer began, since the start of the run."""
+    found: dict[tuple[int, int], int] = {}
+    timers = [one.id for one in trace.entities.values() if one.kind is EntityKind.TIMER]
+    for index in range(trace.event_count):
+        event = trace.event(index)
+        if event.kind is EventKind.TIMER:
+            number = timers.index(event.entity)
+            call = sum(one[0] == number for one in found)
+            found[number, call] = event.stamp_ns
+    return found
+
+
+@pytest.mark.parametrize(
+    ("server", "words"),
+    [
+        ("node: mixing:Server", ()),
+        ("node: mixing:Server", ("--executor", "multi")),
+        ("main: mixing:serve", ()),
+    ],
+    ids=["one process", "threads", "processes"],
+)
+def test_a_replay_does_what_the_native_run_did(
+    tmp_path: Path, command: Any, server: str, words: tuple[str, ...]
+) -> None:
+    recorded(tmp_path, server, *words)
+    done = command("replay", "native.mcap", "-q", "-o", "again.mcap")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the messages are the same except for times" in done.stdout
+    assert "common callbacks started in the same order" in done.stdout
+    assert "callbacks of native.mcap ran in its order" in done.stderr
+    assert "note: all " in done.stderr
+    first = replay("native.mcap")
+    assert first.diff is None
+    assert "the messages are the same except for times" in first.sentence
+    with Trace.open(Path("native.mcap")) as native, Trace.open(Path("again.mcap")) as again:
+        assert again.digest == first.digest
+        assert starts(native) == starts(again)
+        stamps = [
+            [(one.stamp.sec, one.stamp.nanosec) for one in decoded]
+            for decoded in (
+                [trace.decode("/stamped", data) for _, _, data in trace.messages("/stamped")]
+                for trace in (native, again)
+            )
+        ]
+        late_ns = [
+            (a[0] - b[0]) * 10**9 + a[1] - b[1] for a, b in zip(stamps[0], stamps[1], strict=True)
+        ]
+        assert min(late_ns) >= 0  # the callback had begun when it read the clock
+    verified = command("replay", "again.mcap", "-q")
+    assert verified.returncode == 0, verified.stderr
+    assert "verified all" in verified.stdout
+    edit = '40: node("/mixer").mixed = 7'
+    branch = command("replay", "again.mcap", "-q", "--edit", edit)
+    assert branch.returncode == 1, branch.stderr
+    assert "/mixed" in branch.stdout
+
+
+def test_one_node_alone_and_changed_code(tmp_path: Path, command: Any) -> None:
+    recorded(tmp_path, "node: mixing:Server", "--processes")
+    done = command("replay", "native.mcap", "-q", "--node", "/mixer", "-o", "alone.mcap")
+    assert done.returncode == 0, done.stdout + done.stderr
+    with Trace.open(Path("alone.mcap")) as alone:
+        callbacks = [alone.event(index) for index in range(alone.event_count)]
+        nodes = {alone.node_of(alone.entity(one.entity)).name for one in callbacks if one.entity}
+        assert any(one.kind is EventKind.BAG for one in callbacks)
+        timers = [one for one in callbacks if one.kind is EventKind.TIMER]
+        assert {alone.node_of(alone.entity(one.entity)).name for one in timers} == {"/mixer"}
+        assert {"/mixer", "/a", "/b"} <= nodes
+    file = tmp_path / "mixing.py"
+    file.write_text(NODES.replace("* 31", "* 33"))
+    other = command("replay", "native.mcap", "-q", "--node", "/mixer")
+    assert other.returncode == 1, other.stderr
+    assert "first on /mixed: message 1 has a different data" in other.stdout
+    file.write_text(NODES.replace("        self.out.publish(UInt64(data=self.number))\n", ""))
+    silent = command("replay", "native.mcap", "-q")
+    assert silent.returncode == 1
+    assert "/mixer: subscription /numbers with message " in silent.stderr
+    assert "that message was not sent here" in silent.stderr
+
+
+def test_the_debugger_runs_it_again(tmp_path: Path, command: Any) -> None:
+    recorded(tmp_path, "node: mixing:Server")
+    words = ("-c", "break topic /mixed", "-c", "continue", "-c", "reverse-step", "-c", "continue")
+    done = command("debug", "native.mcap", "-q", *words)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("breakpoint 1 (topic /mixed)") == 2
+    with pytest.raises(ReplayError, match="edit a replay of it"):
+        replay("native.mcap", edits='9: node("/mixer").mixed = 7')
