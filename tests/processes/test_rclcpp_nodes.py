@@ -139,6 +139,10 @@ def test_native_runs_have_every_callback_with_its_cause(
         ]
         assert responses == [["/enable"]] * runs["/enable", EventKind.CLIENT]
         assert trace.result["unknown_causes"] == "0"
+    assert _run(tmp_path, text).error is None
+    both = (str(tmp_path / name) for name in ("run.mcap", "t.mcap"))
+    shown = render(diff_files(*both, topics="/rosout"))
+    assert "\n    file" not in shown  # native runs shorten its path
 
 
 @pytest.mark.parametrize("call", ["some", "all", "once"])
