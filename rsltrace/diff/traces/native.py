@@ -37,11 +37,8 @@ from rsltrace.trace.native import DurationStatistics, duration_statistics, event
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.words.entities import EntityKey
 
-TIMES = ("stamp", "*.stamp", "/rosout:file")
-"""Fields that are not compared: what they hold is real time, or was simulated; or where the code of
-a log record is, which is no content of it."""
-
-"""Nodes that are created at once mix there, in any order."""
+NOT_COMPARED = ("stamp", "*.stamp", "/rosout:file")
+"""Not compared: real or simulated time, and the path of a log's file, which native runs shorten."""
 
 _CALLBACKS = tuple(
     int(kind)
@@ -64,7 +61,7 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
     """
     if options.nodes:
         raise TraceError("events of native runs are not aligned: --topic chooses, --node cannot")
-    content = compare_content(a, b, replace(options, ignore=(*options.ignore, *TIMES)))
+    content = compare_content(a, b, replace(options, ignore=(*options.ignore, *NOT_COMPARED)))
     sides = (_Callbacks(a), _Callbacks(b))
     compared, moved, first = _order(*sides)
     tails = tuple(tail for topic in content.topics if (tail := _tail(topic)) is not None)
