@@ -1,19 +1,13 @@
-// Names that come from the machine: of temporary files (libc draws them), and of nodes, with an address
-// in them (tf2_ros::TransformListener).
+// Names of temporary files: libc draws them from the machine's chance.
 #include <errno.h>
 #include <fcntl.h>
-#include <rcl/remap.h>
-#include <rcutils/strdup.h>
 #include <stdlib.h>
-#include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
-#include <cstdint>
 #include <cstring>
 
 #include "entropy.h"
-#include "link.h"
 #include "real.h"
 #include "scheduler.h"
 
@@ -54,39 +48,7 @@ int make_file(char *path, int suffix, int flags) {
   });
 }
 
-constexpr char DIGITS[] = "0123456789abcdef";
-constexpr std::size_t LEAST_DIGITS = 8, MOST_DIGITS = 16;  // of an address
-
-bool is_address(std::uintptr_t number) {
-  const auto page = static_cast<std::uintptr_t>(sysconf(_SC_PAGESIZE));
-  return msync(reinterpret_cast<void *>(number / page * page), page, MS_ASYNC) == 0;
-}
-
-// Draw other digits for the addresses in `name`, as many.
-void hide_addresses(char *name) {
-  static std::uint64_t state = seed() ^ 0x61646472;
-  for (std::size_t length = 0; *name != '\0'; name += length == 0 ? 1 : length) {
-    length = std::strspn(name, DIGITS);
-    if (length < LEAST_DIGITS || length > MOST_DIGITS) continue;
-    if (!is_address(std::strtoull(std::string(name, length).c_str(), nullptr, 16))) continue;
-    std::uint64_t word = split_mix(state);
-    for (std::size_t i = 0; i < length; ++i, word /= sizeof DIGITS - 1) name[i] = DIGITS[word % (sizeof DIGITS - 1)];
-  }
-}
-
 }  // namespace
-
-// rcl asks it for the name of each node; null says that the name stays.
-RSLTRACE_EXPORT rcl_ret_t rcl_remap_node_name(const rcl_arguments_t *local, const rcl_arguments_t *global,
-                                              const char *name, rcl_allocator_t allocator, char **out) {
-  static const auto real =
-      reinterpret_cast<decltype(&rcl_remap_node_name)>(original("librcl.so", "rcl_remap_node_name"));
-  const rcl_ret_t result = real(local, global, name, allocator, out);
-  if (me() == nullptr || result != RCL_RET_OK) return result;
-  if (*out == nullptr) *out = rcutils_strdup(name, allocator);
-  if (*out != nullptr) hide_addresses(*out);
-  return result;
-}
 
 #define RSLTRACE_TEMPORARY(name, suffix, flags, parameters, arguments)   \
   RSLTRACE_EXPORT int name parameters {                                  \
