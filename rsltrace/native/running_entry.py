@@ -107,7 +107,7 @@ class RunningEntry(threading.Thread):
         self._executor = executor = self._make_executor()
         for node in self.nodes:
             executor.add_node(node)
-        while not self.stopping and executor.context.ok():
+        while not self.stopping and executor.context.ok() and not self.entry.is_component:
             try:
                 executor.spin_once()
             except ExternalShutdownException:

@@ -129,12 +129,6 @@ _STEERING = (
 def check(job: Job) -> None:
     """Raise ``JobError`` at the first part of a job that has to be and cannot be native."""
     for index, spec in enumerate(job.nodes):
-        if spec.component is not None:
-            raise JobError(
-                f"a native run loads no components: start {spec.target} beside it, in the domain "
-                "that --domain names, or name a program of its own",
-                where=spec.origin or locate(job, ("nodes", index, "component")),
-            )
         if spec.stdin is not None:
             raise JobError(
                 "a native run types nothing: leave stdin out, or give arguments",

@@ -5,6 +5,7 @@ It is in no wheel. With a ROS 2 that is sourced (``AMENT_PREFIX_PATH``) these te
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -187,8 +188,9 @@ def test_a_loop_at_a_rate_gets_all_that_there_is_in_the_order_of_the_loop(
         assert seen[at : at + 8] == list(range(8))
 
 
-@needs_components
-def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def composed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A job whose launch file has a container load two components."""
     prefix = tmp_path / "install"
     index = prefix / "share/ament_index/resource_index"
     for kind, content in (
@@ -214,10 +216,14 @@ def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.Monkey
       </node_container>
     </launch>"""
     (tmp_path / "a.launch.xml").write_text(launch)
+    return "launch: [a.launch.xml]\nstop: {duration: 2s}\n"
+
+
+@needs_components
+def test_a_container_loads_components(composed: str, tmp_path: Path) -> None:
     results = []
     for number in range(3):
-        job = "launch: [a.launch.xml]\nstop: {duration: 2s}\n"
-        results.append(_run(tmp_path, job, f"{number}.mcap"))
+        results.append(_run(tmp_path, composed, f"{number}.mcap"))
     assert [result.error for result in results] == [None] * 3
     assert len({result.digest for result in results}) == 1
     heard = [(name, text) for _, name, text in _logs(tmp_path / "0.mcap") if "heard" in text]
@@ -229,6 +235,19 @@ def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.Monkey
         assert len(owners) == 2
         kinds = [trace.event(index).kind for index in range(trace.event_count)]
     assert EventKind.SERVICE in kinds
+
+
+@needs_components
+@pytest.mark.native
+@pytest.mark.skipif(
+    importlib.util.find_spec("composition_interfaces") is None, reason="needs LoadNode over DDS"
+)
+def test_a_container_loads_components_natively(composed: str, tmp_path: Path) -> None:
+    done = record(tmp_path, composed)
+    assert done.returncode == 0, done.stderr
+    assert "ended at" not in done.stderr
+    heard = [text for _, name, text in _logs(tmp_path / "run.mcap") if name == "n.two"]
+    assert heard[0].startswith("heard 1")
 
 
 @needs_components

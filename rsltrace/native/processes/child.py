@@ -237,7 +237,7 @@ class _EntryProcess:
             self._raised(one.failed_in, one.node_name, error)
         elif one.stopping:
             destroy(one.nodes, self._observers.recorder, self._observers.entities)
-        else:
+        elif not one.entry.is_component:  # its container has it
             self._link.send("shutdown")
 
     def _raised(self, what: str, node: str, error: BaseException) -> None:

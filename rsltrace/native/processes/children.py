@@ -28,7 +28,8 @@ class ProcessStart:
     """What to start as a process: whose it is, what it does there, and its surroundings.
 
     ``respawn`` is how much later (ns) it starts again, and how often (None: always); ``may_fail``
-    says that the run goes on if it is killed; ``required`` that the run ends with it.
+    says that the run goes on if it is killed; ``required`` that the run ends with it; ``loads``
+    that it has a container load a component.
     """
 
     name: str
@@ -40,6 +41,7 @@ class ProcessStart:
     respawn: tuple[int, int | None] | None = None
     may_fail: bool = False
     required: bool = False
+    loads: bool = False
 
 
 class ObservedProcess(threading.Thread):

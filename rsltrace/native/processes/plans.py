@@ -54,6 +54,7 @@ def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[P
                 None if spec.respawn is None else (spec.respawn.delay_ns, spec.respawn.times),
                 spec.on_exception == "log" or spec.respawn is not None,
                 spec.required,
+                spec.component is not None,
             )
         )
     if job.bags:
@@ -137,4 +138,8 @@ def start_rules(job: Job) -> dict[str, StartRule]:
     """Return when those entries begin that do not begin with the run, by their keys."""
     keys = entry_keys(job.nodes)
     rules = {key: start_rule(job, index, keys) for index, key in enumerate(keys)}
-    return {key: rule for key, rule in rules.items() if rule is not None}
+    for key, spec in zip(keys, job.nodes, strict=True):
+        if (rule := rules[key]) is not None and spec.component is not None:
+            own = None if spec.start_after is None else spec.start_after.service
+            rules[key] = replace(rule, service=own)  # it waits for its container itself
+    return {key: rule for key, rule in rules.items() if rule not in (None, StartRule())}

@@ -259,7 +259,7 @@ class MultiProcessRun(NativeRun):
             "processes": str(len(starts)),
             "domain": str(number),
         }
-        mains = [one.name for one in starts if one.is_main]
+        mains = [one.name for one in starts if one.is_main and not one.loads]
         if self.options.policy is not None and mains:
             self.note(
                 f"--policy has no effect in mains, which spin for themselves: {', '.join(mains)}"
@@ -430,7 +430,7 @@ class MultiProcessRun(NativeRun):
             self.fail(RunError(f"{what.name} {how}, {self._at} s after the start of the run"))
         elif not what.is_main and not what.may_fail:
             self.fail(RunError(f"{what.name} {how} in the middle of the run, at {self._at} s"))
-        else:
+        elif status != 0 or not what.loads:
             self.notes.append(f"{what.name} {'ended' if status == 0 else how} at {self._at} s")
         if what.required:
             self.stop(Stop(f"{what.key} has ended, which the run requires"))
