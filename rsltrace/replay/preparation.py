@@ -330,8 +330,20 @@ _OF_SIMULATIONS = (
 """Parts of a job without effect in a native run, and what a replay of one has from its trace."""
 
 
+_ONLY_OF_PROCESSES = (
+    *("environment", "working_directory", "respawn", "instant_sleep", "intra_process"),
+)
+
+
 def job_of_native(trace: Trace, job: Job) -> Job:
-    """Return the job that does again what a native run did."""
+    """Return the job that does again what a native run did. Python runs in rsltrace's own process,
+    as that run has observed it, except for what only a process of its own can have."""
+    from rsltrace.run.plans.processes import as_python  # which loads much
+
+    nodes = (
+        spec if any(getattr(spec, key) for key in _ONLY_OF_PROCESSES) else as_python(job, spec)
+        for spec in job.nodes
+    )
     defaults = {
         key: Job.model_fields[key].get_default(call_default_factory=True) for key in _OF_SIMULATIONS
     }
@@ -339,6 +351,7 @@ def job_of_native(trace: Trace, job: Job) -> Job:
     return job.model_copy(
         update={
             **defaults,
+            "nodes": tuple(nodes),
             "start_ns": trace.start_ns,
             "policy": PolicySpec(recorded=os.path.relpath(trace.name, job.base_dir)),
             "stop": StopSpec(duration_ns=lasted_ns),

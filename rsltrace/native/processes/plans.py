@@ -12,7 +12,6 @@ from rsltrace.adapters.processes.build import (
     OBSERVER,
     PreloadLibrary,
     find_ros,
-    is_python,
     library,
     program,
 )
@@ -22,7 +21,7 @@ from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.native.processes.children import ProcessStart
 from rsltrace.native.processes.wire import EntryOrder
 from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
-from rsltrace.run.plans.processes import ProcessPrograms
+from rsltrace.run.plans.processes import ProcessPrograms, as_python
 
 THE_BAGS = "the bags"
 """The name of the process that plays them."""
@@ -35,7 +34,7 @@ def starts_of(job: Job, like: EntryOrder, note: Callable[[str], None]) -> list[P
     :raises JobError: a program, or the folder that it is to run in, is not there.
     """
     processes = ProcessPrograms(job, lambda text: None)
-    observed = job.model_copy(update={"nodes": tuple(_observed(job, one) for one in job.nodes)})
+    observed = job.model_copy(update={"nodes": tuple(as_python(job, one) for one in job.nodes)})
     like = replace(like, job=observed, module_path=tuple(sys.path))
     starts = []
     observer = cache(lambda: _observer(note))  # built for the first program
@@ -90,17 +89,6 @@ def _observed_variables(
         search_path=processes.search_path,
         prefixes=processes.prefixes,
     ).environment
-
-
-def _observed(job: Job, spec: NodeSpec) -> NodeSpec:
-    """Return an entry as its process has to see it: Python code is observed there, and not by the
-    library that processes of a simulation have."""
-    changes: dict[str, object] = {"isolated": False}
-    if spec.program is not None:
-        path = job.resolve(spec.program)
-        if path.is_file() and is_python(path):
-            changes |= {"program": None, "script": spec.program}
-    return spec.model_copy(update=changes)
 
 
 def _command(job: Job, index: int, processes: ProcessPrograms, where: str) -> tuple[str, ...]:

@@ -40,6 +40,17 @@ from rsltrace.trace.model.regular_file import not_regular
 from rsltrace.trace.model.texts import printable
 
 
+def as_python(job: Job, spec: NodeSpec) -> NodeSpec:
+    """Return an entry as native runs observe it: Python is run by Python code of ours, and not with
+    the library that processes of a simulation have."""
+    changes: dict[str, object] = {"isolated": False}
+    if spec.program is not None:
+        path = job.resolve(spec.program)
+        if path.is_file() and is_python(path):
+            changes |= {"program": None, "script": spec.program}
+    return spec.model_copy(update=changes)
+
+
 class ProcessPrograms:
     """Makes the command lines of a job's processes; the first one builds the library."""
 
