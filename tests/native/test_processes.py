@@ -205,6 +205,17 @@ stop: {timeout: 120s}
         assert made["/server"] + 200_000_000 <= made["/talk"] < made["/last"]
 
 
+def test_what_a_program_does_is_known_while_it_runs(
+    tmp_path: Path, compiled: Callable[[str], Path]
+) -> None:
+    program = f"{{program: {compiled('counter.c')}, arguments: ['100']}}"
+    later = "{node: robot:Talker, start_after: {topic: /count}}"
+    done = record(tmp_path, f"nodes: [{program}, {later}]\nstop: {{topic: /same, duration: 60s}}\n")
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert "/same" in trace.result["stop_reason"]
+
+
 def test_a_program_that_fails_is_an_error(tmp_path: Path, command: Any) -> None:
     program = tmp_path / "fails.sh"
     program.write_text("#!/bin/sh\necho no such symbol >&2\nexit 127\n")

@@ -155,6 +155,7 @@ def _become(order: EntryOrder, link: Link) -> None:
     if link.receive() is None:
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    link.close_on_exec()
     try:
         os.execvpe(order.command[0], order.command, order.environment or os.environ)
     except OSError as error:

@@ -86,6 +86,10 @@ class Link:
         self._lock = threading.Lock()
         self._got = bytearray()
 
+    def close_on_exec(self) -> None:
+        """Do not leave the socket to the program that this process becomes."""
+        self._socket.set_inheritable(False)
+
     def send(self, *frame: Any) -> None:
         """Send a frame; it waits for as long as the other end does not read.
 
