@@ -107,7 +107,7 @@ def test_a_container_loads_components_in_order_with_all_that_the_job_says(folder
     assert [note for note in result.notes if "'in'" in note] == []
     assert said == [
         "('demo', 'demo::First', 'first', '/cam', ['odom:=odometry', 'in:=out'], "
-        "{'gain': 4, 'rate': 2.5, 'names': ['a', 'b']}, {'use_intra_process_comms': True})",
+        "{'gain': 4, 'names': ['a', 'b'], 'rate': 2.5}, {'use_intra_process_comms': True})",
         "('demo', 'demo::Second', '', '', ['odom:=odometry'], {'gain': 4}, {})",
     ]
 

@@ -102,6 +102,7 @@ def _service_class() -> Any:
 
 
 def _messages(values: Mapping[str, Any]) -> list[Any]:
+    """Return parameters in the order of their names: a trace keeps no other one of its job."""
     from rclpy.parameter import Parameter
 
-    return [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+    return [Parameter(name, value=values[name]).to_parameter_msg() for name in sorted(values)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
@@ -217,8 +218,12 @@ _ENDPOINTS = (
 )
 
 
+_ADDRESS = re.compile("[0-9a-f]{8,16}")
+
+
 class _Names(dict[int, str]):
-    """Unique names of entities, by their ids."""
+    """Unique names of entities, by their ids, without the addresses in names of nodes
+    (``tf2_ros::TransformListener``)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -228,7 +233,7 @@ class _Names(dict[int, str]):
     def add(self, entity: Entity) -> None:
         if entity.kind is EntityKind.NODE:
             self._nodes[entity.id] = entity.name
-        name = entity_text(entity, self._nodes.get(entity.node, ""))
+        name = _ADDRESS.sub("*", entity_text(entity, self._nodes.get(entity.node, "")))
         count = self._counts[name] = self._counts.get(name, 0) + 1
         self[entity.id] = name if count == 1 else f"{name} ({count})"
 
