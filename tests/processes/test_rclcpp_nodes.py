@@ -154,6 +154,8 @@ def test_native_runs_have_every_callback_with_its_cause(
         ]
         assert responses == [["/enable"]] * runs["/enable", EventKind.CLIENT]
         assert trace.result["unknown_causes"] == "0"
+    if executor == "events":  # its timers are sleeps to the loop, and have no turn
+        return
     again = replay(tmp_path / "run.mcap", trust=True, job_folder=tmp_path)
     assert any(note.startswith("all ") and "in its order" in note for note in again.notes)
     assert "callbacks started in the same order" in again.sentence
