@@ -10,7 +10,9 @@ pytest.importorskip("rclpy")
 
 from rsltrace import RunResult, Trace, record
 from rsltrace.job import load_job
+from rsltrace.run.plans.recorded_order import EntityNames
 from rsltrace.simulation.loop.recorded_order import CALLBACKS
+from rsltrace.trace.model.entity import Entity, EntityKind
 from tests.fit.native_like import as_native
 
 pytestmark = pytest.mark.ros
@@ -133,3 +135,27 @@ def test_nodes_that_are_not_there_are_played(folder: Path) -> None:
     assert lost.startswith("native.mcap does not hold ")
     expected = [one for one in own if one != ("/sink", "/two")]
     assert found[: len(expected)] == expected
+
+
+def _named(nodes: tuple[str, ...], native: EntityNames | None = None) -> EntityNames:
+    """Name nodes, each with a subscription to a topic that is named after it."""
+    names = EntityNames(native)
+    for number, name in enumerate(nodes):
+        names.add(Entity(2 * number + 1, 2 * number + 1, EntityKind.NODE, name, "", 0, {}))
+        topic = f"{name.split('_0x')[0]}/heard"
+        names.add(Entity(2 * number + 2, 2 * number + 1, EntityKind.SUBSCRIPTION, topic, "", 0, {}))
+    return names
+
+
+def test_nodes_correspond_whose_names_have_other_addresses_and_no_others() -> None:
+    native = _named(("/camera_10203040", "/tf_0x5581aa00", "/camera_55667788", "/tf_0x7fffe000"))
+    again = _named(
+        ("/camera_55667788", "/tf_0x11111111", "/camera_10203040", "/tf_0x22222222"), native
+    )
+    assert again[1] == native[5]
+    assert again[2] == native[6]
+    assert again[5] == native[1]
+    assert [again[3], again[4]] == [native[3], native[4]]
+    assert [again[7], again[8]] == [native[7], native[8]]
+    other = _named(("/camera_99999999", "/tf_0x1"), native)
+    assert other[3] == "/tf_0x1: node /tf_0x1"

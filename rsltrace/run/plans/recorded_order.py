@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -221,21 +222,32 @@ _ENDPOINTS = (
 _ADDRESS = re.compile("[0-9a-f]{8,16}")
 
 
-class _Names(dict[int, str]):
-    """Unique names of entities, by their ids, without the addresses in names of nodes
-    (``tf2_ros::TransformListener``)."""
+class EntityNames(dict[int, str]):
+    """Unique names of entities, by their ids: those that a ``native`` run has for them, in which an
+    address in the name of a node is another one (``tf2_ros::TransformListener``)."""
 
-    def __init__(self) -> None:
+    def __init__(self, native: EntityNames | None = None) -> None:
         super().__init__()
-        self._nodes: dict[int, str] = {}
+        self.nodes: dict[int, str] = {}
+        self._native = native
         self._counts: dict[str, int] = {}
 
     def add(self, entity: Entity) -> None:
+        """Name an entity, in the order of their creation."""
         if entity.kind is EntityKind.NODE:
-            self._nodes[entity.id] = entity.name
-        name = _ADDRESS.sub("*", entity_text(entity, self._nodes.get(entity.node, "")))
+            entity = replace(entity, name=self._node(entity.name))
+            self.nodes[entity.id] = entity.name
+        name = entity_text(entity, self.nodes.get(entity.node, ""))
         count = self._counts[name] = self._counts.get(name, 0) + 1
         self[entity.id] = name if count == 1 else f"{name} ({count})"
+
+    def _node(self, name: str) -> str:
+        theirs = () if self._native is None else self._native.nodes.values()
+        if name in theirs:
+            return name
+        shape, taken = _ADDRESS.sub("*", name), set(self.nodes.values())
+        alike = (one for one in theirs if _ADDRESS.sub("*", one) == shape and one not in taken)
+        return next(alike, name)
 
 
 class NativeOrderObserver(EventObserver):
@@ -245,9 +257,10 @@ class NativeOrderObserver(EventObserver):
 
     def __init__(self, domain: Domain, trace: Trace, file: str) -> None:
         self._domain, self._trace = domain, trace
-        self._names, self._native = _Names(), _Names()
+        self._native = EntityNames()
         for entity in trace.entities.values():
             self._native.add(entity)
+        self._names = EntityNames(self._native)
         self._sent: dict[int, int] = {}
         self._event, self._place = -1, 0
         self._playing: int | None = None
@@ -279,7 +292,7 @@ class NativeOrderObserver(EventObserver):
 
         self._stand_ins = StandIns(self._domain, self._definition)
         entities = self._trace.entities
-        here = {node.fully_qualified_name for node in self._domain.graph.nodes}
+        here = {self._names.nodes.get(node.entity_id) for node in self._domain.graph.nodes}
         absent = {
             one.id
             for one in entities.values()

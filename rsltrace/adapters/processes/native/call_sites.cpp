@@ -100,12 +100,13 @@ void note_answer(Source source, const char *call, const std::string &answer, con
 }
 
 void write_maker(Writer &body, const void *caller) {
-  void *frames[DEPTH_OF_TEMPLATES];
-  void **end = frames + backtrace(frames, DEPTH_OF_TEMPLATES);
-  void **first = std::find(frames, end, caller);
   std::vector<const Caller *> own;
-  for (void **frame = first; frame != end && caller_at(caller).own; ++frame)
-    if (const Caller &one = caller_at(*frame); one.own) own.push_back(&one);
+  if (caller_at(caller).own) {
+    void *frames[DEPTH_OF_TEMPLATES];
+    void **end = frames + backtrace(frames, DEPTH_OF_TEMPLATES);
+    for (void **frame = std::find(frames, end, caller); frame != end; ++frame)
+      if (const Caller &one = caller_at(*frame); one.own) own.push_back(&one);
+  }
   body.number(static_cast<std::uint32_t>(own.size()));
   for (const Caller *one : own) write_frame(body, *one);
 }
