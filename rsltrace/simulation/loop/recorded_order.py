@@ -309,10 +309,12 @@ class NativeOrder:
         if self._followed == count:
             yield f"all {count} callbacks of {self.file} ran in its order"
             return
+        if self._first is None:  # the run ended before
+            yield f"the first {self._followed} of {count} callbacks of {self.file} ran in its order"
+            return
+        step, why = self._first
         yield f"of {count} callbacks of {self.file} {self._followed} ran in its order"
-        if self._first is not None:
-            step, why = self._first
-            yield f"the first that did not is {step}: {why}"
+        yield f"the first that did not is {step}: {why}"
 
     def _left(self) -> Iterator[NativeStep]:
         if self.next is not None:
