@@ -88,14 +88,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if config.option.markexpr:
         return
     named = {(config.invocation_params.dir / arg.split("::")[0]).resolve() for arg in config.args}
-    left_out = [
+    left_out = {
         item
         for item in items
         if item.path not in named and any(item.get_closest_marker(name) for name in APART)
-    ]
+    }
     if left_out:
-        items[:] = [item for item in items if item not in set(left_out)]
-        config.hook.pytest_deselected(items=left_out)
+        items[:] = [item for item in items if item not in left_out]
+        config.hook.pytest_deselected(items=list(left_out))
 
 
 @pytest.fixture

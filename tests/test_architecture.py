@@ -364,8 +364,18 @@ class _CodeFinder(ast.NodeVisitor):
             self.found.add(module)
 
 
+def _has(source: str, names: Iterable[str]) -> bool:
+    """Return whether a module has one of the names, or the last part of one, as a word."""
+    return bool({name.rpartition(".")[2] for name in names}.intersection(_WORD.findall(source)))
+
+
+_WORD = re.compile(r"\w+")
+
+
 def _turns_into_code(source: str) -> set[str]:
     finder = _CodeFinder()
+    if not _has(source, {*_CALLS, *_MODULES, *_SHELLS, "shell", "allow_pickle", "YAML"}):
+        return finder.found
     finder.visit(_parse(source))
     for text in re.findall(r"^import ([\w, ]+)$", source, re.M):  # in programs that are texts here
         finder.found |= {one.strip().split(" ")[0] for one in text.split(",")} & _MODULES
@@ -403,7 +413,9 @@ _OPENS_PORTS = {
 
 def _opens_for_others(source: str) -> set[str]:
     """Return what a module uses that changes files, or opens sockets."""
-    found = set()
+    found: set[str] = set()
+    if not _has(source, {*_WRITES_FILES, *_OPENS_PORTS, "open", "fdopen"}):
+        return found
     for node in ast.walk(_parse(source)):
         if not isinstance(node, ast.Call):
             continue
@@ -524,7 +536,9 @@ _MARKUP = {"from_markup", "Template"}
 
 def _formats_of_others(source: str) -> list[str]:
     """Return formats that are no texts or constants of the module, and what reads markup."""
-    found = []
+    found: list[str] = []
+    if not _has(source, {*_MARKUP, "format", "format_map"}):
+        return found
     tree = _parse(source)
     texts = {
         name.id

@@ -83,6 +83,7 @@ def on_time(*numbers: int) -> list[tuple[int, int]]:
 # -- messages ------------------------------------------------------------------------------------
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("delay", [None, {"default": "0s"}])
 def test_a_message_is_lost_late_or_comes_twice(delay: Any) -> None:
     def heard(*faults: dict[str, Any]) -> list[tuple[int, int]]:

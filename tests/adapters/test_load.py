@@ -128,6 +128,7 @@ with Simulation(Job(nodes=[NodeSpec(node=many)], stop=StopSpec(duration=1.0))) a
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="3.10 shares by other rules")
 def test_handles_share_the_names_of_their_attributes(tmp_path: Path) -> None:
     """Else each has a table of its own of 1.5 kB, and 200 nodes do not fit into the cache."""

@@ -716,6 +716,7 @@ def spins_in_a_thread(node: Node) -> None:
     thread.join()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("spin", [rclpy.spin, spins_in_threads, spins_in_a_thread])
 @pytest.mark.parametrize("in_the_end", [False, True])
 def test_a_callback_cut_off_by_the_end_of_the_run_has_done_nothing_wrong(

@@ -56,6 +56,7 @@ def run_nodes(simulate: Any, seed: int, policy: Any) -> tuple[list[str], Any]:
     return shared.log, done
 
 
+@pytest.mark.long
 @of_jazzy
 def test_nodes_of_a_job_keep_rclpys_order(simulate: Any) -> None:
     for seed in SEEDS:

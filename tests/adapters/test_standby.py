@@ -220,7 +220,7 @@ def test_a_main_that_only_spins_runs_everything_at_once(
     assert served[0] > 200, f"{served} of {logged}"
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("seed", [2, 3, 6, 12])
 def test_whatever_callbacks_do_the_run_is_the_same(
     simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int

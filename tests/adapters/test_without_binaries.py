@@ -72,6 +72,7 @@ def test_a_run_needs_no_library_of_ros(python: Path, tmp_path: Path, job: str) -
     assert usual.replace("usual.mcap", "pure.mcap") == pure
 
 
+@pytest.mark.long
 def test_a_native_run_says_what_it_needs(python: Path, tmp_path: Path) -> None:
     job = f"{REPOSITORY}/examples/ping_pong/job.yaml"
     said = output_of(python, "record", job, "--native", "-o", f"{tmp_path}/native.mcap")

@@ -237,7 +237,7 @@ def test_what_a_job_takes_from_outside_of_its_revisions(robot: Robot, tmp_path: 
     assert "6.0  |  7.0" in done.stdout
 
 
-@pytest.mark.few(30)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("words", "said"),
     [

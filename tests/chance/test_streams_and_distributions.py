@@ -156,7 +156,7 @@ def test_lognormal() -> None:
     assert abs(sorted(by_median)[N // 2] / (5 * MS) - 1) < 4 * 0.5 * math.sqrt(math.pi / 2 / N)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", [0.5, 1.0, 2.0, 6.25])
 def test_gamma(shape: float) -> None:
     values = draws(Gamma(shape, MS), f"gamma {shape}")

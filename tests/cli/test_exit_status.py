@@ -33,7 +33,7 @@ def run(words: str, redirect: str, cwd: Path | None = None) -> subprocess.Comple
     )
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("words", "status"),
     [("info A", 0), ("diff A B", 1), ("diff A no.mcap", 2), ("--help", 0), ("diff --no", 2)],

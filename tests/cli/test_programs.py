@@ -141,6 +141,7 @@ def test_the_job_that_programs_make(workspace: Path, command: Command) -> None:
     }
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_the_same_bag_the_same_result(workspace: Path, command: Command) -> None:
     made = command(

@@ -13,6 +13,7 @@ import pytest
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "missing_event" / "a.mcap"
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("words", [["export", SAMPLE, "-o", "bag"], ["info", "--check", SAMPLE]])
 def test_progress_is_for_terminals(words: list[object], tmp_path: Path) -> None:
     command = [sys.executable, "-m", "rsltrace", *map(str, words)]

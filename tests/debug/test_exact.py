@@ -172,6 +172,7 @@ def check(folder: Path, job_folder: Path, positions: int, rng: random.Random) ->
     return positions
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("job", list(JOBS)[:2])
 def test_at_random_positions_going_back_is_exact(job: str, tmp_path: Path) -> None:
     check(tmp_path, JOBS[job](tmp_path), 3, random.Random(job))

@@ -304,6 +304,7 @@ def limit():
 """
 
 
+@pytest.mark.long
 def test_a_fork_that_fails(job: Callable[..., Path], tmp_path: Path) -> None:
     path = job("limit()")
     with (tmp_path / "ticks.py").open("a") as file:
@@ -399,6 +400,7 @@ def _command(pid: int) -> str:
         return ""
 
 
+@pytest.mark.long
 def test_requests_that_are_none_are_answered(folder: Path) -> None:
     with DebugSession(folder / "run.mcap", trust=True) as session:
         for request in ({}, {"do": "fly"}, {"do": "step", "count": "x"}, {"do": "event"}):

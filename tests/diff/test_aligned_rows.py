@@ -71,6 +71,7 @@ def check_signs(runs: AlignedRuns, a: Trace, b: Trace) -> None:
             assert event_a.stamp_ns == event_b.stamp_ns
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("kind", PLANTERS)
 def test_planted_pairs(kind: str, tmp_path: Path, per_block: int) -> None:
     folders = [tmp_path / f"{seed}" for seed in range(4)]

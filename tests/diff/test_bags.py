@@ -301,7 +301,7 @@ def test_tolerances_and_a_missing_message(compare: Any) -> None:
     assert (diff.first.presence, diff.first.a.index) == (Presence.ONLY_A, 25)
 
 
-@pytest.mark.few(8)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("at", range(1, 9))
 def test_one_missing_here_and_another_there_among_noise(compare: Any, at: int) -> None:
     """Both recordings are of one length, and no two messages of them are equal."""

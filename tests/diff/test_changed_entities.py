@@ -114,6 +114,7 @@ QOS = [
 ]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("end", "changed", "told"), QOS)
 def test_qos_that_fits_no_more(
     end: str, changed: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -145,6 +146,7 @@ def assert_blames(diff: Diff, node: str) -> None:
         assert f"the constructor of {other}" not in said
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("end", "requested", "offered", "told"),
     [
@@ -207,6 +209,7 @@ def test_periods_that_differ_are_shown_so(tmp_path: Path, monkeypatch: pytest.Mo
     assert "timer period 100.0001 → 100 ms" in rsltrace.diff(b, a).sentence
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("groups", "told"),
     [

@@ -346,6 +346,7 @@ def on_terminal(arguments: list[str], **environment: str) -> str:
     return shown.decode()
 
 
+@pytest.mark.long
 def test_colour_on_a_terminal_only() -> None:
     shown = on_terminal(["diff", str(A), str(B)])
     assert "\x1b[1;31m" in shown
@@ -356,7 +357,7 @@ def test_colour_on_a_terminal_only() -> None:
     assert max(len(line) for line in lines if not line.startswith(("  a ", "  b ", "next"))) <= 90
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("sample", sorted(p.parent.name for p in SAMPLES.glob("*/a.mcap")))
 def test_a_small_terminal_is_enough(sample: str) -> None:
     pair = [str(SAMPLES / sample / f"{name}.mcap") for name in "ab"]

@@ -112,6 +112,7 @@ def test_all_reports_lead_with_the_effect(recorded: Callable[..., Path]) -> None
     assert found["effect"]["settings"][0]["key"] == "nodes.follower.parameters.speed"
 
 
+@pytest.mark.long
 def test_an_effect_that_comes_late_is_found(recorded: Callable[..., Path]) -> None:
     options = {"ignore": "/cmd_vel:angular"}
     a, b = recorded(from_="20"), recorded(speed="1.5", from_="20")

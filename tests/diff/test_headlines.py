@@ -140,6 +140,7 @@ def test_exception_that_rclpy_suppresses(tmp_path: Path) -> None:
         assert cause.startswith(f"{told}; no earlier event differs, but the runs had different")
 
 
+@pytest.mark.long
 def test_exception_that_a_setting_provokes_and_rclpy_suppresses(tmp_path: Path) -> None:
     asked = 'self.get_parameter("lens").value'
     raising = CAMERA.replace("pass", f'if {asked}: raise KeyError("lens")')
@@ -194,6 +195,7 @@ LATCHED = (
 )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("each", ["number", "7"])
 def test_depth_of_a_history(each: str, tmp_path: Path) -> None:
     latched = (*LATCHED, ("EACH", each))
@@ -204,6 +206,7 @@ def test_depth_of_a_history(each: str, tmp_path: Path) -> None:
         assert f"likely cause: {created}: depth {depths}" in found.sentence
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("old", "new", "told"),
     [

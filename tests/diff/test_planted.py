@@ -152,6 +152,7 @@ def _differs(a: dict[int, object], b: dict[int, object], index: int) -> bool:
     return any(mine[name] != theirs[name] for name in names)  # type: ignore[index]
 
 
+@pytest.mark.long
 def test_the_check_bites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sabotage: an engine that knows no consequences is caught by the cases above."""
     monkeypatch.setattr(Propagation, "_explanation", lambda *_: (None, None))

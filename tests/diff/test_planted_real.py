@@ -138,7 +138,7 @@ def test_nothing_planted(diffed: Callable[..., Diff]) -> None:
     assert diffed(both="random").identical
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("mode", "verdict", "root", "node", "entity"),
     [

@@ -44,6 +44,7 @@ def rsltrace_command(*words: str, hash_seed: str = "0") -> subprocess.CompletedP
     )
 
 
+@pytest.mark.long
 @pytest.mark.few(1)
 @pytest.mark.ros
 @pytest.mark.skipif(sys.version_info < (3, 11), reason="3.10 hashes strings in another way")

@@ -70,7 +70,7 @@ def test_identical_runs_are_known_by_their_digests(tmp_path: Path) -> None:
         assert (a.bytes_read, b.bytes_read) == before, "nothing is read for it"
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("per_segment", [(64, 64), (64, 61), (64, 5), (7, 300)])
 def test_few_segments_are_read(tmp_path: Path, per_segment: tuple[int, int]) -> None:
     """As many as a binary search takes, and with equal segments no more than one of each file."""

@@ -107,6 +107,7 @@ def test_a_worker_that_dies_is_replaced_and_its_trial_made_again(
     assert again.digest == first.digest
 
 
+@pytest.mark.long
 def test_a_job_that_cannot_run_is_no_result(worker: Worker, tmp_path: Path) -> None:
     wrong = Trial(5, {"set": {"nodes.0.node": "nodes_under_search:Nobody"}}, "a wrong node")
     with pytest.raises(ExploreError, match=r"trial 5 \(a wrong node\): .*Nobody"):

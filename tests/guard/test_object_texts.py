@@ -47,6 +47,7 @@ class _Before:
     plain: Any
 
 
+@pytest.mark.long
 def test_texts_are_the_same_in_every_run(said: Callable[..., Any]) -> None:
     ballast = []
     runs = []

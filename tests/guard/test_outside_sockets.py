@@ -379,6 +379,7 @@ def test_what_a_device_says_is_given_again_when_it_is_gone(
     assert again.digest == first.digest
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("guard", "device", "read"),
     [

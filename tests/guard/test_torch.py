@@ -50,6 +50,7 @@ DRAW = "self.say(torch.rand(3).tolist(), torch.rand(1).tolist())"
 Said = Callable[..., list[Any]]
 
 
+@pytest.mark.few(1)
 def test_torch_draws_the_same_in_every_run(said: Said, torch: str) -> None:
     code = node_code(DRAW, imports=torch)
     first = said(code)

@@ -311,7 +311,7 @@ return LaunchDescription([])
     assert (Path.cwd(), os.environ.get("RSLTRACE_T")) == (tmp_path, None)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("body", "message"),
     [

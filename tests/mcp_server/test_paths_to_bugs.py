@@ -103,6 +103,7 @@ def test_backwards_and_forwards_and_searches(wall: Path) -> None:
     assert "/range → /speed" in latency
 
 
+@pytest.mark.long
 def test_why_a_callback_did_not_come(tmp_path: Path) -> None:
     sample = WALL.parents[1] / "sample_traces" / "missing_event" / "b.mcap"
     shutil.copy(sample, tmp_path / "run.mcap")

@@ -135,6 +135,7 @@ def run(
         return session.finish(), counter, made[0]
 
 
+@pytest.mark.few(1)
 @pytest.mark.ros
 @pytest.mark.parametrize("name", JOBS)
 def test_it_talks_with_rclpy_nodes_and_the_digest_is_the_same_each_time(

@@ -50,6 +50,7 @@ def test_a_process_has_an_environment_and_a_folder_of_its_own(
         _run(tmp_path, compiled("counter.c"), "    working_directory: nowhere")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("action", "failed"), [("leave", False), ("crash", True)])
 def test_a_process_starts_again_as_often_as_it_may(
     compiled: Compiled, tmp_path: Path, action: str, failed: bool

@@ -77,6 +77,7 @@ def _seen(path: Path, topic: str = "/seen") -> list[int]:
         return [trace.decode(topic, data).data for _, _, data in trace.messages(topic)]  # type: ignore[attr-defined]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("mode", ["plain", "guard", "ask"])
 def test_a_loop_that_looks_at_a_rate_gets_one_message_of_each_topic_each_time(
     compiled: Callable[[str], Path], tmp_path: Path, mode: str

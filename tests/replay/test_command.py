@@ -47,7 +47,7 @@ def test_what_is_said(command: Callable[..., Any]) -> None:
         )
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("until", "verified", "stamp"),
     [("0", 1, "0.000000000"), ("12", 13, "0.400000000"), ("0.4", 15, "0.4"), ("400ms", 15, "0.4")],
@@ -81,6 +81,7 @@ def test_log_records_begin_where_they_are_wanted(command: Callable[..., Any]) ->
     assert "too fast" not in command("-q").stderr
 
 
+@pytest.mark.long
 def test_a_divergence_is_told_as_by_diff(command: Callable[..., Any], tmp_path: Path) -> None:
     code = NODES.replace("0.125", "0.126")
     (tmp_path / "nodes_of_replay.py").write_text(code)

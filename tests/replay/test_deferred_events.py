@@ -98,6 +98,7 @@ def modelled(edits: list[str]) -> list[int]:
     return ran
 
 
+@pytest.mark.long
 def test_defers_that_overlap(folder: Path) -> None:
     edits = ["3: defer(2)", "4: defer(4)"]
     assert modelled(edits) == [1, 3, 0, 4, 5, 2, 6, 7, 8]
@@ -109,6 +110,7 @@ def test_an_event_deferred_when_the_run_stops_still_runs(folder: Path) -> None:
     assert branch(folder, "11: defer()") == list(range(COUNT))
 
 
+@pytest.mark.long
 def test_an_edit_finds_an_event_that_another_has_moved(folder: Path) -> None:
     assert branch(folder, "3: defer(2)", "5: drop()") == [1, 2, 3, 4, 5, 6, 7, 8]
     assert branch(folder, "3: defer(1)", "4: defer(1)") == [1, 2, 0, 3, 4, 5, 6, 7, 8]

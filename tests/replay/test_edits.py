@@ -93,6 +93,7 @@ def values(path: Path, topic: str) -> list[float]:
         return [trace.decode(topic, data).data for _, _, data in trace.messages(topic)]  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_a_message_as_one_receives_it_or_as_it_is_published(folder: Path) -> None:
     at = events(folder / "run.mcap", EventKind.SUBSCRIPTION, "/speed")[3]
     result = branch(folder, f"{at}: message.data += 100")

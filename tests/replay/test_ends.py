@@ -74,7 +74,7 @@ def main():
 """
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("job", "code"),
     [

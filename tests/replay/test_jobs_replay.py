@@ -50,7 +50,7 @@ EXAMPLES = [
 ]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("job", "overrides"), EXAMPLES)
 def test_examples_and_samples(
     job: str, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -89,7 +89,7 @@ FEATURES = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("feature", FEATURES)
 def test_mains_threads_and_calls_that_block(feature: str, tmp_path: Path) -> None:
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
@@ -114,7 +114,7 @@ def test_a_recorded_order_is_in_the_trace_itself(tmp_path: Path) -> None:
     assert result.is_whole
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("until", ["5", "20", None])
 def test_what_a_replay_has_not_come_to_is_no_note(
     recorded: Callable[..., Path], until: str | None

@@ -80,6 +80,7 @@ def test_a_viewer_is_bound_to_this_machine_only(ports: tuple[int, int] | None) -
     assert ("--web-viewer" in line) is (ports is not None)
 
 
+@pytest.mark.long
 def test_a_web_viewer_says_at_which_address_it_is(trace: Path) -> None:
     """Before it blocks: the page is there, and so is the recording that the address names."""
     command = [sys.executable, "-m", "rsltrace", "rerun", str(trace), "--web"]

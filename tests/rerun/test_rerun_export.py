@@ -192,6 +192,7 @@ def test_the_layout_is_in_the_file(recording: Recording) -> None:
     }
 
 
+@pytest.mark.long
 def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Path) -> None:
     gallery.write_gallery(tmp_path / "a.mcap", STEPS)
     gallery.write_gallery(tmp_path / "b.mcap", STEPS, differs_from=20)
@@ -333,7 +334,7 @@ def test_what_was_there_stays_until_the_recording_is_whole(tmp_path: Path) -> No
     assert len(list(tmp_path.iterdir())) == 3
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("schema", "why"),
     [

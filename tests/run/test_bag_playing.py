@@ -334,7 +334,7 @@ def test_a_folder_without_metadata_plays_in_the_order_of_its_files(
     assert "no metadata.yaml: bag_0.db3, bag_2.db3, bag_10.db3 play" in play.notes[0]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("mode", ["file", "message"])
 def test_compressed_bags_play_as_plain_ones(

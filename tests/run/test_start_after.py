@@ -88,7 +88,7 @@ def nodes(*entries: str, more: str = "") -> str:
     return "nodes:\n" + "".join(f"  - {{{entry}}}\n" for entry in entries) + more
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("more", ["", "policy: permutation\n", "executors: single_threaded\n"])
 def test_entries_start_when_their_job_says(
     more: str, record_job: Callable[..., Any], tmp_path: Path

@@ -99,6 +99,7 @@ def absolute(text: str) -> list[str]:
     return re.findall(r"\b1[67]\d{8}\.\d+", text)
 
 
+@pytest.mark.long
 def test_info_has_the_start_once(text: Callable[..., str]) -> None:
     shown = text("info", "one.mcap")
     assert "0.000000000 s to 1.999999999 s  (2 s), from simulated time 1700000000.0000" in shown
@@ -172,6 +173,7 @@ def test_checks_and_latencies(text: Callable[..., str]) -> None:
     assert not absolute(shown)
 
 
+@pytest.mark.long
 def test_replay_and_a_node_alone(text: Callable[..., str], runs: Path) -> None:
     shown = text("replay", "one.mcap", "--until", SECOND)
     assert f"to {SECOND} s" in shown

@@ -95,6 +95,7 @@ def record(callback: Callable[[int], None], path: Path, **options: Any) -> rsltr
     return rsltrace.record(job, path, force=True)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("guard", [True, False])
 def test_a_busy_loop_is_named_with_its_line(
     busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str], guard: bool

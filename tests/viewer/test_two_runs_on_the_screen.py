@@ -243,7 +243,7 @@ CASES = {
 }
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("case", [*CASES, "many moves"])
 def test_constructed_pairs(drive: Drive, simulator: Any, tmp_path: Path, case: str) -> None:
     plan = simulator.NodePlan
@@ -307,6 +307,7 @@ def test_a_difference_can_be_read_in_every_size(drive: Drive, size: tuple[int, i
     drive((folder / "a.mcap", folder / "b.mcap"), steps, size=size)
 
 
+@pytest.mark.long
 def test_what_depends_on_rows_stands_on_events_of_the_run_that_is_shown(drive: Drive) -> None:
     folder = SAMPLES / "schedule"
     pair = folder / "a.mcap", folder / "b.mcap"

@@ -336,6 +336,7 @@ def test_what_is_not_trusted_does_not_run(
     assert marker.exists()
 
 
+@pytest.mark.long
 def test_how_it_is_called(folder: Path) -> None:
     trace = str(folder / "run.mcap")
     for words in ([trace, trace, "--live"], ["--live"], [trace, "--live", "--follow"]):

@@ -124,6 +124,7 @@ def test_a_bag(bags: tuple[Path, Path]) -> None:
     drive(bags[:1], steps)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("size", [(80, 24), (200, 60)], ids=["80x24", "200x60"])
 def test_two_bags_open_where_they_differ(bags: tuple[Path, Path], size: tuple[int, int]) -> None:
     async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
@@ -266,7 +267,7 @@ def test_a_filter_of_two_recordings_keeps_what_either_has(bags: tuple[Path, Path
     drive(bags, steps, filter_text="topic:/pose index:140..150")
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("at", "expected"),
     [("1.445s", ("/pose", 144)), ("0", ("", 0)), ("99999", ("", -1)), ("99s", ("", -1))],

@@ -111,6 +111,7 @@ def _look(style: Any) -> str:
 _MARKS = ("bold", "dim", "italic", "underline", "reverse")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])
 def test_all_text_stands_out_from_its_background(
     pair: tuple[Path, Path], drive: Drive, light: bool

@@ -121,6 +121,7 @@ def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
     assert "b: /x 14, exception ValueError" in row
 
 
+@pytest.mark.long
 def test_a_trace_that_has_no_segment_yet(tmp_path: Path) -> None:
     path = record(tmp_path, "false", "1", "whole.mcap")
     (tmp_path / "begun.mcap").write_bytes(path.read_bytes()[:400])

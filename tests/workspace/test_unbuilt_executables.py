@@ -229,6 +229,7 @@ _NAMESPACES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_modules_without_an_init_and_an_init_beside_package_xml(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command

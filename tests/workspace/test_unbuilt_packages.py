@@ -226,6 +226,7 @@ def test_classes_and_hashes_are_those_that_a_build_makes(
         assert ours.read_text() == built.read_text()
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("text", "said"),
     [
