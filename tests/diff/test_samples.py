@@ -78,16 +78,16 @@ def test_recording_them_again_gives_the_same_runs(pair: Any, tmp_path: Path) -> 
             assert made.event_count == kept.event_count
 
 
-def test_the_document_shows_the_report_as_it_is() -> None:
-    document = (SAMPLES.parent / "docs" / "diff.md").read_text(encoding="utf-8")
-    shown = document.split("<!-- sample: nondeterministic_callback -->\n```text\n")[1]
-    report = (SAMPLES / "nondeterministic_callback" / "report.txt").read_text(encoding="utf-8")
-    assert shown.startswith(f"{report}```\n")
-
-
-def test_the_readme_shows_lines_of_the_report_in_order() -> None:
-    readme = (SAMPLES.parent / "README.md").read_text(encoding="utf-8")
-    shown = readme.partition("$ rsltrace diff a.mcap b.mcap\n")[2].partition("```")[0]
+@pytest.mark.parametrize(
+    ("document", "before"),
+    [
+        ("README.md", "$ rsltrace diff a.mcap b.mcap\n"),
+        ("docs/diff.md", "<!-- sample: nondeterministic_callback -->\n```text\n"),
+    ],
+)
+def test_documents_show_lines_of_the_report_in_order(document: str, before: str) -> None:
+    text = (SAMPLES.parent / document).read_text(encoding="utf-8")
+    shown = text.partition(before)[2].partition("```")[0]
     folder = SAMPLES / "nondeterministic_callback"
     report = iter((folder / "report.txt").read_text(encoding="utf-8").splitlines())
     lines = [line for line in shown.splitlines() if line != "..."]
