@@ -192,7 +192,8 @@ def test_calls_leave_no_memory_behind() -> None:
 @pytest.mark.ros
 def test_a_run_has_the_same_bytes_without_it(tmp_path: Path) -> None:
     files = []
-    record = [sys.executable, "-m", "rsltrace", "record", "examples/rslcpp_determinism/job.yaml", "-q"]
+    job = ROOT / "examples/rslcpp_determinism/job.yaml"
+    record = [sys.executable, "-m", "rsltrace", "record", job, "-q"]
     for setting in ("0", "1"):
         files.append(tmp_path / f"{setting}.mcap")
         environment = {**os.environ, "RSLTRACE_COMPILED": setting}
