@@ -114,25 +114,31 @@ static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_
   return -1;
 }
 
-static int buffer_init(Buffer *self, PyObject *args, PyObject *named) {
+static PyObject *buffer_new(PyTypeObject *type, PyObject *args, PyObject *named) {
   static char *names[] = {"write_segment",     "write_payloads", "events_max", "outputs_max",
                           "payload_bytes_max", "header_bytes",   NULL};
   PyObject *write_segment, *write_payloads, *first;
+  Py_ssize_t limits[4];
+  Buffer *self;
   if (!PyArg_ParseTupleAndKeywords(args, named, "OOnnnn", names, &write_segment, &write_payloads,
-                                   &self->events_max, &self->outputs_max,
-                                   &self->payload_bytes_max, &self->header_bytes))
-    return -1;
-  if (self->payloads != NULL) return 0;
+                                   limits, limits + 1, limits + 2, limits + 3))
+    return NULL;
+  self = (Buffer *)PyType_GenericAlloc(type, 0);
+  if (self == NULL) return NULL;
   self->write_segment = Py_NewRef(write_segment);
   self->write_payloads = Py_NewRef(write_payloads);
+  self->events_max = limits[0];
+  self->outputs_max = limits[1];
+  self->payload_bytes_max = limits[2];
+  self->header_bytes = limits[3];
   self->payloads = PyList_New(0);
   self->sequences = PyList_New(1);
   first = PyLong_FromLong(0);
-  if (self->payloads == NULL || self->sequences == NULL || first == NULL) {
-    Py_XDECREF(first);
-    return -1;
-  }
-  return PyList_SetItem(self->sequences, 0, first);
+  if (self->payloads == NULL || self->sequences == NULL || first == NULL ||
+      PyList_SetItem(self->sequences, 0, Py_NewRef(first)) < 0)
+    Py_CLEAR(self);
+  Py_XDECREF(first);
+  return (PyObject *)self;
 }
 
 static int buffer_traverse(Buffer *self, visitproc visit, void *arg) {
@@ -144,11 +150,10 @@ static int buffer_traverse(Buffer *self, visitproc visit, void *arg) {
   return 0;
 }
 
+/* Cycles go through the functions only; the lists stay until the end. */
 static int buffer_clear(Buffer *self) {
   Py_CLEAR(self->write_segment);
   Py_CLEAR(self->write_payloads);
-  Py_CLEAR(self->payloads);
-  Py_CLEAR(self->sequences);
   return 0;
 }
 
@@ -164,6 +169,8 @@ static void buffer_dealloc(Buffer *self) {
   PyTypeObject *type = Py_TYPE(self);
   PyObject_GC_UnTrack(self);
   buffer_clear(self);
+  Py_CLEAR(self->payloads);
+  Py_CLEAR(self->sequences);
   free_rows(self);
   PyObject_GC_Del(self);
   Py_DECREF(type);
@@ -319,11 +326,10 @@ static PyGetSetDef buffer_properties[] = {
 };
 
 static PyType_Slot buffer_slots[] = {
-    {Py_tp_init, buffer_init},         {Py_tp_new, PyType_GenericNew},
-    {Py_tp_dealloc, buffer_dealloc},   {Py_tp_traverse, buffer_traverse},
-    {Py_tp_clear, buffer_clear},       {Py_tp_methods, buffer_methods},
-    {Py_tp_members, buffer_members},   {Py_tp_getset, buffer_properties},
-    {0, NULL},
+    {Py_tp_new, buffer_new},           {Py_tp_dealloc, buffer_dealloc},
+    {Py_tp_traverse, buffer_traverse}, {Py_tp_clear, buffer_clear},
+    {Py_tp_methods, buffer_methods},   {Py_tp_members, buffer_members},
+    {Py_tp_getset, buffer_properties}, {0, NULL},
 };
 
 static PyType_Spec buffer_spec = {
