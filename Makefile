@@ -53,10 +53,12 @@ types: $(INSTALLED)
 architecture: $(INSTALLED)
 	$(BIN)/lint-imports
 
-# The tests start hundreds of processes: none of them shall have to compile our modules again.
+# The tests start hundreds of processes: none of them shall have to compile our modules again. The
+# module in C is built where a compiler is.
 unexport PYTHONDONTWRITEBYTECODE
 compiled: $(INSTALLED)
 	@$(BIN)/python -m compileall -q rsltrace viewer
+	@$(BIN)/python hatch_build.py
 
 unit: compiled
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST)

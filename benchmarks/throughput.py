@@ -36,6 +36,7 @@ RSLTRACE_MODES = {
     "rsltrace_delayed": (False, True),
     "rsltrace_recorded": (True, False),
     "rsltrace_recorded_delayed": (True, True),
+    "rsltrace_recorded_python": (True, False),
 }
 DELAYED = {plain: f"{plain}_delayed" for plain in ("rsltrace", "rsltrace_recorded")}
 DELAYED_AIM = 1.3
@@ -47,6 +48,7 @@ TITLES = {
     "rsltrace_recorded": "rsltrace, everything recorded",
     "rsltrace_delayed": "same, a random delay on every link",
     "rsltrace_recorded_delayed": "same, a random delay on every link",
+    "rsltrace_recorded_python": "recorded, no compiled module",
 }
 AIMS = (
     # (slower case, faster case, how many times faster it is meant to be)
@@ -107,10 +109,13 @@ def run_worker(case: Case, amount: float) -> dict[str, Any]:
     """
     with tempfile.TemporaryDirectory(prefix="rsltrace-throughput-") as folder:
         command = [sys.executable, __file__, "--worker", case.name, str(amount), folder]
+        environment = child_environment(Path(folder))
+        if case.mode.endswith("_python"):
+            environment["RSLTRACE_COMPILED"] = "0"
         try:
             done = subprocess.run(
                 command,
-                env=child_environment(Path(folder)),
+                env=environment,
                 capture_output=True,
                 text=True,
                 timeout=WORKER_S_MAX,

@@ -6,7 +6,9 @@ This runs at every callback, so it only packs and hashes. The writer handles the
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
+from rsltrace.compiled import core
 from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
 from rsltrace.trace.model.entity import Entity
@@ -19,35 +21,27 @@ _pack_output = OUTPUT_CONTENT.pack
 _DRAW = int(OutputKind.DRAW)
 
 
-class Recorder:
-    """The current event, and the hash chain so far.
+class PythonEventChain:
+    """The current event, and the hash chain so far. The compiled module has an equal class.
 
     ``outputs`` and ``output_hash`` belong to the current event; ``end_event`` closes it.
-    ``add_output`` is the writer's, unless ``tell`` adds observers.
     """
 
-    def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
-        self.writer = writer
-        self.keep_payload = keep_payload
+    def __init__(self, writer: TraceWriter) -> None:
         self.index = 0
         self.chain_hash = 0
         self.outputs = 0
         self.output_hash = 0
         self._add_event = writer.add_event
-        self.add_output = writer.add_output
+        self._add_output = self._writers_add_output = writer.add_output
         self._add_sequence = writer.add_sequence
         self._add_payload = writer.add_payload
 
-    @property
-    def digest(self) -> str:
-        """The digest of the run so far: the chain hash of the last event."""
-        return f"{self.chain_hash:016x}"
-
     def tell(self, observers: Sequence[Callable[[int, int, int], None]]) -> None:
         """Call each observer with kind, entity and content hash of every output from now on."""
-        add_output = self.writer.add_output
+        add_output = self._writers_add_output
         if not observers:
-            self.add_output = add_output
+            self._add_output = add_output
             return
 
         def tell(packed: bytes) -> None:
@@ -56,13 +50,13 @@ class Recorder:
             for one in observers:
                 one(kind, entity, content_hash)
 
-        self.add_output = tell
+        self._add_output = tell
 
     def output(self, kind: int, entity: int, content_hash: int, sequence: int = NO_SEQUENCE) -> int:
         """Add an output to the current event; return its number in it."""
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        add_output, add_sequence = self.add_output, self._add_sequence
+        add_output, add_sequence = self._add_output, self._add_sequence
         add_output(packed)
         add_sequence(sequence)
         position = self.outputs
@@ -73,7 +67,7 @@ class Recorder:
         """Add a random decision to the current event: it has no payload."""
         packed = _pack_output(draw, entity, _DRAW)
         self.output_hash = hash64(packed, self.output_hash)
-        add_output = self.add_output
+        add_output = self._add_output
         add_output(packed)
         self.outputs += 1
 
@@ -88,36 +82,12 @@ class Recorder:
             sequence = NO_SEQUENCE
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        add_output, add_sequence = self.add_output, self._add_sequence
+        add_output, add_sequence = self._add_output, self._add_sequence
         add_output(packed)
         add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
         return position
-
-    def detail(
-        self, kind: OutputKind, entity: int, stamp_ns: int, text: str, content_hash: int
-    ) -> int:
-        """Add an output described by a text, which is not hashed."""
-        sequence = self.writer.add_detail(self.index, self.outputs, stamp_ns, text)
-        return self.output(kind, entity, content_hash, sequence)
-
-    def finding(self, finding: Finding, stamp_ns: int) -> None:
-        """Record a finding of the guard in the current event. It is not hashed."""
-        self.writer.add_finding(finding, stamp_ns)
-
-    def code_line(self, line: CodeLine, stamp_ns: int) -> None:
-        """Record a code line. It is not hashed."""
-        self.writer.add_code_line(line, stamp_ns)
-
-    def state(self, node: int, stamp_ns: int, changes: str) -> None:
-        """Record how a node's state changed in the current event. It is not hashed."""
-        self.writer.add_state(self.index, node, stamp_ns, changes)
-
-    def entity(self, entity: Entity) -> None:
-        """Record an entity; its identity is part of the event that created it."""
-        self.writer.add_entity(entity)
-        self.output(OutputKind.ENTITY, entity.id, identity_hash(entity))
 
     def end_event(
         self,
@@ -150,3 +120,46 @@ class Recorder:
         self.index += 1
         self.outputs = 0
         self.output_hash = 0
+
+
+EventChain = PythonEventChain
+if core is not None and not TYPE_CHECKING:
+    EventChain = core.EventChain
+
+
+class Recorder(EventChain):
+    """Records the events of a run."""
+
+    def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
+        super().__init__(writer)
+        self.writer = writer
+        self.keep_payload = keep_payload
+
+    @property
+    def digest(self) -> str:
+        """The digest of the run so far: the chain hash of the last event."""
+        return f"{self.chain_hash:016x}"
+
+    def detail(
+        self, kind: OutputKind, entity: int, stamp_ns: int, text: str, content_hash: int
+    ) -> int:
+        """Add an output described by a text, which is not hashed."""
+        sequence = self.writer.add_detail(self.index, self.outputs, stamp_ns, text)
+        return self.output(kind, entity, content_hash, sequence)
+
+    def finding(self, finding: Finding, stamp_ns: int) -> None:
+        """Record a finding of the guard in the current event. It is not hashed."""
+        self.writer.add_finding(finding, stamp_ns)
+
+    def code_line(self, line: CodeLine, stamp_ns: int) -> None:
+        """Record a code line. It is not hashed."""
+        self.writer.add_code_line(line, stamp_ns)
+
+    def state(self, node: int, stamp_ns: int, changes: str) -> None:
+        """Record how a node's state changed in the current event. It is not hashed."""
+        self.writer.add_state(self.index, node, stamp_ns, changes)
+
+    def entity(self, entity: Entity) -> None:
+        """Record an entity; its identity is part of the event that created it."""
+        self.writer.add_entity(entity)
+        self.output(OutputKind.ENTITY, entity.id, identity_hash(entity))

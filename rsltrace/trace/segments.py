@@ -7,8 +7,6 @@ is a loop over the array.
 
 from __future__ import annotations
 
-from array import array
-from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -48,46 +46,35 @@ assert _CHAINED_DTYPE.itemsize == EVENT_DTYPE.itemsize
 assert _NUMBERED_DTYPE.itemsize == OUTPUT_DTYPE.itemsize
 
 
-def event_rows(rests: Sequence[bytes], chain_hashes: array[int]) -> npt.NDArray[np.void]:
+def event_rows(rests: bytes, chain_hashes: bytes) -> npt.NDArray[np.void]:
     """Return the events as an array of EVENT_DTYPE, shape (n,). ``rests`` are packed EVENT_REST."""
-    assert len(rests) == len(chain_hashes)
-    rows = np.empty(len(rests), dtype=_CHAINED_DTYPE)
-    rows["chain_hash"] = chain_hashes
-    rows["rest"] = np.frombuffer(b"".join(rests), dtype=_CHAINED_DTYPE["rest"])
+    packed = np.frombuffer(rests, dtype=_CHAINED_DTYPE["rest"])
+    rows = np.empty(len(packed), dtype=_CHAINED_DTYPE)
+    rows["chain_hash"] = np.frombuffer(chain_hashes, dtype="<u8")
+    rows["rest"] = packed
     return rows.view(EVENT_DTYPE)
 
 
 def output_rows(
-    contents: Sequence[bytes], sequences: array[int], events: npt.NDArray[np.void]
+    contents: bytes, sequences: bytes, events: npt.NDArray[np.void]
 ) -> npt.NDArray[np.void]:
     """Return the outputs of ``events`` as an array of OUTPUT_DTYPE, shape (n,).
 
     ``contents`` are packed OUTPUT_CONTENT, ``sequences`` those of all outputs except draws.
     """
-    packed, numbered = _contents(contents)
+    packed = np.frombuffer(contents, dtype=OUTPUT_CONTENT_DTYPE)
+    numbered = packed["kind"] != OutputKind.DRAW
+    numbers = np.frombuffer(sequences, dtype="<u4")
     owners = np.repeat(events["index"], events["outputs"])
     assert len(owners) == len(packed), "outputs do not match their events"
-    assert np.count_nonzero(numbered) == len(sequences), "outputs do not match their sequences"
+    assert np.count_nonzero(numbered) == len(numbers), "outputs do not match their sequences"
     rows = np.empty(len(packed), dtype=_NUMBERED_DTYPE)
     rows["event"] = owners
     rows["content"] = packed.view(_NUMBERED_DTYPE["content"])
     sequence = np.full(len(packed), NO_SEQUENCE, dtype="<u4")
-    sequence[numbered] = sequences
+    sequence[numbered] = numbers
     rows["sequence"] = sequence
     return rows.view(OUTPUT_DTYPE)
-
-
-def count_numbered(contents: Sequence[bytes]) -> int:
-    """Return how many of these outputs have a sequence."""
-    return int(np.count_nonzero(_contents(contents)[1]))
-
-
-def _contents(
-    contents: Sequence[bytes],
-) -> tuple[npt.NDArray[np.void], npt.NDArray[np.bool_]]:
-    """Return outputs as an array of OUTPUT_CONTENT_DTYPE, and which have a sequence."""
-    packed = np.frombuffer(b"".join(contents), dtype=OUTPUT_CONTENT_DTYPE)
-    return packed, packed["kind"] != OutputKind.DRAW
 
 
 def events_chunk(rows: npt.NDArray[np.void], channel_id: int) -> ChunkBody:

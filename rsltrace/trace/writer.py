@@ -10,11 +10,13 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace._version import __version__
+from rsltrace.compiled import core
 from rsltrace.errors import OutputError
 from rsltrace.trace import segments
 from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
@@ -24,6 +26,7 @@ from rsltrace.trace.format import (
     CDR_HEADER,
     CHECKSUM_KEY,
     CHECKSUMS_KEY,
+    EVENT_REST_DTYPE,
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
     LIBRARY,
@@ -31,6 +34,7 @@ from rsltrace.trace.format import (
     METADATA_FORMAT,
     METADATA_RESULT,
     METADATA_ROSBAG2,
+    OUTPUT_CONTENT_DTYPE,
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
     PROFILE,
@@ -59,12 +63,92 @@ from rsltrace.trace.mcap.chunk_builder import PendingMessages, messages_chunk
 from rsltrace.trace.mcap.records import MESSAGE_BYTES_MAX, MESSAGE_HEAD
 from rsltrace.trace.mcap.writer import McapWriter
 from rsltrace.trace.model.entity import Entity
-from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine
+from rsltrace.trace.model.event import NO_SEQUENCE, CodeLine, OutputKind
 from rsltrace.trace.model.finding import Finding
 from rsltrace.trace.rosbag2 import KEY, BagTopicMetadata, bag_metadata_yaml, normalized_qos
 
 _HEADER_BYTES = MESSAGE_HEAD.size
 SEGMENT_MEDIA_TYPE = "application/octet-stream"
+
+
+class PythonRecordBuffer:
+    """What waits to be written. The compiled module has an equal class.
+
+    ``write_segment`` is called when there are ``events_max`` events or ``outputs_max`` outputs,
+    ``write_payloads`` when the payloads have ``payload_bytes_max`` bytes, with ``header_bytes`` for
+    each. ``sequences`` are the next ones by channel id, which counts from 1.
+    """
+
+    def __init__(
+        self,
+        write_segment: Callable[[], None],
+        write_payloads: Callable[[], None],
+        *,
+        events_max: int,
+        outputs_max: int,
+        payload_bytes_max: int,
+        header_bytes: int,
+    ) -> None:
+        self._write_segment, self._write_payloads = write_segment, write_payloads
+        self._events_max, self._outputs_max = events_max, outputs_max
+        self._payload_bytes_max, self._header_bytes = payload_bytes_max, header_bytes
+        self.payloads: PendingMessages = []
+        self.payload_bytes = 0
+        self.sequences: list[int] = [0]
+        self._rests: list[bytes] = []
+        self._chain_hashes = array("Q")
+        self._outputs: list[bytes] = []
+        self._output_sequences = array("I")
+        self.add_output: Callable[[bytes], None] = self._outputs.append
+        self.add_sequence: Callable[[int], None] = self._output_sequences.append
+
+    @property
+    def events(self) -> int:
+        return len(self._rests)
+
+    @property
+    def outputs(self) -> int:
+        return len(self._outputs)
+
+    def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
+        sequence = self.sequences[channel_id]
+        self.payloads.extend((channel_id, sequence, stamp_ns, data))
+        self.sequences[channel_id] = sequence + 1
+        self.payload_bytes += len(data) + self._header_bytes
+        if self.payload_bytes >= self._payload_bytes_max:
+            self._write_payloads()
+        return sequence
+
+    def add_event(self, rest: bytes, chain_hash: int) -> None:
+        self._rests.append(rest)
+        self._chain_hashes.append(chain_hash)
+        if len(self._rests) >= self._events_max or len(self._outputs) >= self._outputs_max:
+            self._write_segment()
+
+    def rows(self) -> tuple[bytes, bytes, bytes, bytes]:
+        """Return the events without their chain hashes, these, the outputs and their sequences."""
+        rests, outputs = b"".join(self._rests), b"".join(self._outputs)
+        return rests, self._chain_hashes.tobytes(), outputs, self._output_sequences.tobytes()
+
+    def clear_rows(self) -> None:
+        self._rests.clear()
+        self._outputs.clear()
+        del self._output_sequences[:]
+        del self._chain_hashes[:]
+
+    def drop_unfinished(self) -> None:
+        """Drop what follows the last whole event: an interrupt may come anywhere."""
+        del self._rests[len(self._chain_hashes) :]
+        rests = np.frombuffer(b"".join(self._rests), dtype=EVENT_REST_DTYPE)
+        del self._outputs[int(rests["outputs"].sum()) :]
+        contents = np.frombuffer(b"".join(self._outputs), dtype=OUTPUT_CONTENT_DTYPE)
+        numbered = int(np.count_nonzero(contents["kind"] != OutputKind.DRAW))
+        del self._output_sequences[numbered:]
+
+
+RecordBuffer = PythonRecordBuffer
+if core is not None and not TYPE_CHECKING:
+    RecordBuffer = core.RecordBuffer
 
 
 class TraceWriter:
@@ -73,9 +157,11 @@ class TraceWriter:
     Add an event's outputs before the event; entities and payloads at any time before the event that
     refers to them. ``add_output`` takes an output of the next event, packed by
     ``format.OUTPUT_CONTENT``; unless it is a draw, ``add_sequence`` takes the sequence of its
-    payload (or NO_SEQUENCE). Both are methods of the collecting lists, since a run calls them for
-    every message. ``close`` ends the file; leaving the ``with`` block without it leaves the file of
-    an interrupted run (``abort``).
+    payload (or NO_SEQUENCE). ``add_payload`` takes the channel, the time and the CDR of a message,
+    and returns its sequence in the channel; ``add_event`` the next event, packed by
+    ``format.EVENT_REST``, and its chain hash. These four are the buffer's own, since a run calls
+    them for every message. ``close`` ends the file; leaving the ``with`` block without it leaves
+    the file of an interrupted run (``abort``).
 
     Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no space,
     a failing disk, a file too large. The file is then readable up to its last whole segment.
@@ -95,18 +181,21 @@ class TraceWriter:
         Raises OutputError if ``path`` exists and ``force`` is false, is a folder, or cannot be
         created. Missing folders are not made: mostly they are typing errors.
         """
-        self._segment_events = events_per_segment or EVENTS_PER_SEGMENT
-        self._rests: list[bytes] = []
-        self._chain_hashes = array("Q")
-        self._outputs: list[bytes] = []
-        self.add_output: Callable[[bytes], None] = self._outputs.append
-        self._output_sequences = array("I")
-        self.add_sequence: Callable[[int], None] = self._output_sequences.append
-        self._payloads: PendingMessages = []
-        self._payload_bytes = 0
+        self._buffer = buffer = RecordBuffer(
+            self._write_segment,
+            self._write_payloads,
+            events_max=events_per_segment or EVENTS_PER_SEGMENT,
+            outputs_max=OUTPUTS_PER_SEGMENT,
+            payload_bytes_max=PAYLOAD_BYTES_PER_CHUNK,
+            header_bytes=_HEADER_BYTES,
+        )
+        self.add_event: Callable[[bytes, int], None] = buffer.add_event
+        self.add_output: Callable[[bytes], None] = buffer.add_output
+        self.add_sequence: Callable[[int], None] = buffer.add_sequence
+        self.add_payload: Callable[[int, int, bytes], int] = buffer.add_payload
+        self._sequences = buffer.sequences
         self._entities: PendingMessages = []
         self._entity_bytes = 0
-        self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
         self._segments: list[bytes] = []
         self._events_written = 0
@@ -169,17 +258,21 @@ class TraceWriter:
     @property
     def event_count(self) -> int:
         """The number of events added."""
-        return self._events_written + len(self._rests)
+        return self._events_written + self._buffer.events
 
     @property
     def output_count(self) -> int:
         """The number of outputs added."""
-        return self._outputs_written + len(self._outputs)
+        return self._outputs_written + self._buffer.outputs
 
     @property
     def digest(self) -> str:
         """The digest so far: the last chain hash as 16 hex digits."""
-        return digest_text(self._chain_hashes[-1] if self._chain_hashes else self._last_chain_hash)
+        chain_hashes = self._buffer.rows()[1]
+        last = (
+            int.from_bytes(chain_hashes[-8:], "little") if chain_hashes else self._last_chain_hash
+        )
+        return digest_text(last)
 
     @property
     def size(self) -> int:
@@ -225,23 +318,6 @@ class TraceWriter:
             self._channel_ids[key] = channel_id
         return channel_id
 
-    def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
-        """Add a message (CDR with its 4-byte header). Returns its sequence in the channel."""
-        sequence = self._sequences[channel_id]
-        self._payloads.extend((channel_id, sequence, stamp_ns, data))
-        self._sequences[channel_id] = sequence + 1
-        self._payload_bytes += len(data) + _HEADER_BYTES
-        if self._payload_bytes >= PAYLOAD_BYTES_PER_CHUNK:
-            self._write_payloads()
-        return sequence
-
-    def add_event(self, rest: bytes, chain_hash: int) -> None:
-        """Add the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
-        self._rests.append(rest)
-        self._chain_hashes.append(chain_hash)
-        if len(self._rests) >= self._segment_events or len(self._outputs) >= OUTPUTS_PER_SEGMENT:
-            self._write_segment()
-
     def add_entity(self, entity: Entity) -> int:
         """Add an entity before the first event that names it."""
         channel_id, data = self._entity_channel, pack_entity(entity)
@@ -279,7 +355,7 @@ class TraceWriter:
 
     def flush(self) -> None:
         """Write the events that there are: they stay if this process is killed."""
-        if self._rests:
+        if self._buffer.events:
             self._write_segment()
 
     def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
@@ -291,8 +367,8 @@ class TraceWriter:
         ``replace``, the trace replaces an older one. After an OutputError the file is closed, too.
         """
         try:
-            self._drop_unfinished_event()
-            if self._rests:
+            self._buffer.drop_unfinished()
+            if self._buffer.events:
                 self._write_segment()
             self._write_entities()
             self._write_payloads()
@@ -317,20 +393,20 @@ class TraceWriter:
             self._entity_bytes = 0
 
     def _write_payloads(self) -> None:
-        if not self._payloads:
+        if not self._buffer.payloads:
             return
         if max(self._sequences) >= NO_SEQUENCE:
             raise OutputError(
                 f"a topic has more than {NO_SEQUENCE} messages, more than a trace can number; "
                 "leave its payloads out (record: exclude: in the job)"
             )
-        if self._payload_bytes > MESSAGE_BYTES_MAX + PAYLOAD_BYTES_PER_CHUNK:
+        if self._buffer.payload_bytes > MESSAGE_BYTES_MAX + PAYLOAD_BYTES_PER_CHUNK:
             raise OutputError(
                 f"a message has more than {MESSAGE_BYTES_MAX} bytes, more than a trace can hold; "
                 "leave its topic out (record: exclude: in the job)"
             )
-        self._write_waiting(self._payloads)
-        self._payload_bytes = 0
+        self._write_waiting(self._buffer.payloads)
+        self._buffer.payload_bytes = 0
 
     def _write_waiting(self, waiting: PendingMessages) -> None:
         try:
@@ -350,9 +426,10 @@ class TraceWriter:
             raise
 
     def _write_events_and_outputs(self) -> None:
-        events = segments.event_rows(self._rests, self._chain_hashes)
+        rests, chain_hashes, contents, sequences = self._buffer.rows()
+        events = segments.event_rows(rests, chain_hashes)
         self._check(events)
-        outputs = segments.output_rows(self._outputs, self._output_sequences, events)
+        outputs = segments.output_rows(contents, sequences, events)
         outputs_at = (0, 0)
         if len(outputs):
             outputs_at = self._stream.chunk(
@@ -362,26 +439,16 @@ class TraceWriter:
         firsts = (self._events_written, self._outputs_written)
         row = segments.segment_row(events, len(outputs), firsts, events_at, outputs_at)
         self._segments.append(row.tobytes())
-        self._last_chain_hash = self._chain_hashes[-1]
+        self._last_chain_hash = int(events["chain_hash"][-1])
         self._events_written += len(events)
         self._outputs_written += len(outputs)
-        self._rests.clear()
-        self._outputs.clear()
-        del self._output_sequences[:]
-        del self._chain_hashes[:]
+        self._buffer.clear_rows()
 
     def _check(self, events: npt.NDArray[np.void]) -> None:
         """Stop at once if the recorder miscounts: such a trace would mislead."""
         first = self._events_written
         indexes = np.arange(first, first + len(events), dtype=np.uint64)
         assert np.array_equal(events["index"], indexes), "events are not numbered 0, 1, 2, …"
-
-    def _drop_unfinished_event(self) -> None:
-        """Drop what follows the last whole event: an interrupt may come anywhere."""
-        del self._rests[len(self._chain_hashes) :]
-        events = segments.event_rows(self._rests, self._chain_hashes)
-        del self._outputs[int(events["outputs"].sum()) :]
-        del self._output_sequences[segments.count_numbered(self._outputs) :]
 
     def _result(self, given: Mapping[str, str]) -> dict[str, str]:
         return {

@@ -187,7 +187,7 @@ class Simulation:
                     }
                 )
             else:
-                writer._write_segment() if writer._rests else None
+                writer.flush()
         return self
 
     # -- construction ----------------------------------------------------------------------------

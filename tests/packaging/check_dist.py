@@ -63,7 +63,10 @@ def check_contents(wheel: Path, sdist: Path) -> str:
         assert len(names) == len(set(names)), "a file is in the wheel twice"
         said = archive.read("rsltrace/_version.py").decode()
     assert repr(version) in said, f"the wheel is {version}, its code says {said}"
+    is_compiled = "rsltrace/_core.abi3.so" in names
+    assert is_compiled != wheel.name.endswith("-py3-none-any.whl"), wheel.name
     code = {path.relative_to(ROOT) for path in (ROOT / "rsltrace").rglob("*") if path.is_file()}
+    code -= {Path("rsltrace/_core.c"), Path("rsltrace/_core.abi3.so")}
     missing = {str(p) for p in code if "__pycache__" not in p.parts} - set(names)
     assert not missing, f"not in the wheel: {sorted(missing)}"
     assert sum(".data/data/share/man/man1/" in name for name in names) > 10, "no manual pages"

@@ -23,12 +23,18 @@ def test_a_checkout_has_one_version() -> None:
 
 
 @pytest.mark.long
-def test_wheel_and_sdist_have_all_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("compiler", ["cc", "false"])
+def test_wheel_and_sdist_have_all_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compiler: str
+) -> None:
     pytest.importorskip("hatch_vcs")
+    monkeypatch.setenv("CC", compiler)
     build = [sys.executable, "-m", "build", "--no-isolation", "--outdir", tmp_path, ROOT]
     check_dist.run(*build, cwd=tmp_path)
     (wheel,), (sdist,) = tmp_path.glob("*.whl"), tmp_path.glob("*.tar.gz")
     version = check_dist.check_contents(wheel, sdist)
+    can_compile = compiler == "cc" and shutil.which("cc") is not None
+    assert wheel.name.endswith("-py3-none-any.whl") != can_compile
     assert sdist.name == f"rsltrace-{version}.tar.gz"
 
 

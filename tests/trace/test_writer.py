@@ -446,7 +446,11 @@ def test_leaving_the_block_without_close_leaves_an_interrupted_trace(tmp_path: P
         assert trace.event_count == EVENTS_PER_SEGMENT
 
 
-def test_a_recorder_that_miscounts_is_stopped(tmp_path: Path) -> None:
+@pytest.mark.parametrize("buffer", ["RecordBuffer", "PythonRecordBuffer"])
+def test_a_recorder_that_miscounts_is_stopped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, buffer: str
+) -> None:
+    monkeypatch.setattr(writer_module, "RecordBuffer", getattr(writer_module, buffer))
     event = [EVENT_REST.pack(i, 0, 0, 0, 0, 0, 0, 0, 0, 2, 0) for i in (0, 2)]
     with TraceWriter(tmp_path / "a.mcap", force=False) as writer:
         for rest in event:

@@ -25,20 +25,16 @@ from rsltrace.simulation.middleware.interface import MessageFault, TopicFaults
 from rsltrace.simulation.middleware.qos.policies import INFINITE_NS, Qos, Reliability
 from rsltrace.simulation.middleware.qos.timing import MESSAGE_LOST, RequestedLease, finite
 from rsltrace.simulation.middleware.subscription import Delivery, Subscription
-from rsltrace.trace.chain import hash64
-from rsltrace.trace.format import OUTPUT_CONTENT
-from rsltrace.trace.model.event import OutputKind, RandomDecision, encode_decision
+from rsltrace.trace.model.event import RandomDecision, encode_decision
 
 # Fast links: every message arrives, in order, at once or later. With a delay on every link, most
 # events of a run come this way, so lookups are bound once in a closure, arrivals go straight into
-# the loop's queue, and draws to the recorder without a call.
+# the loop's queue.
 
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
 _FAST_LINK_DELAY = encode_decision(RandomDecision.DELAY)
-_DRAW = int(OutputKind.DRAW)
-_pack_output = OUTPUT_CONTENT.pack
 
 
 class FastLink(Protocol):
@@ -84,12 +80,8 @@ def fast_send(dispatcher: Dispatcher, link: FastLink, delay: Sampler) -> Send:
             delay_ns = arrival_ns - leaves_ns
         link.last_ns = arrival_ns
         recorder = dispatcher.recorder
-        if recorder is not None:  # what Recorder.draw does
-            packed = _pack_output(_FAST_LINK_DELAY | delay_ns, entity, _DRAW)
-            recorder.output_hash = hash64(packed, recorder.output_hash)
-            add_output = recorder.add_output
-            add_output(packed)
-            recorder.outputs += 1
+        if recorder is not None:
+            recorder.draw(entity, _FAST_LINK_DELAY | delay_ns)
         place = next_place()
         release = (
             arrival_ns, ORDER_RELEASE, place, arrive, data, event, position, digest, stamp_ns, count

@@ -1,0 +1,621 @@
+/* The hot part of a recorded run, compiled: what trace/recorder.py's EventChain and trace/writer.py's
+   RecordBuffer do, with the same bytes. What is unusual (a number that does not fit, an index of
+   numpy) is left to Python's struct. */
+
+#define PY_SSIZE_T_CLEAN
+#define Py_LIMITED_API 0x030A0000
+#include <Python.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <string.h>
+#include <structmember.h>
+
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "rows are packed as they lie in memory"
+#endif
+
+enum {
+  REST = 62,        /* format.EVENT_REST */
+  REST_OUTPUTS = 56,
+  CONTENT = 16,     /* format.OUTPUT_CONTENT */
+  CONTENT_KIND = 12,
+  DRAW = 11,        /* OutputKind.DRAW */
+};
+
+#define U8 0xFFu
+#define U32 0xFFFFFFFFu
+#define U64 UINT64_MAX
+
+/* -- XXH3-64 with a seed, of the two sizes that are hashed here ---------------------------------- */
+
+static const uint8_t SECRET[64] = {
+    0xb8, 0xfe, 0x6c, 0x39, 0x23, 0xa4, 0x4b, 0xbe, 0x7c, 0x01, 0x81, 0x2c, 0xf7, 0x21, 0xad, 0x1c,
+    0xde, 0xd4, 0x6d, 0xe9, 0x83, 0x90, 0x97, 0xdb, 0x72, 0x40, 0xa4, 0xa4, 0xb7, 0xb3, 0x67, 0x1f,
+    0xcb, 0x79, 0xe6, 0x4e, 0xcc, 0xc0, 0xe5, 0x78, 0x82, 0x5a, 0xd0, 0x7d, 0xcc, 0xff, 0x72, 0x21,
+    0xb8, 0x08, 0x46, 0x74, 0xf7, 0x43, 0x24, 0x8e, 0xe0, 0x35, 0x90, 0xe6, 0x81, 0x3a, 0x26, 0x4c,
+};
+
+static uint64_t at(const uint8_t *data) {
+  uint64_t value;
+  memcpy(&value, data, sizeof value);
+  return value;
+}
+
+static uint64_t folded(uint64_t a, uint64_t b) {
+  const unsigned __int128 product = (unsigned __int128)a * b;
+  return (uint64_t)product ^ (uint64_t)(product >> 64);
+}
+
+static uint64_t mixed(const uint8_t *data, const uint8_t *secret, uint64_t seed) {
+  return folded(at(data) ^ (at(secret) + seed), at(data + 8) ^ (at(secret + 8) - seed));
+}
+
+static uint64_t finished(uint64_t hash) {
+  hash = (hash ^ hash >> 37) * 0x165667919E3779F9;
+  return hash ^ hash >> 32;
+}
+
+static uint64_t content_hash64(const uint8_t *data, uint64_t seed) {
+  const uint64_t low = at(data) ^ ((at(SECRET + 24) ^ at(SECRET + 32)) + seed);
+  const uint64_t high = at(data + 8) ^ ((at(SECRET + 40) ^ at(SECRET + 48)) - seed);
+  return finished(CONTENT + __builtin_bswap64(low) + high + folded(low, high));
+}
+
+static uint64_t rest_hash64(const uint8_t *data, uint64_t seed) {
+  return finished(REST * 0x9E3779B185EBCA87 + mixed(data, SECRET, seed) +
+                  mixed(data + REST - 16, SECRET + 16, seed) +
+                  mixed(data + 16, SECRET + 32, seed) +
+                  mixed(data + REST - 32, SECRET + 48, seed));
+}
+
+/* -- RecordBuffer ------------------------------------------------------------------------------- */
+
+typedef struct {
+  uint8_t *data;
+  size_t size, capacity;
+} Bytes;
+
+static int append(Bytes *bytes, const void *data, size_t size) {
+  if (bytes->size + size > bytes->capacity) {
+    const size_t capacity = 2 * bytes->capacity + 4096;
+    uint8_t *larger = PyMem_Realloc(bytes->data, capacity);
+    if (larger == NULL) {
+      PyErr_NoMemory();
+      return -1;
+    }
+    bytes->data = larger;
+    bytes->capacity = capacity;
+  }
+  memcpy(bytes->data + bytes->size, data, size);
+  bytes->size += size;
+  return 0;
+}
+
+typedef struct {
+  PyObject_HEAD
+  PyObject *write_segment, *write_payloads, *payloads, *sequences;
+  Py_ssize_t events_max, outputs_max, payload_bytes_max, header_bytes;
+  Py_ssize_t payload_bytes;
+  Bytes rests, chain_hashes, contents, numbers;
+} Buffer;
+
+static PyTypeObject *buffer_type;
+static PyObject *draw_kind, *no_sequence;
+
+static int called(PyObject *function) {
+  PyObject *result = PyObject_CallObject(function, NULL);
+  Py_XDECREF(result);
+  return result == NULL ? -1 : 0;
+}
+
+static int check_count(const char *name, Py_ssize_t count, Py_ssize_t least, Py_ssize_t most) {
+  if (count >= least && count <= most) return 0;
+  PyErr_Format(PyExc_TypeError, "%s() got %zd arguments", name, count);
+  return -1;
+}
+
+static PyObject *buffer_new(PyTypeObject *type, PyObject *args, PyObject *named) {
+  static char *names[] = {"write_segment",     "write_payloads", "events_max", "outputs_max",
+                          "payload_bytes_max", "header_bytes",   NULL};
+  PyObject *write_segment, *write_payloads, *first;
+  Py_ssize_t limits[4];
+  Buffer *self;
+  if (!PyArg_ParseTupleAndKeywords(args, named, "OOnnnn", names, &write_segment, &write_payloads,
+                                   limits, limits + 1, limits + 2, limits + 3))
+    return NULL;
+  self = (Buffer *)PyType_GenericAlloc(type, 0);
+  if (self == NULL) return NULL;
+  self->write_segment = Py_NewRef(write_segment);
+  self->write_payloads = Py_NewRef(write_payloads);
+  self->events_max = limits[0];
+  self->outputs_max = limits[1];
+  self->payload_bytes_max = limits[2];
+  self->header_bytes = limits[3];
+  self->payloads = PyList_New(0);
+  self->sequences = PyList_New(1);
+  first = PyLong_FromLong(0);
+  if (self->payloads == NULL || self->sequences == NULL || first == NULL ||
+      PyList_SetItem(self->sequences, 0, Py_NewRef(first)) < 0)
+    Py_CLEAR(self);
+  Py_XDECREF(first);
+  return (PyObject *)self;
+}
+
+static int buffer_traverse(Buffer *self, visitproc visit, void *arg) {
+  Py_VISIT(Py_TYPE(self));
+  Py_VISIT(self->write_segment);
+  Py_VISIT(self->write_payloads);
+  Py_VISIT(self->payloads);
+  Py_VISIT(self->sequences);
+  return 0;
+}
+
+/* Cycles go through the functions only; the lists stay until the end. */
+static int buffer_clear(Buffer *self) {
+  Py_CLEAR(self->write_segment);
+  Py_CLEAR(self->write_payloads);
+  return 0;
+}
+
+static void free_rows(Buffer *self) {
+  Bytes *all[] = {&self->rests, &self->chain_hashes, &self->contents, &self->numbers};
+  for (int i = 0; i < 4; ++i) {
+    PyMem_Free(all[i]->data);
+    memset(all[i], 0, sizeof *all[i]);
+  }
+}
+
+static void buffer_dealloc(Buffer *self) {
+  PyTypeObject *type = Py_TYPE(self);
+  PyObject_GC_UnTrack(self);
+  buffer_clear(self);
+  Py_CLEAR(self->payloads);
+  Py_CLEAR(self->sequences);
+  free_rows(self);
+  PyObject_GC_Del(self);
+  Py_DECREF(type);
+}
+
+/* Returns the sequence of the message in its channel. */
+static PyObject *add_payload(Buffer *self, PyObject *channel, PyObject *stamp, PyObject *data) {
+  PyObject *sequence, *next, *parts[4];
+  Py_ssize_t size;
+  const Py_ssize_t place = PyLong_AsSsize_t(channel);
+  if (place == -1 && PyErr_Occurred()) return NULL;
+  sequence = PyList_GetItem(self->sequences, place);
+  if (sequence == NULL) return NULL;
+  Py_INCREF(sequence);
+  parts[0] = channel, parts[1] = sequence, parts[2] = stamp, parts[3] = data;
+  size = PyObject_Length(data);
+  if (size < 0) goto failed;
+  for (int i = 0; i < 4; ++i)
+    if (PyList_Append(self->payloads, parts[i]) < 0) goto failed;
+  next = PyLong_FromUnsignedLongLong(PyLong_AsUnsignedLongLong(sequence) + 1);
+  if (next == NULL || PyList_SetItem(self->sequences, place, next) < 0) goto failed;
+  self->payload_bytes += size + self->header_bytes;
+  if (self->payload_bytes >= self->payload_bytes_max && called(self->write_payloads) < 0)
+    goto failed;
+  return sequence;
+failed:
+  Py_DECREF(sequence);
+  return NULL;
+}
+
+static int add_event(Buffer *self, const uint8_t *rest, uint64_t chain_hash) {
+  if (append(&self->rests, rest, REST) < 0) return -1;
+  if (append(&self->chain_hashes, &chain_hash, 8) < 0) {
+    self->rests.size -= REST;
+    return -1;
+  }
+  if (self->rests.size >= (size_t)self->events_max * REST ||
+      self->contents.size >= (size_t)self->outputs_max * CONTENT)
+    return called(self->write_segment);
+  return 0;
+}
+
+static PyObject *buffer_add_payload(Buffer *self, PyObject *const *args, Py_ssize_t count) {
+  if (check_count("add_payload", count, 3, 3) < 0) return NULL;
+  return add_payload(self, args[0], args[1], args[2]);
+}
+
+/* Returns bytes of the wanted size, or NULL with an error. */
+static const uint8_t *packed_bytes(PyObject *packed, Py_ssize_t wanted) {
+  char *data;
+  Py_ssize_t size;
+  if (PyBytes_AsStringAndSize(packed, &data, &size) < 0) return NULL;
+  if (size == wanted) return (const uint8_t *)data;
+  PyErr_Format(PyExc_ValueError, "%zd bytes where %zd are expected", size, wanted);
+  return NULL;
+}
+
+static PyObject *buffer_add_event(Buffer *self, PyObject *const *args, Py_ssize_t count) {
+  const uint8_t *rest;
+  uint64_t chain_hash;
+  if (check_count("add_event", count, 2, 2) < 0) return NULL;
+  rest = packed_bytes(args[0], REST);
+  if (rest == NULL) return NULL;
+  chain_hash = PyLong_AsUnsignedLongLong(args[1]);
+  if ((chain_hash == U64 && PyErr_Occurred()) || add_event(self, rest, chain_hash) < 0)
+    return NULL;
+  Py_RETURN_NONE;
+}
+
+static PyObject *buffer_add_output(Buffer *self, PyObject *packed) {
+  const uint8_t *content = packed_bytes(packed, CONTENT);
+  if (content == NULL || append(&self->contents, content, CONTENT) < 0) return NULL;
+  Py_RETURN_NONE;
+}
+
+static int add_sequence(Buffer *self, PyObject *sequence) {
+  const unsigned long long value = PyLong_AsUnsignedLongLong(sequence);
+  uint32_t number = (uint32_t)value;
+  if (value == (unsigned long long)-1 && PyErr_Occurred()) return -1;
+  if (value > U32) {
+    PyErr_SetString(PyExc_OverflowError, "unsigned int is greater than maximum");
+    return -1;
+  }
+  return append(&self->numbers, &number, 4);
+}
+
+static PyObject *buffer_add_sequence(Buffer *self, PyObject *sequence) {
+  if (add_sequence(self, sequence) < 0) return NULL;
+  Py_RETURN_NONE;
+}
+
+static PyObject *buffer_rows(Buffer *self, PyObject *Py_UNUSED(none)) {
+  const Bytes *all[] = {&self->rests, &self->chain_hashes, &self->contents, &self->numbers};
+  PyObject *rows = PyTuple_New(4);
+  for (int i = 0; rows != NULL && i < 4; ++i) {
+    PyObject *bytes = PyBytes_FromStringAndSize((char *)all[i]->data, all[i]->size);
+    if (bytes == NULL || PyTuple_SetItem(rows, i, bytes) < 0) Py_CLEAR(rows);
+  }
+  return rows;
+}
+
+static PyObject *buffer_drop_unfinished(Buffer *self, PyObject *Py_UNUSED(none)) {
+  size_t outputs = 0, numbered = 0;
+  uint32_t value;
+  for (size_t place = REST_OUTPUTS; place < self->rests.size; place += REST) {
+    memcpy(&value, self->rests.data + place, 4);
+    outputs += value;
+  }
+  if (outputs * CONTENT < self->contents.size) self->contents.size = outputs * CONTENT;
+  for (size_t place = CONTENT_KIND; place < self->contents.size; place += CONTENT) {
+    memcpy(&value, self->contents.data + place, 4);
+    numbered += value != DRAW;
+  }
+  if (numbered * 4 < self->numbers.size) self->numbers.size = numbered * 4;
+  Py_RETURN_NONE;
+}
+
+static PyObject *buffer_clear_rows(Buffer *self, PyObject *Py_UNUSED(none)) {
+  free_rows(self);
+  Py_RETURN_NONE;
+}
+
+static PyObject *buffer_events(Buffer *self, void *Py_UNUSED(none)) {
+  return PyLong_FromSize_t(self->rests.size / REST);
+}
+
+static PyObject *buffer_outputs(Buffer *self, void *Py_UNUSED(none)) {
+  return PyLong_FromSize_t(self->contents.size / CONTENT);
+}
+
+static PyMethodDef buffer_methods[] = {
+    {"add_payload", (PyCFunction)(void (*)(void))buffer_add_payload, METH_FASTCALL, NULL},
+    {"add_event", (PyCFunction)(void (*)(void))buffer_add_event, METH_FASTCALL, NULL},
+    {"add_output", (PyCFunction)buffer_add_output, METH_O, NULL},
+    {"add_sequence", (PyCFunction)buffer_add_sequence, METH_O, NULL},
+    {"rows", (PyCFunction)buffer_rows, METH_NOARGS, NULL},
+    {"drop_unfinished", (PyCFunction)buffer_drop_unfinished, METH_NOARGS, NULL},
+    {"clear_rows", (PyCFunction)buffer_clear_rows, METH_NOARGS, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMemberDef buffer_members[] = {
+    {"payloads", T_OBJECT_EX, offsetof(Buffer, payloads), READONLY, NULL},
+    {"sequences", T_OBJECT_EX, offsetof(Buffer, sequences), READONLY, NULL},
+    {"payload_bytes", T_PYSSIZET, offsetof(Buffer, payload_bytes), 0, NULL},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyGetSetDef buffer_properties[] = {
+    {"events", (getter)buffer_events, NULL, NULL, NULL},
+    {"outputs", (getter)buffer_outputs, NULL, NULL, NULL},
+    {NULL, NULL, NULL, NULL, NULL},
+};
+
+static PyType_Slot buffer_slots[] = {
+    {Py_tp_new, buffer_new},           {Py_tp_dealloc, buffer_dealloc},
+    {Py_tp_traverse, buffer_traverse}, {Py_tp_clear, buffer_clear},
+    {Py_tp_methods, buffer_methods},   {Py_tp_members, buffer_members},
+    {Py_tp_getset, buffer_properties}, {0, NULL},
+};
+
+static PyType_Spec buffer_spec = {
+    "rsltrace._core.RecordBuffer", sizeof(Buffer), 0, Py_TPFLAGS_DEFAULT | Py_TPFLAGS_HAVE_GC,
+    buffer_slots,
+};
+
+/* -- EventChain --------------------------------------------------------------------------------- */
+
+typedef struct {
+  PyObject_HEAD
+  /* Of the writer. `buffer` is set if its functions are those of a compiled RecordBuffer. */
+  PyObject *add_event, *add_output, *add_sequence, *add_payload;
+  Buffer *buffer;
+  PyObject *observers;
+  unsigned long long index, chain_hash, outputs, output_hash;
+} Chain;
+
+static int chain_traverse(Chain *self, visitproc visit, void *arg) {
+  Py_VISIT(Py_TYPE(self));
+  Py_VISIT(self->add_event);
+  Py_VISIT(self->add_output);
+  Py_VISIT(self->add_sequence);
+  Py_VISIT(self->add_payload);
+  Py_VISIT(self->buffer);
+  Py_VISIT(self->observers);
+  return 0;
+}
+
+static int chain_clear(Chain *self) {
+  Py_CLEAR(self->add_event);
+  Py_CLEAR(self->add_output);
+  Py_CLEAR(self->add_sequence);
+  Py_CLEAR(self->add_payload);
+  Py_CLEAR(self->buffer);
+  Py_CLEAR(self->observers);
+  return 0;
+}
+
+static void chain_dealloc(Chain *self) {
+  PyTypeObject *type = Py_TYPE(self);
+  PyObject_GC_UnTrack(self);
+  chain_clear(self);
+  PyObject_GC_Del(self);
+  Py_DECREF(type);
+}
+
+/* Returns whose method a built-in one is, if it is a compiled buffer's; borrowed. */
+static Buffer *buffer_of(PyObject *method) {
+  PyObject *owner;
+  if (!PyCFunction_Check(method)) return NULL;
+  owner = PyCFunction_GetSelf(method);
+  return owner != NULL && Py_TYPE(owner) == buffer_type ? (Buffer *)owner : NULL;
+}
+
+static int chain_init(Chain *self, PyObject *args, PyObject *named) {
+  static char *names[] = {"writer", NULL};
+  PyObject *writer;
+  Buffer *buffer;
+  if (!PyArg_ParseTupleAndKeywords(args, named, "O", names, &writer)) return -1;
+  chain_clear(self);
+  self->index = self->chain_hash = self->outputs = self->output_hash = 0;
+  self->observers = PyTuple_New(0);
+  self->add_event = PyObject_GetAttrString(writer, "add_event");
+  self->add_output = PyObject_GetAttrString(writer, "add_output");
+  self->add_sequence = PyObject_GetAttrString(writer, "add_sequence");
+  self->add_payload = PyObject_GetAttrString(writer, "add_payload");
+  if (self->observers == NULL || self->add_event == NULL || self->add_output == NULL ||
+      self->add_sequence == NULL || self->add_payload == NULL)
+    return -1;
+  buffer = buffer_of(self->add_event);
+  if (buffer != NULL && buffer == buffer_of(self->add_output) &&
+      buffer == buffer_of(self->add_sequence) && buffer == buffer_of(self->add_payload))
+    self->buffer = (Buffer *)Py_NewRef((PyObject *)buffer);
+  return 0;
+}
+
+/* Stores a number at the place of a row; returns whether it fits. */
+static int put(uint8_t *row, PyObject *value, uint64_t most, size_t size) {
+  const uint64_t number = PyLong_AsUnsignedLongLong(value);
+  if (number == U64 && PyErr_Occurred()) {
+    PyErr_Clear();
+    return 0;
+  }
+  memcpy(row, &number, size);
+  return number <= most;
+}
+
+static PyObject *layout(const char *name) {
+  PyObject *format = PyImport_ImportModule("rsltrace.trace.format"), *found;
+  if (format == NULL) return NULL;
+  found = PyObject_GetAttrString(format, name);
+  Py_DECREF(format);
+  return found;
+}
+
+static int copy_packed(uint8_t *row, PyObject *packed, Py_ssize_t size) {
+  const uint8_t *data = packed == NULL ? NULL : packed_bytes(packed, size);
+  if (data != NULL) memcpy(row, data, size);
+  Py_XDECREF(packed);
+  return data == NULL ? -1 : 0;
+}
+
+static int add_content(Chain *self, PyObject *content_hash, PyObject *entity, PyObject *kind) {
+  uint8_t row[CONTENT];
+  if (!(put(row, content_hash, U64, 8) && put(row + 8, entity, U32, 4) &&
+        put(row + CONTENT_KIND, kind, U32, 4))) {
+    PyObject *by = layout("OUTPUT_CONTENT"), *packed;
+    if (by == NULL) return -1;
+    packed = PyObject_CallMethod(by, "pack", "OOO", content_hash, entity, kind);
+    Py_DECREF(by);
+    if (copy_packed(row, packed, CONTENT) < 0) return -1;
+  }
+  self->output_hash = content_hash64(row, self->output_hash);
+  if (self->buffer != NULL) {
+    if (append(&self->buffer->contents, row, CONTENT) < 0) return -1;
+  } else {
+    PyObject *result = PyObject_CallFunction(self->add_output, "y#", row, (Py_ssize_t)CONTENT);
+    if (result == NULL) return -1;
+    Py_DECREF(result);
+  }
+  const Py_ssize_t count = PyTuple_Size(self->observers);
+  if (count) {
+    PyObject *observers = Py_NewRef(self->observers);
+    uint64_t shown_hash;
+    uint32_t shown[2];
+    memcpy(&shown_hash, row, 8);
+    memcpy(shown, row + 8, 8);
+    for (Py_ssize_t i = 0; i < count; ++i) {
+      PyObject *result = PyObject_CallFunction(PyTuple_GetItem(observers, i), "IIK", shown[1],
+                                               shown[0], (unsigned long long)shown_hash);
+      if (result == NULL) {
+        Py_DECREF(observers);
+        return -1;
+      }
+      Py_DECREF(result);
+    }
+    Py_DECREF(observers);
+  }
+  return 0;
+}
+
+/* Adds an output and the sequence of its payload; returns its number in the event. */
+static PyObject *add_output(Chain *self, PyObject *kind, PyObject *entity, PyObject *content_hash,
+                            PyObject *sequence) {
+  if (add_content(self, content_hash, entity, kind) < 0) return NULL;
+  if (self->buffer != NULL) {
+    if (add_sequence(self->buffer, sequence) < 0) return NULL;
+  } else {
+    PyObject *result = PyObject_CallFunctionObjArgs(self->add_sequence, sequence, NULL);
+    if (result == NULL) return NULL;
+    Py_DECREF(result);
+  }
+  return PyLong_FromUnsignedLongLong(self->outputs++);
+}
+
+static PyObject *chain_output(Chain *self, PyObject *const *args, Py_ssize_t count) {
+  if (check_count("output", count, 3, 4) < 0) return NULL;
+  return add_output(self, args[0], args[1], args[2], count > 3 ? args[3] : no_sequence);
+}
+
+static PyObject *chain_draw(Chain *self, PyObject *const *args, Py_ssize_t count) {
+  if (check_count("draw", count, 2, 2) < 0) return NULL;
+  if (add_content(self, args[1], args[0], draw_kind) < 0) return NULL;
+  self->outputs++;
+  Py_RETURN_NONE;
+}
+
+static PyObject *chain_message(Chain *self, PyObject *const *args, Py_ssize_t count) {
+  PyObject *sequence, *position;
+  long channel;
+  if (check_count("message", count, 6, 6) < 0) return NULL;
+  channel = PyLong_AsLong(args[2]);
+  if (channel == -1 && PyErr_Occurred()) return NULL;
+  if (channel < 0)
+    sequence = Py_NewRef(no_sequence);
+  else if (self->buffer != NULL)
+    sequence = add_payload(self->buffer, args[2], args[3], args[4]);
+  else
+    sequence =
+        PyObject_CallFunctionObjArgs(self->add_payload, args[2], args[3], args[4], NULL);
+  if (sequence == NULL) return NULL;
+  position = add_output(self, args[0], args[1], args[5], sequence);
+  Py_DECREF(sequence);
+  return position;
+}
+
+static int pack_rest(Chain *self, PyObject *const *args, Py_ssize_t count, uint8_t *row) {
+  PyObject *by, *state, *packed;
+  const uint64_t none = 0;
+  const uint32_t outputs = (uint32_t)self->outputs;
+  const uint64_t index = self->index, output_hash = self->output_hash;
+  memcpy(row, &index, 8);
+  memcpy(row + 32, &output_hash, 8);
+  memcpy(row + 40, &none, 8);
+  memcpy(row + REST_OUTPUTS, &outputs, 4);
+  if (outputs == self->outputs && put(row + 8, args[0], U64, 8) && put(row + 60, args[1], U8, 1) &&
+      put(row + 61, args[2], U8, 1) && put(row + 48, args[3], U32, 4) &&
+      put(row + 16, args[4], U64, 8) && put(row + 52, args[5], U32, 4) &&
+      put(row + 24, args[6], U64, 8) && (count < 8 || put(row + 40, args[7], U64, 8)))
+    return 0;
+  by = layout("EVENT_REST");
+  if (by == NULL) return -1;
+  state = count < 8 ? PyLong_FromLong(0) : Py_NewRef(args[7]);
+  packed = state == NULL ? NULL
+                         : PyObject_CallMethod(by, "pack", "KOOOKOOOKOO", self->index, args[0],
+                                               args[4], args[6], self->output_hash, state, args[3],
+                                               args[5], self->outputs, args[1], args[2]);
+  Py_XDECREF(state);
+  Py_DECREF(by);
+  return copy_packed(row, packed, REST);
+}
+
+static PyObject *chain_end_event(Chain *self, PyObject *const *args, Py_ssize_t count) {
+  uint8_t row[REST];
+  if (check_count("end_event", count, 7, 8) < 0 || pack_rest(self, args, count, row) < 0)
+    return NULL;
+  self->chain_hash = rest_hash64(row, self->chain_hash);
+  if (self->buffer != NULL) {
+    if (add_event(self->buffer, row, self->chain_hash) < 0) return NULL;
+  } else {
+    PyObject *result = PyObject_CallFunction(self->add_event, "y#K", row, (Py_ssize_t)REST,
+                                             self->chain_hash);
+    if (result == NULL) return NULL;
+    Py_DECREF(result);
+  }
+  self->index++;
+  self->outputs = self->output_hash = 0;
+  Py_RETURN_NONE;
+}
+
+static PyObject *chain_tell(Chain *self, PyObject *observers) {
+  PyObject *all = PySequence_Tuple(observers), *old = self->observers;
+  if (all == NULL) return NULL;
+  self->observers = all;
+  Py_XDECREF(old);
+  Py_RETURN_NONE;
+}
+
+static PyMethodDef chain_methods[] = {
+    {"output", (PyCFunction)(void (*)(void))chain_output, METH_FASTCALL, NULL},
+    {"draw", (PyCFunction)(void (*)(void))chain_draw, METH_FASTCALL, NULL},
+    {"message", (PyCFunction)(void (*)(void))chain_message, METH_FASTCALL, NULL},
+    {"end_event", (PyCFunction)(void (*)(void))chain_end_event, METH_FASTCALL, NULL},
+    {"tell", (PyCFunction)chain_tell, METH_O, NULL},
+    {NULL, NULL, 0, NULL},
+};
+
+static PyMemberDef chain_members[] = {
+    {"index", T_ULONGLONG, offsetof(Chain, index), 0, NULL},
+    {"chain_hash", T_ULONGLONG, offsetof(Chain, chain_hash), 0, NULL},
+    {"outputs", T_ULONGLONG, offsetof(Chain, outputs), 0, NULL},
+    {"output_hash", T_ULONGLONG, offsetof(Chain, output_hash), 0, NULL},
+    {NULL, 0, 0, 0, NULL},
+};
+
+static PyType_Slot chain_slots[] = {
+    {Py_tp_init, chain_init},         {Py_tp_new, PyType_GenericNew},
+    {Py_tp_dealloc, chain_dealloc},   {Py_tp_traverse, chain_traverse},
+    {Py_tp_clear, chain_clear},       {Py_tp_methods, chain_methods},
+    {Py_tp_members, chain_members},   {0, NULL},
+};
+
+static PyType_Spec chain_spec = {
+    "rsltrace._core.EventChain", sizeof(Chain), 0,
+    Py_TPFLAGS_DEFAULT | Py_TPFLAGS_BASETYPE | Py_TPFLAGS_HAVE_GC, chain_slots,
+};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "_core", NULL, -1, NULL, NULL, NULL, NULL, NULL,
+};
+
+PyMODINIT_FUNC PyInit__core(void) {
+  PyObject *chain_type, *module = PyModule_Create(&definition);
+  if (module == NULL) return NULL;
+  buffer_type = (PyTypeObject *)PyType_FromSpec(&buffer_spec);
+  chain_type = PyType_FromSpec(&chain_spec);
+  draw_kind = PyLong_FromLong(DRAW);
+  no_sequence = PyLong_FromUnsignedLong(U32);
+  if (draw_kind == NULL || no_sequence == NULL || buffer_type == NULL || chain_type == NULL ||
+      PyModule_AddObjectRef(module, "RecordBuffer", (PyObject *)buffer_type) < 0 ||
+      PyModule_AddObjectRef(module, "EventChain", chain_type) < 0) {
+    Py_XDECREF(chain_type);
+    Py_DECREF(module);
+    return NULL;
+  }
+  Py_DECREF(chain_type);
+  return module;
+}
