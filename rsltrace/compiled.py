@@ -10,10 +10,22 @@ import os
 from importlib import import_module
 from types import ModuleType
 
+
+def _is_older_than_its_source(module: ModuleType) -> bool:
+    """Return whether a checkout has got another source since it was built."""
+    try:
+        source_s = os.stat(os.path.join(os.path.dirname(__file__), "_core.c")).st_mtime
+    except OSError:
+        return False  # an installed package has no source
+    return os.stat(str(module.__file__)).st_mtime < source_s
+
+
 core: ModuleType | None = None
 
 if os.environ.get("RSLTRACE_COMPILED") != "0":
     try:
         core = import_module("rsltrace._core")
+        if _is_older_than_its_source(core):
+            core = None
     except ImportError:
         pass  # not built

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -199,3 +200,13 @@ def test_a_run_has_the_same_bytes_without_it(tmp_path: Path) -> None:
         environment = {**os.environ, "RSLTRACE_COMPILED": setting}
         subprocess.run([*record, "-o", files[-1]], cwd=ROOT, env=environment, check=True)
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_module_older_than_its_source_is_not_used(tmp_path: Path) -> None:
+    built = tmp_path / "core.so"
+    built.touch()
+    module = ModuleType("core")
+    module.__file__ = str(built)
+    assert not compiled._is_older_than_its_source(module)
+    os.utime(built, (0, 0))
+    assert compiled._is_older_than_its_source(module)
