@@ -115,8 +115,8 @@ def test_a_worker_that_dies_is_reported_by_its_last_words(
 def test_the_command_lists_and_filters_its_cases() -> None:
     command = [sys.executable, str(BENCHMARKS / "throughput.py"), "--list", "--only", "graph200"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    modes = ("rsltrace", "rsltrace_delayed", "rsltrace_recorded", "rsltrace_recorded_delayed")
-    assert done.stdout.split() == [f"graph200/{mode}" for mode in modes]
+    modes = ("", "_delayed", "_recorded", "_recorded_delayed", "_recorded_python")
+    assert done.stdout.split() == [f"graph200/rsltrace{mode}" for mode in modes]
     nothing = subprocess.run(
         [*command[:-1], "no such case"], capture_output=True, text=True, check=False
     )
