@@ -186,13 +186,17 @@ class NativeStep:
 
 
 class NativeOrder:
-    """The order of a native run, which ended before ``end_ns``.
+    """The order of a native run, which ended before ``end_ns``, or (not ``whole``) is followed up
+    to then.
 
     What it has of this run is known by ``names``: a unique one for each entity, by its id.
     """
 
-    def __init__(self, file: str, end_ns: int, names: Mapping[int, str]) -> None:
+    def __init__(
+        self, file: str, end_ns: int, names: Mapping[int, str], *, whole: bool = True
+    ) -> None:
         self.file = file
+        self._whole = whole
         self.end_ns = end_ns
         self._names = names
         self._steps: Iterator[NativeStep] = iter(())
@@ -206,16 +210,15 @@ class NativeOrder:
         self._count = self._followed = 0
         self._first: tuple[NativeStep, str] | None = None
 
-    def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> None:
-        """Follow ``steps``. ``known`` are the entities of the native run and how much each sent."""
-        following = tuple(steps)
-        self._taken = {(one.name, one.message) for one in following}
+    def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> Sequence[NativeStep]:
+        """Follow ``steps``; return those that come too late. ``known`` are the entities of the
+        native run and how much each sent."""
+        every = tuple(steps)
+        self._taken = {(one.name, one.message) for one in every}
+        following = [one for one in every if self._whole or one.stamp_ns < self.end_ns]
         self._steps, self._known = iter(following), known
         self.next = next(self._steps, None)
-
-    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
-        """After the end of the native run, it is first come, first served."""
-        return 0
+        return [one for one in every if not self._whole and one.stamp_ns >= self.end_ns]
 
     def done(self) -> None:
         """Go on to the next callback."""
@@ -363,6 +366,10 @@ class NativeOrderLoop(OrderedLoop):
         if at_ns <= self.now_ns:
             at_ns = self.now_ns if self._is_overdue(order) else at_ns + _PATIENCE_NS
         return at_ns if own_ns is None else min(own_ns, at_ns)
+
+    def stepped(self, next_ns: int, end_ns: int) -> int:
+        """Return the next time: that of the native run as long as it is followed."""
+        return super().stepped(next_ns, end_ns) if self.following is None else next_ns
 
     def _all_timers(self) -> list[TimerState]:
         return self.timers.due(NEVER_NS)[0]

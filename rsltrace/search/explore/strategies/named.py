@@ -431,7 +431,7 @@ def _check_forks(name: str, job: Job) -> None:
         raise ExploreError(
             "--fork-after: runs with other settings differ from their beginning; leave it out"
         )
-    if name != "faults" and job.policy is not None and job.policy.order != "fifo":
+    if name != "faults" and job.policy is not None and not job.policy.is_plain:
         raise ExploreError(
             f"--fork-after: {locate(job, ('policy',))}: up to that time the order has to be the "
             "plain one; leave the policy out of the job, or --fork-after"
