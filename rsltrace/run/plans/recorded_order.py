@@ -283,9 +283,8 @@ class NativeOrderObserver(EventObserver):
         self._loop = loop = domain.loop
         assert isinstance(loop, NativeOrderLoop), "a job that follows a recording has one"
         end_ns = self._here(last_ns(trace)) if after_ns is None else loop.origin_ns + after_ns
-        self._followed = loop.order = NativeOrder(
-            file, end_ns + 1, self._names, whole=after_ns is None
-        )
+        until = None if after_ns is None else format_seconds(after_ns)
+        self._followed = loop.order = NativeOrder(file, end_ns + 1, self._names, until)
         domain.dispatcher.add_observer(self)
 
     def _here(self, native_ns: int) -> int:

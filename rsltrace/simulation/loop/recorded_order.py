@@ -186,17 +186,16 @@ class NativeStep:
 
 
 class NativeOrder:
-    """The order of a native run, which ended before ``end_ns``, or (not ``whole``) is followed up
-    to then.
+    """The order of a native run, which ended before ``end_ns``, or is left then, ``until`` a time.
 
     What it has of this run is known by ``names``: a unique one for each entity, by its id.
     """
 
     def __init__(
-        self, file: str, end_ns: int, names: Mapping[int, str], *, whole: bool = True
+        self, file: str, end_ns: int, names: Mapping[int, str], until: str | None = None
     ) -> None:
         self.file = file
-        self._whole = whole
+        self.until = until
         self.end_ns = end_ns
         self._names = names
         self._steps: Iterator[NativeStep] = iter(())
@@ -215,10 +214,11 @@ class NativeOrder:
         native run and how much each sent."""
         every = tuple(steps)
         self._taken = {(one.name, one.message) for one in every}
-        following = [one for one in every if self._whole or one.stamp_ns < self.end_ns]
+        left = self.until is not None
+        following = [one for one in every if not left or one.stamp_ns < self.end_ns]
         self._steps, self._known = iter(following), known
         self.next = next(self._steps, None)
-        return [one for one in every if not self._whole and one.stamp_ns >= self.end_ns]
+        return [one for one in every if left and one.stamp_ns >= self.end_ns]
 
     def done(self) -> None:
         """Go on to the next callback."""
@@ -309,14 +309,15 @@ class NativeOrder:
     def notes(self) -> Iterator[str]:
         """Yield how far the order was followed, and where it first was not."""
         count = self._count + sum(one.perform is None for one in self._left())
+        of = self.file if self.until is None else f"{self.file} up to {self.until} s"
         if self._followed == count:
-            yield f"all {count} callbacks of {self.file} ran in its order"
+            yield f"all {count} callbacks of {of} ran in its order"
             return
         if self._first is None:  # the run ended before
-            yield f"the first {self._followed} of {count} callbacks of {self.file} ran in its order"
+            yield f"the first {self._followed} of {count} callbacks of {of} ran in its order"
             return
         step, why = self._first
-        yield f"of {count} callbacks of {self.file} {self._followed} ran in its order"
+        yield f"of {count} callbacks of {of} {self._followed} ran in its order"
         yield f"the first that did not is {step}: {why}"
 
     def _left(self) -> Iterator[NativeStep]:
@@ -368,8 +369,15 @@ class NativeOrderLoop(OrderedLoop):
         return at_ns if own_ns is None else min(own_ns, at_ns)
 
     def stepped(self, next_ns: int, end_ns: int) -> int:
-        """Return the next time: that of the native run as long as it is followed."""
-        return super().stepped(next_ns, end_ns) if self.following is None else next_ns
+        """Return the next time: that of the native run as long as it is followed; once it is left,
+        the end of a step, of those that follow each other from then on."""
+        order = self.order
+        if order is None or order.until is None:
+            return super().stepped(next_ns, end_ns)
+        if self.following is not None:
+            return next_ns
+        step_ns = next_ns + (order.end_ns - next_ns) % self.min_step_ns
+        return min(step_ns, max(end_ns, next_ns))
 
     def _all_timers(self) -> list[TimerState]:
         return self.timers.due(NEVER_NS)[0]

@@ -180,7 +180,7 @@ class Feedback:
         self._runs = self._new_runs = 0
 
     def begin(self, plain: TrialResult) -> None:
-        choices_left(plain)
+        choices_left(plain, is_forked=self._is_forked)
         self._first = plain.choices_before
         self._keep(plain)
 
@@ -274,7 +274,7 @@ class _ByNumber:
 
     def begin(self, plain: TrialResult) -> None:
         """See that there is something to choose."""
-        choices_left(plain)
+        choices_left(plain, is_forked=self._after is not None)
 
     def learn(self, result: TrialResult) -> TrialResult | None:
         """Learn nothing."""
@@ -312,7 +312,7 @@ class PctWalk(_ByNumber):
         self._tried = [0] * depth
 
     def begin(self, plain: TrialResult) -> None:
-        self._choices = max(choices_left(plain), 1)
+        self._choices = max(choices_left(plain, is_forked=self._after is not None), 1)
         self._entities = max(plain.entities, 1)
 
     def propose(self, number: int) -> Proposal | None:
