@@ -50,8 +50,10 @@ def choices_left(plain: TrialResult, *, is_forked: bool = False) -> int:
     :raises ExploreError: there are none after the time at which runs are forked.
     """
     if plain.choices == plain.choices_before and (plain.choices or is_forked):
+        failed = "" if plain.failure is None else f" ({plain.failure.text.splitlines()[0]})"
         raise ExploreError(
-            "--fork-after: the plain run has no choice of what runs next after that time; give an "
-            "earlier one, or --set min_time_step=5ms to choose among what is due within 5 ms"
+            f"--fork-after: the plain run{failed} has no choice of what runs next after that time; "
+            "give an earlier one, or --set min_time_step=5ms to choose among what is due within 5 "
+            "ms"
         )
     return plain.choices - plain.choices_before
