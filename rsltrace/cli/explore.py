@@ -6,6 +6,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +21,7 @@ from rsltrace.cli.job_source import (
     ros_arguments_given,
     source_name,
 )
-from rsltrace.cli.options import history_option
+from rsltrace.cli.options import history_option, job_folder_option, trust_option
 from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import JobArguments, handling_signals
 from rsltrace.errors import ExploreError
@@ -30,6 +31,7 @@ from rsltrace.trace.model.texts import printable
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
+    from rsltrace.job.parts.scheduling import PolicySpec
     from rsltrace.search.explore.search import Explorer, SearchBudget, TrialPool
     from rsltrace.search.explore.small.causes import ReducedFailure
     from rsltrace.search.explore.trial import JobSource, TrialResult
@@ -140,7 +142,7 @@ output_option = click.option(
     metavar="T",
     callback=_fork_after,
     help="Change the order only after simulated time T (30s): run the job up to T once, and fork "
-    "that run for each trial.",
+    "that run for each trial. Of a native TRACE: follow its order up to T (default: 0s).",
 )
 @click.option(
     "--timeout",
@@ -169,6 +171,8 @@ output_option = click.option(
     help="Reduce the first failing run of each cause to the fewest faults and deviations, and "
     "write a folder that reproduces it. Can be done later with --resume.",
 )
+@job_folder_option
+@trust_option
 @history_option
 @click.option("-q", "--quiet", is_flag=True, help="Show only the result, no progress.")
 def explore(
@@ -191,6 +195,8 @@ def explore(
     cluster: str | None,
     form: str,
     minimize: bool,
+    job_folder: Path | None,
+    trust: bool,
     history: str | None,
     quiet: bool,
 ) -> int:
@@ -200,11 +206,15 @@ def explore(
     if it deadlocks, livelocks, crashes or reaches its timeout (stop: {timeout: …}). Each failing
     run is printed as an "rsltrace record" command that reproduces it.
 
+    If JOB is the trace of a native run, follow its order up to --fork-after, then try others. The
+    job of that is written to TRACE.explore.yaml, beside the job that was recorded.
+
     Exit status: 0 if no run failed, 1 if one did, 2 for an error. Results so far are kept, and
     --resume continues the search.
     """
     from rsltrace.checks.evaluate import check_texts
     from rsltrace.checks.metrics import check_metrics
+    from rsltrace.diff.file_kind import is_trace
     from rsltrace.search.explore.search import Explorer
     from rsltrace.search.explore.strategies.named import check_vary, strategy_named
     from rsltrace.search.explore.table import ResultsFolder
@@ -215,16 +225,23 @@ def explore(
             "give --resume to continue a search or --force to replace it, not both"
         )
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
+    default = default_output(named).with_suffix(".explore")
+    if text is None and is_trace(named):
+        named = _job_of_native(named, job_folder, trust=trust, force=force, quiet=quiet)
+        fork_after = fork_after or ("0s", 0)
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
     source = JobSource(source_name(named, launch, text), labelled, text, str(named.parent))
     given = JobArguments(words, launch, skip, overrides, None, until, False, ros_arguments_given())
     with given.recorded(history, "explore") as record:
         job = source.job()
+        if job.policy is not None and job.policy.recorded is not None:
+            source, fork_after = _leaving_recorded(source, job.policy, fork_after)
+            job = source.job()
         check_texts(job)
         check_metrics(job)
         if strategy == "vary":
             check_vary(source, job)
-        folder = output or default_output(named).with_suffix(".explore")
+        folder = output or default
         about = _about(source, job, strategy, seed, depth)
         if fork_after is not None:
             about["fork after"] = fork_after[1]
@@ -261,6 +278,54 @@ def explore(
             tell(f"interrupted: continue with --resume; the results are in {folder}")
             return _INTERRUPTED
         return 1 if search.tally.failures else 0
+
+
+def _job_of_native(
+    path: Path, job_folder: Path | None, *, trust: bool, force: bool, quiet: bool
+) -> Path:
+    """Write the job that follows a native run beside the job of that run; return its path.
+
+    :raises TraceError, ReplayError: the trace or what it needs is missing, or is not trusted.
+    :raises ExploreError: it is of a simulated run, or the job cannot be written.
+    """
+    from rsltrace.cli.replay import agree, code_lines
+    from rsltrace.replay.preparation import prepare_replay
+    from rsltrace.trace.native import is_native
+
+    with prepare_replay(path, job_folder) as plan:
+        if not is_native(plan.trace):
+            raise ExploreError(
+                f"{path} is of a simulated run: explore its job, with --fork-after for other "
+                "orders from a time on"
+            )
+        for line in () if quiet else (*code_lines(plan, "exploring"), *plan.notes):
+            tell(line)
+        agree(plan, trust=trust)
+        written = plan.folder / f"{path.stem}.explore.yaml"
+        text = f"# {path.name}, to be run again: see docs/native.md\n{plan.job.to_yaml()}"
+        try:
+            if written.exists() and written.read_text(encoding="utf-8") != text and not force:
+                raise ExploreError(f"{written} is of another run: replace it with --force")
+            with replacement_of(written) as work:
+                work.write_text(text, encoding="utf-8")
+            tell(f"wrote {written}")
+        except (OSError, UnicodeError) as error:
+            raise ExploreError(f"{written} cannot be written: {error}") from None
+    return written
+
+
+def _leaving_recorded(
+    source: JobSource, policy: PolicySpec, fork_after: tuple[str, int] | None
+) -> tuple[JobSource, tuple[str, int] | None]:
+    """Return a job that follows a recording so that trials leave it at a time, and the time."""
+    from rsltrace.job.values.times import format_time
+
+    if fork_after is not None:
+        after = "--fork-after", f"policy.after={fork_after[0]}"
+        source = replace(source, overrides=(*source.overrides, after))
+    elif policy.after_ns is not None:
+        fork_after = format_time(policy.after_ns), policy.after_ns
+    return replace(source, begins_recorded=fork_after is not None), fork_after
 
 
 def _set_result(record: RunRecord, search: Explorer) -> None:
@@ -400,6 +465,7 @@ class _SearchReport:
             list(result_rows(self._folder)),
             strategy=self._strategy,
             arguments=[word for _, text in source.overrides for word in ("--set", text)],
+            begins_recorded=source.begins_recorded,
             coverage=search.strategy.coverage(),
             wall_s=time.monotonic() - search.began_s,
             reduced={

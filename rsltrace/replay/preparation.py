@@ -88,7 +88,7 @@ def _follow_trace_order(trace: Trace, resolved: dict[str, Any], folder: Path) ->
     if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
         return
     if not (folder / policy["recorded"]).is_file():
-        policy["recorded"] = str(Path(trace.name).resolve())
+        resolved["policy"] = {"recorded": str(Path(trace.name).resolve())}
 
 
 def job_name(trace: Trace) -> str:

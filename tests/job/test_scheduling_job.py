@@ -34,6 +34,23 @@ def test_a_job_is_ordered_when_it_says_so() -> None:
         assert is_ordered(load(keys))
 
 
+def test_a_recording_may_be_left_for_another_policy() -> None:
+    begun = "policy: {recorded: job.yaml, after: 2s"
+    for more, plain in ((", pct: 2, seed: 1}", False), (", departures: []}", False), ("}", True)):
+        policy = load(begun + more).policy
+        assert policy is not None
+        assert policy.begins_recorded
+        assert policy.is_plain == plain
+        assert load_job("job.yaml").resolved()["policy"]["after_ns"] == 2000 * MS
+    changed = load_job("job.yaml", overrides=["policy.order=permutation"]).policy
+    assert changed is not None
+    assert (changed.recorded, changed.order) == ("job.yaml", "permutation")
+    whole = load("policy: {recorded: job.yaml}").policy
+    assert whole is not None
+    assert not whole.begins_recorded
+    assert not whole.is_plain
+
+
 def test_executors_and_execution_times() -> None:
     pytest.importorskip("rclpy")
     job = load(
@@ -89,7 +106,16 @@ def test_clocks() -> None:
         (
             "policy: {order: fifo, recorded: job.yaml}",
             "job.yaml:2:9: policy: give one of order, priority, departures, pct, recorded, "
+            "function; recorded with another one needs after, too",
+        ),
+        (
+            "policy: {recorded: job.yaml, after: 1s, pct: 2, order: fifo}",
+            "job.yaml:2:9: policy: give one of order, priority, departures, pct, recorded, "
             "function",
+        ),
+        (
+            "policy: {departures: [], after: 1s}",
+            "job.yaml:2:26: policy: departures say themselves from when on",
         ),
         ("policy: {prio: 5}", "job.yaml:2:10: unknown key 'prio' in policy; did you mean"),
         (

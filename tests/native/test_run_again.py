@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shlex
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from rsltrace import replay
 from rsltrace.errors import ReplayError
+from rsltrace.search.explore.table import result_rows
 from rsltrace.trace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 from tests.native.running import COMMAND, environment
@@ -193,6 +195,93 @@ def test_one_node_alone_and_changed_code(tmp_path: Path, command: Any) -> None:
     assert silent.returncode == 1
     assert "/mixer: subscription /numbers with message " in silent.stderr
     assert "that message was not sent here" in silent.stderr
+
+
+RACE = """\
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+
+class Ticker(Node):
+    def __init__(self):
+        super().__init__("ticker")
+        self.out = self.create_publisher(UInt64, "/tick", 10)
+        self.count = 0
+        self.create_timer(0.02, self.on_timer)
+
+    def on_timer(self):
+        self.count += 1
+        self.out.publish(UInt64(data=self.count))
+
+
+class Sensor(Node):
+    def __init__(self, name, topic):
+        super().__init__(name)
+        out = self.create_publisher(UInt64, topic, 10)
+        self.create_subscription(UInt64, "/tick", out.publish, 10)
+
+
+class Fuse(Node):
+    def __init__(self):
+        super().__init__("fuse")
+        self.a = 0
+        self.create_subscription(UInt64, "/a", self.on_a, 10)
+        self.create_subscription(UInt64, "/b", self.on_b, 10)
+
+    def on_a(self, message):
+        self.a = message.data
+
+    def on_b(self, message):
+        if message.data > LIMIT and self.a < message.data:
+            raise ValueError("b before a")
+
+
+LIMIT = 1 << 60
+"""
+RACING = """\
+nodes:
+  - node: racing:Ticker
+  - {node: racing:Sensor, arguments: {name: sensor_a, topic: /a}}
+  - {node: racing:Sensor, arguments: {name: sensor_b, topic: /b}}
+  - node: racing:Fuse
+stop: {duration: 1s}
+"""
+
+
+@pytest.mark.long
+def test_other_orders_from_a_time_on(tmp_path: Path, command: Any) -> None:
+    (tmp_path / "racing.py").write_text(RACE)
+    (tmp_path / "job.yaml").write_text(RACING)
+    started = [*COMMAND, "record", "--native", "job.yaml", "-o", "native.mcap", "-q"]
+    subprocess.run(started, cwd=tmp_path, env=environment(tmp_path), check=True, timeout=300)
+    command("replay", "native.mcap", "-q", "-o", "again.mcap")
+    with Trace.open(Path("again.mcap")) as trace:
+        half_ns = trace.start_ns + 500_000_000
+        ticks = sum(stamp_ns <= half_ns for stamp_ns, _, _ in trace.messages("/tick"))
+    (tmp_path / "racing.py").write_text(RACE.replace("1 << 60", str(ticks + 2)))  # only then
+    words = ("--fork-after", "0.5s", "--strategy", "random", "--budget", "4", "--jobs", "1", "-q")
+    done = command("explore", "native.mcap", *words)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "exception: /fuse: subscription /b" in done.stdout
+    plain, *found = result_rows(Path("native.explore"))
+    assert plain.failure is None
+    assert found[-1].is_forked
+    assert len({row.digest for row in (plain, *found)}) == 4
+    shown = next(row for row in found if row.failure is not None)
+    again = shlex.split(re.search("reproduce: rsltrace (.*)", done.stdout)[1])  # type: ignore[index]
+    repeated = command(*again, "-q", "-o", "found.mcap")
+    assert f"digest {shown.digest}  events {shown.events}" in repeated.stdout
+    with Trace.open(Path("again.mcap")) as a, Trace.open(Path("found.mcap")) as b:
+        before = [
+            [tuple(row) for rows in one.events() for row in rows if row["stamp"] <= half_ns]
+            for one in (a, b)
+        ]
+    assert before[0] == before[1]
+    assert command("replay", shown.trace, "-q").returncode == 0
+    late = command("explore", "native.mcap", "--fork-after", "1h", "-o", "late")
+    assert "--fork-after: native.mcap ends at " in late.stderr
+    simulated = command("explore", "again.mcap")
+    assert "again.mcap is of a simulated run: explore its job" in simulated.stderr
 
 
 def test_the_debugger_runs_it_again(tmp_path: Path, command: Any) -> None:

@@ -13,7 +13,7 @@ from rsltrace.diff import diff_files
 from rsltrace.diff.report import render
 from rsltrace.search.explore.search import Explorer, SearchTally
 from rsltrace.search.explore.small.causes import FAILING, JOB, PASSING, PASSING_JOB
-from rsltrace.search.explore.trial import JobSource, TrialResult, overrides_of
+from rsltrace.search.explore.trial import JobSource, TrialResult
 
 if TYPE_CHECKING:
     from rsltrace.diff.result import Diff
@@ -221,7 +221,7 @@ def repeats(result: TrialResult, source: JobSource) -> str:
     words = ["rsltrace", "record"]
     if source.text is None:
         words.append(source.path)
-    for _, text in (*source.overrides, *overrides_of(result.trial)):
+    for _, text in (*source.overrides, *source.overrides_of(result.trial)):
         words += ["--set", text]
     return shlex.join(words)
 

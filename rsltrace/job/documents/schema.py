@@ -112,10 +112,9 @@ class _Maker:
         required = [key for key, field in fields.items() if field.is_required()]
         if required and not self._partial:
             definition["required"] = required
-        one_of = getattr(model, "ONE_OF", ())
-        if one_of and not self._partial:
+        one_of, alternatives = getattr(model, "ONE_OF", ()), getattr(model, "ALTERNATIVES", ())
+        if one_of and not alternatives and not self._partial:
             definition["oneOf"] = [{"required": [key]} for key in one_of]
-        alternatives = () if one_of else getattr(model, "ALTERNATIVES", ())
         if alternatives:
             pairs = [(a[0], b[0]) for a, b in combinations(alternatives, 2)]
             definition["not"] = {"anyOf": [{"required": list(pair)} for pair in pairs]}

@@ -85,8 +85,8 @@ class PctSpec(JobPart):
 
 
 class PolicySpec(JobPart):
-    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``; a word alone
-    is an ``order``."""
+    """Which ready callback runs next. Exactly one key besides ``after`` and ``seed``, or
+    ``recorded`` with ``after`` and one more; a word alone is an ``order``."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = (
         "order",
@@ -96,7 +96,9 @@ class PolicySpec(JobPart):
         "recorded",
         "function",
     )
-    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((key,) for key in ONE_OF)
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple(
+        (key,) for key in ONE_OF if key != "recorded"
+    )
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
@@ -122,7 +124,7 @@ class PolicySpec(JobPart):
     )
     recorded: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A trace whose order is followed exactly.",
+        description="A trace whose order is followed exactly; of a native run, until `after`.",
         examples=["run1.mcap"],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
@@ -133,7 +135,7 @@ class PolicySpec(JobPart):
     after_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="after",
-        description="First come, first served until this time.",
+        description="First come, first served (or as `recorded`) until this time.",
         examples=["30s"],
     )
     seed: Annotated[int | None, check(whole(0), optional=True)] = Field(
@@ -157,13 +159,29 @@ class PolicySpec(JobPart):
             seed: int | None = None,
         ) -> None: ...
 
+    @property
+    def begins_recorded(self) -> bool:
+        """Whether the order is that of a native run until ``after``, and then the policy's."""
+        return self.recorded is not None and self.after_ns is not None
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it chooses what came first, at least from ``after`` on."""
+        chosen = (self.priority, self.departures, self.pct, self.function)
+        if self.recorded is not None and not self.begins_recorded:
+            return False
+        return self.order in (None, "fifo") and all(one is None for one in chosen)
+
     @model_validator(mode="after")
     def _one(self) -> PolicySpec:
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
+        if self.begins_recorded and len(given) == 2:
+            given.remove("recorded")
         if len(given) != 1:
-            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}")
-        if self.after_ns is not None and given[0] in ("departures", "recorded"):
-            raise JobProblem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
+            hint = "; recorded with another one needs after, too" if "recorded" in given else ""
+            raise JobProblem(f"give one of {', '.join(self.ONE_OF)}{hint}")
+        if self.after_ns is not None and given == ["departures"] and not self.begins_recorded:
+            raise JobProblem("departures say themselves from when on", ("after",), at_key=True)
         draws = self.pct is not None or self.order == "permutation"
         if self.seed is not None and not draws:
             raise JobProblem("only permutation and pct draw anything", ("seed",), at_key=True)

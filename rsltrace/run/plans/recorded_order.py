@@ -49,7 +49,7 @@ from rsltrace.simulation.loop.wait_set import RclpyWaitSetPolicy
 from rsltrace.simulation.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.trace.model.entity import Entity, EntityKind
 from rsltrace.trace.model.event import EventKind, OutputKind
-from rsltrace.trace.model.texts import Stamp
+from rsltrace.trace.model.texts import Stamp, format_seconds
 from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
@@ -85,8 +85,20 @@ def follow_recording(
     census = domain.entities.census
     assert census is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
+    after_ns = job.policy.after_ns
     if is_native(trace):
-        return NativeOrderObserver(domain, trace, file)
+        if after_ns is not None and after_ns >= last_ns(trace) - trace.start_ns:
+            raise JobError(
+                f"{file} ends at {format_seconds(last_ns(trace) - trace.start_ns)} s: give an "
+                "earlier time",
+                where=locate(job, ("policy", "after")),
+            )
+        return NativeOrderObserver(domain, trace, file, after_ns)
+    if after_ns is not None:
+        raise JobError(
+            f"{file} is of a simulated run: only the order of a native run can be left at a time",
+            where=locate(job, ("policy", "after")),
+        )
     order = RecordedOrder(file, _EventCursor(trace).event, _chosen(trace), census.describe_all())
     from_ns = _polls_from_ns(trace)
     if from_ns is not None:
@@ -254,8 +266,11 @@ class NativeOrderObserver(EventObserver):
     """Lets a run follow a native one; nodes that are not in the run are played from the trace."""
 
     order = ObserverOrder.RECORDED_ORDER
+    policy = None
+    """What chooses in place of the job's policy."""
 
-    def __init__(self, domain: Domain, trace: Trace, file: str) -> None:
+    def __init__(self, domain: Domain, trace: Trace, file: str, after_ns: int | None) -> None:
+        """``after_ns``: how long after the start the run goes on by itself (None: never)."""
         self._domain, self._trace = domain, trace
         self._native = EntityNames()
         for entity in trace.entities.values():
@@ -267,7 +282,9 @@ class NativeOrderObserver(EventObserver):
         self._not_kept: dict[str, int] = {}
         self._loop = loop = domain.loop
         assert isinstance(loop, NativeOrderLoop), "a job that follows a recording has one"
-        self.policy = loop.order = NativeOrder(file, self._here(last_ns(trace)) + 1, self._names)
+        end_ns = self._here(last_ns(trace)) if after_ns is None else loop.origin_ns + after_ns
+        until = None if after_ns is None else format_seconds(after_ns)
+        self._followed = loop.order = NativeOrder(file, end_ns + 1, self._names, until)
         domain.dispatcher.add_observer(self)
 
     def _here(self, native_ns: int) -> int:
@@ -281,7 +298,7 @@ class NativeOrderObserver(EventObserver):
             self._event, self._place = self._loop.events, 0
         if kind in _SENT:
             count = self._sent.get(entity, 0) + 1 if self._playing is None else self._playing
-            self.policy.sent[self._event, self._place] = entity, count
+            self._followed.sent[self._event, self._place] = entity, count
             self._sent[entity] = count
         self._place += 1
 
@@ -305,7 +322,9 @@ class NativeOrderObserver(EventObserver):
         for outputs in self._trace.outputs():
             for entity in outputs["entity"][np.isin(outputs["kind"], list(_SENT))].tolist():
                 known[self._native[entity]] += 1
-        self.policy.begin(self._steps(played), known)
+        for step in self._followed.begin(self._steps(played), known):
+            if step.perform is not None:
+                self._loop.schedule(step.stamp_ns, step.perform)
 
     def _steps(self, played: Container[int]) -> Iterator[NativeStep]:
         """Yield the callbacks of nodes that run here, and what others sent."""
@@ -361,10 +380,11 @@ class NativeOrderObserver(EventObserver):
         return definition_of(self._trace, type_name)
 
     def notes(self) -> Iterator[str]:
-        yield from self.policy.notes()
+        yield from self._followed.notes()
         if self._not_kept:
             count, names = sum(self._not_kept.values()), ", ".join(self._not_kept)
-            yield f"{self.policy.file} does not hold {count} messages, which were not sent: {names}"
+            file = self._followed.file
+            yield f"{file} does not hold {count} messages, which were not sent: {names}"
 
 
 _OF_EVENT = ("index", "stamp", "kind", "entity", "cause_event", "cause_output", "input_hash")

@@ -74,7 +74,7 @@ def load_target(target: str, *, where: str) -> Any:
 def is_ordered(job: Job) -> bool:
     """Whether a job needs more than the plain loop."""
     policy = job.policy
-    fifo = policy is None or policy.order == "fifo"
+    fifo = policy is None or (policy.order == "fifo" and policy.recorded is None)
     rules = not fifo or job.executors is not None or job.execution is not None
     return rules or switches_at_lines(job)
 
@@ -122,7 +122,9 @@ def policy_of_job(job: Job, start_ns: int) -> ExecutionPolicy:
     if spec is None:
         return Fifo()
     policy = _policy(job, spec)
-    return policy if spec.after_ns is None else FifoUntil(start_ns + spec.after_ns, policy)
+    if spec.after_ns is None or isinstance(policy, Fifo | Departures):
+        return policy
+    return FifoUntil(start_ns + spec.after_ns, policy)
 
 
 def continued_policy(policy: ExecutionPolicy, before: ExecutionPolicy) -> ExecutionPolicy:
@@ -145,7 +147,9 @@ def _policy(job: Job, spec: PolicySpec) -> ExecutionPolicy:
         return Departures(Departure(one.choice, one.run, one.of) for one in spec.departures)
     if spec.pct is not None:
         return Pct(RandomStream(seed, "pct"), spec.pct.depth, spec.pct.choices)
-    return user_policy(spec.function, locate(job, ("policy", "function")))
+    if spec.function is not None:
+        return user_policy(spec.function, locate(job, ("policy", "function")))
+    return Fifo()
 
 
 def unmet_departures(job: Job, policy: ExecutionPolicy) -> Iterator[str]:

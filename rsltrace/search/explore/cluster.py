@@ -58,11 +58,17 @@ class Bundle:
     folder: str
     files: Mapping[str, bytes]
     large: Mapping[str, int]
+    begins_recorded: bool = False
 
     def source(self, root: str | Path) -> JobSource:
         """Return the job in the folder where the bundle was unpacked."""
         folder = os.path.normpath(os.path.join(root, self.folder))
-        return JobSource(os.path.join(folder, self.name), text=self.text, folder=folder)
+        return JobSource(
+            os.path.join(folder, self.name),
+            text=self.text,
+            folder=folder,
+            begins_recorded=self.begins_recorded,
+        )
 
     def unpack(self, root: Path) -> None:
         """Write the files below ``root``, and link to the large ones.
@@ -116,7 +122,8 @@ def bundle_of(source: JobSource) -> Bundle:
         except OSError as error:
             raise ExploreError(f"{path} cannot be sent to workers: {error.strerror}") from None
     name = Path(job.source_name).name or "job.yaml"
-    return Bundle(total.hexdigest(), text, name, root, folder, files, large)
+    begins_recorded = source.begins_recorded
+    return Bundle(total.hexdigest(), text, name, root, folder, files, large, begins_recorded)
 
 
 def _sources(job: Job) -> Iterator[Path]:

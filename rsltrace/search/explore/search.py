@@ -270,7 +270,6 @@ class Explorer:
 
 def _plain_trial(job: Job) -> Trial:
     """Return the trial of a job as it is. If it has no policy, choices are counted."""
-    policy = job.policy
-    is_plain = policy is None or policy.order == "fifo"
+    is_plain = job.policy is None or job.policy.is_plain
     overlay: dict[str, Any] = {"policy": {"departures": []}} if is_plain else {}
     return Trial(0, overlay, "the job as it is")

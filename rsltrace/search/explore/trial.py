@@ -58,24 +58,34 @@ _NOT_KEPT = ("behaviours", "order", "steps")
 class JobSource:
     """A job as a command line names it: the file, and overrides (name for messages, text).
 
-    ``text`` replaces the file where there is none (a launch file alone).
+    ``text`` replaces the file where there is none (a launch file alone). ``begins_recorded``: its
+    policy follows a native run first, which trials leave as it is.
     """
 
     path: str
     overrides: tuple[tuple[str, str], ...] = ()
     text: str | None = None
     folder: str = "."
+    begins_recorded: bool = False
 
     def job(self, trial: Trial | None = None) -> Job:
         """Return the job, with a trial's overlay.
 
         :raises JobError: it is wrong.
         """
-        more = [] if trial is None else list(overrides_of(trial))
-        overrides = [*self.overrides, *more]
+        overrides = [*self.overrides, *(() if trial is None else self.overrides_of(trial))]
         if self.text is not None:
             return job_from_text(self.text, self.path, self.folder, overrides=overrides)
         return load_job(self.path, overrides=overrides)
+
+    def overrides_of(self, trial: Trial) -> Iterator[tuple[str, str]]:
+        """Yield the overlay of a trial as overrides of this job: (name for messages, text)."""
+        for key, value in trial.overlay.items():
+            if key == "policy" and self.begins_recorded:
+                more = {f"policy.{name}": one for name, one in value.items() if name != "after"}
+                yield from overrides_of(Trial(trial.number, {"set": more}))
+            else:
+                yield from overrides_of(Trial(trial.number, {key: value}))
 
 
 @dataclass(frozen=True, slots=True)

@@ -186,13 +186,16 @@ class NativeStep:
 
 
 class NativeOrder:
-    """The order of a native run, which ended before ``end_ns``.
+    """The order of a native run, which ended before ``end_ns``, or is left then, ``until`` a time.
 
     What it has of this run is known by ``names``: a unique one for each entity, by its id.
     """
 
-    def __init__(self, file: str, end_ns: int, names: Mapping[int, str]) -> None:
+    def __init__(
+        self, file: str, end_ns: int, names: Mapping[int, str], until: str | None = None
+    ) -> None:
         self.file = file
+        self.until = until
         self.end_ns = end_ns
         self._names = names
         self._steps: Iterator[NativeStep] = iter(())
@@ -206,16 +209,16 @@ class NativeOrder:
         self._count = self._followed = 0
         self._first: tuple[NativeStep, str] | None = None
 
-    def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> None:
-        """Follow ``steps``. ``known`` are the entities of the native run and how much each sent."""
-        following = tuple(steps)
-        self._taken = {(one.name, one.message) for one in following}
+    def begin(self, steps: Iterable[NativeStep], known: Mapping[str, int]) -> Sequence[NativeStep]:
+        """Follow ``steps``; return those that come too late. ``known`` are the entities of the
+        native run and how much each sent."""
+        every = tuple(steps)
+        self._taken = {(one.name, one.message) for one in every}
+        left = self.until is not None
+        following = [one for one in every if not left or one.stamp_ns < self.end_ns]
         self._steps, self._known = iter(following), known
         self.next = next(self._steps, None)
-
-    def choose(self, ready: Sequence[Candidate], moment: ChoicePoint) -> int:
-        """After the end of the native run, it is first come, first served."""
-        return 0
+        return [one for one in every if left and one.stamp_ns >= self.end_ns]
 
     def done(self) -> None:
         """Go on to the next callback."""
@@ -306,14 +309,15 @@ class NativeOrder:
     def notes(self) -> Iterator[str]:
         """Yield how far the order was followed, and where it first was not."""
         count = self._count + sum(one.perform is None for one in self._left())
+        of = self.file if self.until is None else f"{self.file} up to {self.until} s"
         if self._followed == count:
-            yield f"all {count} callbacks of {self.file} ran in its order"
+            yield f"all {count} callbacks of {of} ran in its order"
             return
         if self._first is None:  # the run ended before
-            yield f"the first {self._followed} of {count} callbacks of {self.file} ran in its order"
+            yield f"the first {self._followed} of {count} callbacks of {of} ran in its order"
             return
         step, why = self._first
-        yield f"of {count} callbacks of {self.file} {self._followed} ran in its order"
+        yield f"of {count} callbacks of {of} {self._followed} ran in its order"
         yield f"the first that did not is {step}: {why}"
 
     def _left(self) -> Iterator[NativeStep]:
@@ -363,6 +367,17 @@ class NativeOrderLoop(OrderedLoop):
         if at_ns <= self.now_ns:
             at_ns = self.now_ns if self._is_overdue(order) else at_ns + _PATIENCE_NS
         return at_ns if own_ns is None else min(own_ns, at_ns)
+
+    def stepped(self, next_ns: int, end_ns: int) -> int:
+        """Return the next time: that of the native run as long as it is followed; once it is left,
+        the end of a step, of those that follow each other from then on."""
+        order = self.order
+        if order is None or order.until is None:
+            return super().stepped(next_ns, end_ns)
+        if self.following is not None:
+            return next_ns
+        step_ns = next_ns + (order.end_ns - next_ns) % self.min_step_ns
+        return min(step_ns, max(end_ns, next_ns))
 
     def _all_timers(self) -> list[TimerState]:
         return self.timers.due(NEVER_NS)[0]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rsltrace.errors import ExploreError
-from rsltrace.search.explore.trial import Failure, Trial, TrialResult, overrides_of
+from rsltrace.search.explore.trial import Failure, JobSource, Trial, TrialResult
 
 _COMMAND_MAX = 400
 _AT_LINE = re.compile(r" at (?P<file>[^:\s]+):(?P<line>\d+)")
@@ -38,14 +38,16 @@ class Exploration:
     """A search that has ended.
 
     ``job`` is the job file as it was named, ``arguments`` what else names the job in a command
-    (``--set``, ``--launch``). ``coverage`` are sentences on what was tried, ``units`` the units of
-    metrics, ``reduced`` the reduced runs by their failure's key, ``checks`` the number of checks.
+    (``--set``, ``--launch``), ``begins_recorded`` as for ``JobSource``. ``coverage`` are sentences
+    on what was tried, ``units`` the units of metrics, ``reduced`` the reduced runs by their
+    failure's key, ``checks`` the number of checks.
     """
 
     job: str
     results: Sequence[TrialResult]
     strategy: str = ""
     arguments: Sequence[str] = ()
+    begins_recorded: bool = False
     coverage: Sequence[str] = ()
     wall_s: float = 0.0
     units: Mapping[str, str] = field(default_factory=dict)
@@ -136,7 +138,8 @@ def _fault(fault: Mapping[str, Any]) -> str:
 def repeat_command(explored: Exploration, result: TrialResult) -> str | None:
     """Return the command that repeats a run, None if it would be too long to read."""
     words = ["rsltrace", "record", explored.job, *explored.arguments]
-    for _, override in overrides_of(result.trial):
+    source = JobSource(explored.job, begins_recorded=explored.begins_recorded)
+    for _, override in source.overrides_of(result.trial):
         path, _, value = override.partition("=")
         if path == "seed":
             words += ["--seed", value]

@@ -16,7 +16,7 @@ from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.search.explore.outcome import TrialOptions
 from rsltrace.search.explore.small.reduction import OverlayParts, ReducedTrial, TrialReduction
 from rsltrace.search.explore.table import SMALL
-from rsltrace.search.explore.trial import JobSource, Trial, TrialResult, overrides_of
+from rsltrace.search.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.search.explore.workers import Worker
 from rsltrace.trace.model.texts import format_seconds, printable
 
@@ -176,7 +176,7 @@ def _is_moved(job: Job, failing: TrialResult, before: TrialResult) -> bool:
 def moved_job(source: JobSource, parts: OverlayParts, folder: Path) -> Job:
     """Return the job of a trial with paths relative to ``folder``. Raises JobError."""
     trial = Trial(0, parts.overlay())
-    own = [*source.overrides, *overrides_of(trial)]
+    own = [*source.overrides, *source.overrides_of(trial)]
     name = str(folder / JOB)
     if source.text is not None:  # there is no file: the overrides have everything else
         before = source.job()

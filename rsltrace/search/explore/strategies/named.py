@@ -180,7 +180,7 @@ class Feedback:
         self._runs = self._new_runs = 0
 
     def begin(self, plain: TrialResult) -> None:
-        choices_left(plain)
+        choices_left(plain, is_forked=self._is_forked)
         self._first = plain.choices_before
         self._keep(plain)
 
@@ -274,7 +274,7 @@ class _ByNumber:
 
     def begin(self, plain: TrialResult) -> None:
         """See that there is something to choose."""
-        choices_left(plain)
+        choices_left(plain, is_forked=self._after is not None)
 
     def learn(self, result: TrialResult) -> TrialResult | None:
         """Learn nothing."""
@@ -312,7 +312,7 @@ class PctWalk(_ByNumber):
         self._tried = [0] * depth
 
     def begin(self, plain: TrialResult) -> None:
-        self._choices = max(choices_left(plain), 1)
+        self._choices = max(choices_left(plain, is_forked=self._after is not None), 1)
         self._entities = max(plain.entities, 1)
 
     def propose(self, number: int) -> Proposal | None:
@@ -431,7 +431,7 @@ def _check_forks(name: str, job: Job) -> None:
         raise ExploreError(
             "--fork-after: runs with other settings differ from their beginning; leave it out"
         )
-    if name != "faults" and job.policy is not None and job.policy.order != "fifo":
+    if name != "faults" and job.policy is not None and not job.policy.is_plain:
         raise ExploreError(
             f"--fork-after: {locate(job, ('policy',))}: up to that time the order has to be the "
             "plain one; leave the policy out of the job, or --fork-after"

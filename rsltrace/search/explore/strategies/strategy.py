@@ -44,14 +44,16 @@ class Strategy(Protocol):
         """Return sentences for people on what was tried."""
 
 
-def choices_left(plain: TrialResult) -> int:
+def choices_left(plain: TrialResult, *, is_forked: bool = False) -> int:
     """Return how many choices of the plain run may be changed.
 
     :raises ExploreError: there are none after the time at which runs are forked.
     """
-    if plain.choices and plain.choices == plain.choices_before:
+    if plain.choices == plain.choices_before and (plain.choices or is_forked):
+        failed = "" if plain.failure is None else f" ({plain.failure.text.splitlines()[0]})"
         raise ExploreError(
-            "--fork-after: the plain run has no choice of what runs next after that time; give an "
-            "earlier one"
+            f"--fork-after: the plain run{failed} has no choice of what runs next after that time; "
+            "give an earlier one, or --set min_time_step=5ms to choose among what is due within 5 "
+            "ms"
         )
     return plain.choices - plain.choices_before
