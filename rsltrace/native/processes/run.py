@@ -193,7 +193,7 @@ class SpanMerger:
         return taken
 
 
-_KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
+_KILLED_WITHIN_S = 3.0
 """A process that is stuck ends itself before; this is for one that cannot."""
 Counts = tuple[int, int, int, int, int]
 """Of a process: its events, when it was last active (steady), messages that could not be read,
@@ -415,7 +415,7 @@ class MultiProcessRun(NativeRun):
             how += f": {child.exit_text}"
         self.starts.tell("ended", what.key)
         if child.is_stopping or child.has_failed:
-            if status < 0 and not (child.is_stuck or status == -signal.SIGINT):
+            if status < 0 and child.has_begun and not (child.is_stuck or status == -signal.SIGINT):
                 self.notes.append(f"{what.name}, told to end, {how}")
             return
         if not child.has_begun:
@@ -539,7 +539,12 @@ class MultiProcessRun(NativeRun):
         for child in self.children:
             if not child.is_over:
                 child.stop()
-        deadline = time.monotonic() + _KILLED_AFTER_S
+        deadline = time.monotonic() + ENDS_WITHIN_S
+        for child in self.children:
+            child.join(max(deadline - time.monotonic(), 0.1))
+            if child.is_alive():
+                child.terminate()
+        deadline = time.monotonic() + _KILLED_WITHIN_S
         for child in self.children:
             child.join(max(deadline - time.monotonic(), 0.1))
             if child.is_alive():
