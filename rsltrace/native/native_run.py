@@ -17,7 +17,7 @@ from typing import Any
 from rsltrace.errors import JobError, RsltraceError, RunError, SetupError
 from rsltrace.job import Job, locate
 from rsltrace.native import support
-from rsltrace.native.last_seconds import LastSeconds, Programs
+from rsltrace.native.last_seconds import LastSeconds, LiveChecks, Programs
 from rsltrace.native.priorities import order, real_time_class
 from rsltrace.native.span_writer import ClockPair, SpanSource, SpanWriter
 from rsltrace.run.inputs import check_output
@@ -209,6 +209,14 @@ class NativeRun:
         self.last = last = LastSeconds(
             spec, spans, programs, payload_filter(self.job), self._keep_file
         )
+        last.checks = LiveChecks(
+            self.job,
+            self.clocks.stamp,
+            lambda name, reason: last.trigger(reason, kind=f"check {name}"),
+            self._not_judged,
+        )
+        if last.checks.later:
+            self.note(f"judged only at the end: {'; '.join(last.checks.later)}")
         if threading.current_thread() is threading.main_thread():
             before = signal.signal(signal.SIGUSR1, lambda *_: last.trigger("SIGUSR1", at_once=True))
             stack.callback(signal.signal, signal.SIGUSR1, before)
@@ -217,6 +225,10 @@ class NativeRun:
             "writes them to a file"
         )
         return last
+
+    def _not_judged(self, text: str) -> None:
+        self.note(text)
+        self.lacks(text)
 
     def _keep_file(self, reason: str) -> None:
         """Write the last seconds to a file of their own; the run goes on."""

@@ -138,6 +138,7 @@ class SpanMerger:
         self._lock = threading.Lock()
         self._sources: list[ProcessSpans] = []
         self._latest_ns = 0
+        self.until_ns = 0
         self.late = 0
         """Spans that came too late for their place, and were put after what was written."""
 
@@ -162,7 +163,9 @@ class SpanMerger:
     def finished(self, patience_ns: int | None) -> list[CallbackSpan]:
         """Take what is in order, everything if ``patience_ns`` is None."""
         with self._lock:
-            taken = self._taken(self._until(patience_ns))
+            now, until_ns = now_ns(), self._until(patience_ns)
+            self.until_ns = now if until_ns is None else until_ns
+            taken = self._taken(until_ns)
         for span in taken:
             if span.start_ns < self._latest_ns:
                 self.late += 1
@@ -473,6 +476,10 @@ class MultiProcessRun(NativeRun):
             yield from program.look(since_ns)
             if child.is_over and program.is_forgotten:
                 del self._programs[child]
+
+    def checked(self) -> list[CallbackSpan]:
+        """Return what programs have sent on topics of checks."""
+        return [span for program in list(self._programs.values()) for span in program.checked()]
 
     def last_of_programs(self, since_ns: int) -> tuple[list[CallbackSpan], list[str]]:
         """Return what programs keep, and what is missing of it."""
