@@ -46,7 +46,7 @@ class RunProperty(ABC):
 
     @abstractmethod
     def advance(self, now_ns: int) -> None:
-        """Judge what can be judged at a time, before which no more events come."""
+        """Judge what can be judged at a time, up to which all events have come."""
 
     @abstractmethod
     def end(self, stamp_ns: int, *, complete: bool) -> None:

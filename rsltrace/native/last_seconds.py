@@ -161,7 +161,7 @@ class LiveChecks:
             try:
                 for _, view in due:
                     one.see(view)
-                one.advance(until_ns)
+                one.advance(until_ns - 1)
             except RsltraceError as error:
                 del self._properties[name]
                 self._lacks(f"check {name} is not judged any more: {error}")
