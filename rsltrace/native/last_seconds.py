@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from functools import partial
@@ -143,6 +143,8 @@ class LiveChecks:
             if not why and (one := property_of(job, index, self._start_ns)) is not None
         }
         self._waiting: list[tuple[int, _SpanView]] = []
+        self.failed: Counter[str] = Counter()
+        """How often which check has failed."""
 
     def add(self, spans: Iterable[CallbackSpan]) -> None:
         """Take spans, as long as they have the messages."""
@@ -167,6 +169,7 @@ class LiveChecks:
                 self._lacks(f"check {name} is not judged any more: {error}")
             if one.found:
                 self._violated(name, f"check {name}: {one.found[0].text}")
+                self.failed[name] += one.count
                 one.count = 0
                 one.found.clear()
 

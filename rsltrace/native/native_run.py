@@ -68,6 +68,8 @@ class NativeResult:
     stuck: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     kept: str = ""
+    failed_checks: Mapping[str, int] = field(default_factory=dict)
+    """How often checks failed while only the last seconds were kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,7 +365,12 @@ class NativeRun:
             stuck=stuck,
             notes=(*self.notes, *_said(stuck, unreadable)),
             kept=self.writer.kept,
+            failed_checks=self._failed_checks(),
         )
+
+    def _failed_checks(self) -> Mapping[str, int]:
+        checks = None if self.last is None else self.last.checks
+        return {} if checks is None else checks.failed
 
     def _levels(self) -> dict[str, str]:
         if self.options.policy is None:

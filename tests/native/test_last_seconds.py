@@ -263,6 +263,7 @@ def test_checks_say_what_is_wrong_in_the_order_of_time(monkeypatch: pytest.Monke
         "check three: it does not happen within 3 s",
     ]
     assert checked.look(9 * S) == checked.lacks == []
+    assert checked.checks.failed["small"] == 1
 
 
 def test_a_topic_that_stops_is_too_slow_once(monkeypatch: pytest.MonkeyPatch) -> None:
