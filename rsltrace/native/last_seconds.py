@@ -220,6 +220,8 @@ class LastSeconds:
         self._written_ns = 0
         self.ended_ns = 0
         """When the run was told to end, 0 before that: the last seconds are those up to then."""
+        self.span_ns = (0, 0)
+        """From when to when the file that was written last has all."""
         self.missing: list[str] = []
         """What the file that was written last lacks."""
 
@@ -271,6 +273,7 @@ class LastSeconds:
         """Return what is kept now, everything at the end of the run (None)."""
         self._take(patience_ns)
         since_ns = self.since_ns
+        self.span_ns = since_ns, now_ns()
         spans = [span for span, _ in self._spans]
         self.missing = []
         if self._dropped_ns > since_ns:

@@ -259,8 +259,9 @@ class NativeRun:
         more: Mapping[str, str] | None = None,
     ) -> None:
         now_ns, start_ns = time.monotonic_ns(), self.clocks.steady_ns
-        if self.last is not None:
-            start_ns = max(start_ns, self.last.since_ns)
+        if self.last is not None:  # writing it takes time
+            since_ns, now_ns = self.last.span_ns
+            start_ns = max(start_ns, since_ns)
         missing = [text for at_ns, text in self._missing if at_ns >= start_ns]
         missing += [] if self.last is None else self.last.missing
         writer.close(

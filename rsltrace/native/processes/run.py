@@ -445,14 +445,19 @@ class MultiProcessRun(NativeRun):
         name, program = child.what.name, self._programs.get(child)
         if program is not None and program.lost and self.last is None:
             self.lacks(f"{program.lost} records of {name}, for which there was no room")
-        if program is not None and program.unobserved:
-            self.lacks(
-                f"{program.unobserved} processes of {name}, which made no file: killed before, or "
-                f"no room in {self._folder}"
-            )
+        if program is not None and self.last is None:
+            for text in self._without_file(child, program):
+                self.lacks(text)
         if child.has_begun and status < 0 and status != -signal.SIGINT:
             what = "the last 50 ms" if program is None else "what each thread was just doing"
             self.lacks(f"of {name}, which {how_ended(status)} at {self._at} s, {what}")
+
+    def _without_file(self, child: ObservedProcess, program: ObservedProgram) -> Iterator[str]:
+        if child.is_over and program.unobserved:
+            yield (
+                f"{program.unobserved} processes of {child.what.name}, which made no file: killed "
+                f"before, or no room in {self._folder}"
+            )
 
     @property
     def _at(self) -> str:
@@ -492,7 +497,7 @@ class MultiProcessRun(NativeRun):
                 missing.append(f"what {child.what.name} did: {error}")
             else:
                 spans += found
-                missing += lost
+                missing += [*lost, *self._without_file(child, program)]
         return spans, missing
 
     # -- the run --------------------------------------------------------------------------------
